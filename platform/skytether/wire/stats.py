@@ -1,0 +1,96 @@
+"""Quality of service as it is told to others (rule 11): plain snapshots, no live state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStats:
+    """One topic in one direction. Counters count messages since the session object was made.
+
+    Sender's counters are exact at the sender and as of its last report at the receiver, and the other
+    way round; times are in seconds, NaN where nothing was measured yet.
+    """
+
+    topic: str
+    direction: str
+    priority: int
+    offered: int = 0
+    """Handed to ``publish`` while connected."""
+    sent: int = 0
+    """First shard handed to the network."""
+    delivered: int = 0
+    """Complete and authentic at the receiver, and given to its graph."""
+    lost: int = 0
+    """Sent, never completed: gaps in the topic's sequence that are older than its lifespan."""
+    late: int = 0
+    """Arrived after having been counted lost; subtracted from ``lost`` again."""
+    expired: int = 0
+    """Dropped for age in the sender's queue, or partly arrived and dropped in the receiver's reassembly."""
+    replaced: int = 0
+    """Dropped in the sender's queue because newer ones filled it."""
+    superseded: int = 0
+    """Arrived complete after a newer one of a newest-value topic; neither lost nor delivered."""
+    duplicate: int = 0
+    """Shards of messages that were already complete (what redundancy cost where nothing was lost)."""
+    bytes_sent: int = 0
+    """On the wire, headers and redundancy included, IP and UDP headers not."""
+    bytes_delivered: int = 0
+    """Payload."""
+    delay_p50: float = float("nan")
+    """One-way, from ``publish`` at the sender to delivery, in seconds."""
+    delay_p99: float = float("nan")
+    delay_max: float = float("nan")
+    delay_error: float = float("nan")
+    """Bound of the clock offset's error behind the delays."""
+    jitter: float = float("nan")
+    """Mean absolute difference of successive one-way delays (RFC 3550 section 6.4.1), by arrival."""
+    jitter_in_order: float = float("nan")
+    """The same over messages that arrived in sequence only: jitter without reordering."""
+    period_p50: float = float("nan")
+    """Time between arrivals."""
+    period_p99: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class PathStats:
+    """One path of a session, as this end sees it."""
+
+    path: int
+    address: object
+    rtt: float = float("nan")
+    """Latest round trip without the peer's hold time, seconds."""
+    rtt_min: float = float("nan")
+    rtt_p50: float = float("nan")
+    loss_out: float = float("nan")
+    """Share of packets sent that did not arrive, reported by the peer."""
+    loss_in: float = float("nan")
+    """Share of packets sent by the peer that did not arrive here."""
+    burst_in: float = float("nan")
+    """Mean length of a run of lost packets."""
+    packets_sent: int = 0
+    packets_received: int = 0
+    bytes_sent: int = 0
+    bytes_received: int = 0
+    rate: float = float("nan")
+    """Pacing budget, bits per second."""
+    overhead: float = float("nan")
+    """Bytes sent beyond payload, as a share of payload."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionStats:
+    """Everything one end knows of both directions."""
+
+    connected: bool
+    topics: tuple[TopicStats, ...] = ()
+    paths: tuple[PathStats, ...] = ()
+    rejected: dict[str, int] = field(default_factory=dict)
+    """Packets refused, by bounded reason."""
+    clock_offset: float = float("nan")
+    """Peer's monotonic clock minus ours, seconds."""
+    clock_error: float = float("inf")
+    handshakes: int = 0
+    last_heard: float = float("nan")
+    """Seconds since the last authenticated packet."""
