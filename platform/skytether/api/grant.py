@@ -1,0 +1,39 @@
+"""The file that an instance reads at start: everything it needs, and nobody else may see.
+
+It holds the session key, so it has mode 0600 (process), or is a secret mount (Docker, Kubernetes). Its path,
+never its contents, is in the environment variable ``SKYTETHER_GRANT``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from .manifest import Strict, TopicSpec
+
+GRANT_VARIABLE = "SKYTETHER_GRANT"
+DEFAULT_GRANT_PATH = "/run/skytether/grant.json"
+
+
+class Grant(Strict):
+    """What the orchestrator grants to one instance."""
+
+    instance: str
+    service: str
+    robot: str
+    params: dict[str, Any] = {}
+    session_id: str
+    """16 hexadecimal digits."""
+    session_key: Annotated[str, Field(repr=False)]
+    """32 bytes, base64."""
+    topics: tuple[TopicSpec, ...]
+    bind_host: str = "127.0.0.1"
+    bind_port: int = 0
+    """0: any free port; the one taken is told in ``ready_file``."""
+    ready_file: str | None = None
+    """Written (atomically) once the bridge listens: ``{"port": 40123, "pid": 4711}``."""
+    data_dir: str = "."
+    """Where the instance may write what it produces (recordings)."""
+    idle_exit_s: float = 120
+    """The instance ends by itself when it has heard nothing from its robot for this long."""

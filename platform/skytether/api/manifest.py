@@ -1,0 +1,101 @@
+"""A service's manifest: what people write in YAML. Unknown keys are refused by name."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
+"""Names of services, sites and robots: a DNS label, so that every runtime can use them as they are."""
+
+Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", description="lower-case letters, digits and '-'")]
+Tier = Literal["robot", "edge", "cloud"]
+ANY_TOPIC = "*"
+
+
+class Strict(BaseModel):
+    """Base of everything that people or programs send us: no unknown keys, no silent changes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class TopicSpec(Strict):
+    """One topic of a service, as the service sees it; units are in the names."""
+
+    name: Annotated[str, Field(min_length=1, max_length=255)]
+    """``*`` takes any topic that the robot offers (direction ``in`` only), with this row's quality of service."""
+    type: Annotated[str, Field(min_length=1, max_length=255)]
+    """ROS 2 style name, ``geometry_msgs/msg/Twist``; ``*`` with name ``*``."""
+    direction: Literal["in", "out"]
+    type_hash: str = ""
+    encoding: Literal["cdr", "ros1"] = "cdr"
+    """A default: the robot's choice overrides it in the handshake."""
+    priority: Annotated[int, Field(ge=0, le=127)] = 64
+    period_ms: Annotated[float, Field(gt=0, lt=3_600_000)] | None = None
+    lifespan_ms: Annotated[float, Field(gt=0, le=3_600_000)] = 100
+    depth: Annotated[int, Field(ge=1, le=10_000)] = 1
+    delivery: Annotated[float, Field(gt=0, lt=1)] = 0.99
+
+    @model_validator(mode="after")
+    def _any_topic_comes_in(self) -> TopicSpec:
+        if (self.name == ANY_TOPIC or self.type == ANY_TOPIC) and (
+            self.name != self.type or self.direction != "in"
+        ):
+            raise ValueError("name '*' needs type '*' and direction 'in'")
+        return self
+
+
+class Needs(Strict):
+    """What a site and a link must offer before an instance may run there."""
+
+    cpu: Annotated[float, Field(gt=0)] = 0.1
+    """Cores."""
+    memory_mb: Annotated[int, Field(gt=0)] = 128
+    gpu: Annotated[int, Field(ge=0)] = 0
+    max_rtt_ms: Annotated[float, Field(gt=0)] | None = None
+    """Above this the robot's fallback takes over; None: any."""
+    max_loss: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Share of messages; above this the robot's fallback takes over; None: any."""
+    tiers: Annotated[tuple[Tier, ...], Field(min_length=1)] = ("robot", "edge", "cloud")
+
+
+class Metadata(Strict):
+    """Who the service is."""
+
+    name: Name
+    version: Annotated[str, Field(min_length=1, max_length=64)] = "1"
+    labels: dict[str, str] = {}
+
+
+class ServiceSpec(Strict):
+    """What runs, what it takes in and gives out, what it needs."""
+
+    image: str | None = None
+    """Container image; needed by container sites."""
+    entrypoint: str | None = None
+    """Python module with a ``__main__``; needed by process sites."""
+    params: dict[str, Any] = {}
+    """JSON schema (2020-12) of the parameters; ``additionalProperties`` is false unless it says otherwise."""
+    topics: tuple[TopicSpec, ...] = ()
+    needs: Needs = Needs()
+
+    @model_validator(mode="after")
+    def _can_run_and_names_are_unique(self) -> ServiceSpec:
+        if not self.image and not self.entrypoint:
+            raise ValueError("one of 'image' and 'entrypoint' is needed")
+        names = [t.name for t in self.topics]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"topic '{name}' is listed twice")
+        return self
+
+
+class Manifest(Strict):
+    """The whole document."""
+
+    api_version: Annotated[Literal["skytether.io/v1"], Field(alias="apiVersion")]
+    kind: Literal["Service"]
+    metadata: Metadata
+    spec: ServiceSpec

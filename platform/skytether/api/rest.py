@@ -1,0 +1,189 @@
+"""What goes over REST, both ways. Times are RFC 3339 in UTC."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from .manifest import Name, Needs, Strict, Tier, TopicSpec
+
+
+class State(StrEnum):
+    """Life of an instance: pending -> placing -> starting -> running -> stopping -> stopped, or failed."""
+
+    PENDING = "pending"
+    PLACING = "placing"
+    STARTING = "starting"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    STOPPED = "stopped"
+    FAILED = "failed"
+
+    @property
+    def final(self) -> bool:
+        """Nothing comes after it."""
+        return self in (State.STOPPED, State.FAILED)
+
+
+class Measurement(Strict):
+    """What a robot measured towards one site."""
+
+    rtt_ms: Annotated[float, Field(ge=0)] | None = None
+    loss: Annotated[float, Field(ge=0, le=1)] | None = None
+
+
+class InstanceCreate(Strict):
+    """A robot asks for a service."""
+
+    robot: Name
+    service: Name
+    params: dict[str, Any] = {}
+    measurements: dict[Name, Measurement] = {}
+    """By site; sites not named are taken as unmeasured."""
+    lease_s: Annotated[float, Field(ge=1, le=86_400)] = 15
+    """The instance is stopped when it is not renewed for this long."""
+
+
+class Refusal(Strict):
+    """Why one site was not chosen: the number asked for and the number found."""
+
+    site: str
+    reason: str
+    """Bounded, for metrics: ``tier``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``, ``runtime``, ``unreachable``."""
+    detail: str
+
+
+class Placement(Strict):
+    """Where an instance runs, and why not elsewhere."""
+
+    site: str
+    refused: tuple[Refusal, ...] = ()
+
+
+class Session(Strict):
+    """The robot's half of a bridge session. Only the robot that owns the instance (or an operator) gets it."""
+
+    id: str
+    """16 hexadecimal digits."""
+    key: Annotated[str, Field(repr=False)]
+    """32 bytes, base64."""
+    host: str | None = None
+    """Where the service's end can be reached (the advertised, not the bound address); None until it is up."""
+    port: int | None = None
+    topics: tuple[TopicSpec, ...] = ()
+    needs: Needs = Needs()
+
+
+class Instance(Strict):
+    """One running copy of a service, for one robot."""
+
+    id: str
+    robot: str
+    service: str
+    state: State
+    reason: str = ""
+    """One sentence a person can act on; empty while all is well."""
+    params: dict[str, Any] = {}
+    placement: Placement | None = None
+    session: Session | None = None
+    """None for a token that may not see it."""
+    restarts: int = 0
+    created_at: datetime
+    updated_at: datetime
+    lease_expires_at: datetime
+
+
+class TopicReport(Strict):
+    """One topic's quality as the robot knows it, counted since the session began."""
+
+    topic: str
+    direction: Literal["in", "out"]
+    priority: int
+    sent: int = 0
+    delivered: int = 0
+    lost: int = 0
+    late: int = 0
+    expired: int = 0
+    replaced: int = 0
+    superseded: int = 0
+    duplicate: int = 0
+    bytes_sent: int = 0
+    delay_p50_s: float | None = None
+    delay_p99_s: float | None = None
+    jitter_s: float | None = None
+
+
+class Report(Strict):
+    """What the robot tells the orchestrator with each renewal; it feeds /metrics."""
+
+    rtt_s: float | None = None
+    topics: tuple[TopicReport, ...] = ()
+    control_source: str | None = None
+    """Who drives: ``cloud``, ``fallback`` or ``stop``."""
+    fallback_transitions: dict[str, int] = {}
+    """Counted by bounded reason."""
+
+
+class Renew(Strict):
+    """Keep the lease; optionally report."""
+
+    lease_s: Annotated[float, Field(ge=1, le=86_400)] | None = None
+    report: Report | None = None
+
+
+class SiteCreate(Strict):
+    """A place where instances run."""
+
+    name: Name
+    tier: Tier
+    runtime: str
+    """Entry point of group ``skytether.runtimes``."""
+    options: dict[str, Any] = {}
+    """The runtime's own options; unknown ones are refused by name."""
+
+
+class Site(SiteCreate):
+    """A site and what is known of it."""
+
+    state: Literal["ready", "unreachable"] = "ready"
+    reason: str = ""
+    cpu: float | None = None
+    memory_mb: int | None = None
+    instances: int = 0
+
+
+class RobotCreate(Strict):
+    """Register a robot."""
+
+    name: Name
+    services: tuple[str, ...] = ("*",)
+    """What it may ask for; ``*``: anything."""
+
+
+class Robot(RobotCreate):
+    """A registered robot."""
+
+    created_at: datetime
+    last_seen_at: datetime | None = None
+
+
+class RobotCreated(Robot):
+    """Answer to a registration: the only time that the token is shown."""
+
+    token: Annotated[str, Field(repr=False)]
+
+
+class Problem(Strict):
+    """RFC 9457 problem document."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = ""
+    """One sentence with what to do."""
+    instance: str | None = None
+    errors: tuple[dict[str, Any], ...] = ()
+    """For invalid input: ``{"key": "spec.topics.0.prority", "detail": "unknown key"}``."""
