@@ -40,9 +40,7 @@ class TopicSpec(Strict):
 
     @model_validator(mode="after")
     def _any_topic_comes_in(self) -> TopicSpec:
-        if (self.name == ANY_TOPIC or self.type == ANY_TOPIC) and (
-            self.name != self.type or self.direction != "in"
-        ):
+        if (self.name == ANY_TOPIC or self.type == ANY_TOPIC) and (self.name != self.type or self.direction != "in"):
             raise ValueError("name '*' needs type '*' and direction 'in'")
         return self
 

@@ -72,9 +72,7 @@ class Topic:
         if self.period is not None and not 0 < self.period < 3600:
             raise ValueError(f"topic {self.name}: period must be above 0 and below 3600 s, not {self.period}")
         if not 0 < self.lifespan <= 3600:
-            raise ValueError(
-                f"topic {self.name}: lifespan must be above 0 and at most 3600 s, not {self.lifespan}"
-            )
+            raise ValueError(f"topic {self.name}: lifespan must be above 0 and at most 3600 s, not {self.lifespan}")
         if not 1 <= self.depth <= 10_000:
             raise ValueError(f"topic {self.name}: depth must be 1 to 10000, not {self.depth}")
         if not 0 < self.delivery < 1:
