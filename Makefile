@@ -1,0 +1,44 @@
+# Two commands do all the set-up: `make demo` and `make test`.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: demo test unit check fmt lock clean
+
+demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
+	$(BIN)/skytether demo
+
+test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
+	$(BIN)/pytest
+
+unit: $(READY) ## the quick part, under a minute
+	$(BIN)/pytest -m "not slow"
+
+check: $(READY) ## style, types and layers: the same for people and CI
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+fmt: $(READY) ## format, and mend what can be mended
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock: $(READY) ## resolve pyproject.toml anew into requirements.lock
+	$(BIN)/pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --all-extras --generate-hashes --universal --no-emit-index-url --no-header \
+		--output-file requirements.lock pyproject.toml
+
+$(READY): requirements.lock pyproject.toml
+	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 or newer is missing: apt-get install python3 python3-venv"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$$($(PYTHON) --version) is too old: Skytether needs 3.11 or newer; give another with PYTHON=python3.x"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python's venv is missing: apt-get install python3-venv"; exit 1; }
+	@echo "Setting up .venv (once; about 500 MB) ..."
+	@test -x $(BIN)/pip || $(PYTHON) -m venv .venv
+	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+clean: ## remove what the build and the tools made
+	rm -rf .venv dist build demo-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
