@@ -1,0 +1,5 @@
+"""``python -m skytether.cli``: the same as ``skytether``."""
+
+from .main import main
+
+main()

@@ -1,0 +1,101 @@
+"""An orchestrator of one's own, as a child process, for demonstrations, replays and benchmarks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import TracebackType
+
+_START_TIMEOUT = 20.0
+_STOP_TIMEOUT = 10.0
+
+
+class EmbeddedError(Exception):
+    """The orchestrator did not come up; the text is its own last line."""
+
+
+class EmbeddedOrchestrator:
+    """Runs ``skytether orchestrator run`` on loopback and ends it, with all it started, on exit.
+
+    It is a real child process, not a thread: what works here works with an orchestrator elsewhere, and it
+    can be killed and started again over the same state (``kill``, ``start``).
+    """
+
+    def __init__(self, state_dir: Path | None = None) -> None:
+        """Without a state directory a temporary one is used, and removed at the end."""
+        self._temporary = None if state_dir else tempfile.TemporaryDirectory(prefix="skytether-")
+        self.state_dir = state_dir or Path(self._temporary.name if self._temporary else "")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._port = 0
+
+    @property
+    def url(self) -> str:
+        """Base address; the same over restarts."""
+        return f"http://127.0.0.1:{self._port}"
+
+    @property
+    def operator_token(self) -> str:
+        """The token made at the first start."""
+        return (self.state_dir / "operator.token").read_text().strip()
+
+    @property
+    def log(self) -> str:
+        """What the orchestrator wrote so far."""
+        return (self.state_dir / "orchestrator.log").read_text(errors="replace")
+
+    def start(self) -> None:
+        """Start, and return once it answers.
+
+        Raises:
+            EmbeddedError: It ended or did not answer in time.
+        """
+        address = self.state_dir / "address"
+        address.unlink(missing_ok=True)
+        command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--stop-instances"]
+        command += ["--state-dir", str(self.state_dir), "--port", str(self._port)]
+        with (self.state_dir / "orchestrator.log").open("ab") as log:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            )
+        deadline = time.monotonic() + _START_TIMEOUT
+        while not address.exists():
+            if self._process.poll() is not None:
+                lines = self.log.strip().splitlines()
+                raise EmbeddedError(f"the orchestrator did not start: {lines[-1] if lines else 'no output'}")
+            if time.monotonic() > deadline:
+                self.kill()
+                raise EmbeddedError(f"the orchestrator did not answer within {_START_TIMEOUT:.0f} s")
+            time.sleep(0.01)
+        self._port = int(address.read_text().strip().rsplit(":", 1)[1])
+
+    def stop(self) -> None:
+        """End it and every instance that it started."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.kill()
+        self._process = None
+
+    def kill(self) -> None:
+        """Kill the orchestrator alone, as a crash would; its instances go on."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def __enter__(self) -> EmbeddedOrchestrator:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        if self._temporary is not None:
+            self._temporary.cleanup()
