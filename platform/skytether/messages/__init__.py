@@ -1,0 +1,90 @@
+"""The message types that services and robots speak, as frozen dataclasses named as in ROS, and their codec.
+
+SI units, ROS 2 field names, NumPy arrays for what is long. Not for types that only a graph passes through: the
+bridge and the recorder carry bytes and need no class.
+"""
+
+from .base import Message, all_types, type_of
+from .codec import (
+    DecodeError,
+    EncodeError,
+    Encoding,
+    decode,
+    definition_of,
+    encode,
+    hash_of,
+    type_hash,
+    warm,
+)
+from .geometry import (
+    Point,
+    Pose,
+    PoseStamped,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+    TwistWithCovariance,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+    quaternion_from_yaw,
+    yaw_of,
+)
+from .nav import MapMetaData, OccupancyGrid, Odometry, Path, TFMessage
+from .sensor import CompressedImage, Imu, JointState, Joy, LaserScan, PointCloud2, PointField, Range
+from .std import Bool, Duration, Float32, Float64, Header, String, Time
+
+__all__ = [
+    "Bool",
+    "CompressedImage",
+    "DecodeError",
+    "Duration",
+    "EncodeError",
+    "Encoding",
+    "Float32",
+    "Float64",
+    "Header",
+    "Imu",
+    "JointState",
+    "Joy",
+    "LaserScan",
+    "MapMetaData",
+    "Message",
+    "OccupancyGrid",
+    "Odometry",
+    "Path",
+    "Point",
+    "PointCloud2",
+    "PointField",
+    "Pose",
+    "PoseStamped",
+    "PoseWithCovariance",
+    "PoseWithCovarianceStamped",
+    "Quaternion",
+    "Range",
+    "String",
+    "TFMessage",
+    "Time",
+    "Transform",
+    "TransformStamped",
+    "Twist",
+    "TwistStamped",
+    "TwistWithCovariance",
+    "Vector3",
+    "Wrench",
+    "WrenchStamped",
+    "all_types",
+    "decode",
+    "definition_of",
+    "encode",
+    "hash_of",
+    "quaternion_from_yaw",
+    "type_hash",
+    "type_of",
+    "warm",
+    "yaw_of",
+]
