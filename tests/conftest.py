@@ -1,0 +1,31 @@
+"""What tests of every package share: the means that not every machine has."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+
+def require(name: str, reason: str) -> NoReturn:
+    """Skip the test because the means ``name`` is not here; fail where it was promised to be.
+
+    ``SKYTETHER_REQUIRE=data,docker`` promises: a machine that is set up for these must not skip them silently.
+    """
+    promised = os.environ.get("SKYTETHER_REQUIRE", "").replace(",", " ").split()
+    if name in promised:
+        pytest.fail(f"'{name}' is listed in SKYTETHER_REQUIRE, but {reason}", pytrace=False)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The directory of real recordings, for tests marked ``data``."""
+    folder = os.environ.get("SKYTETHER_DATA", "")
+    if not folder:
+        require("data", "SKYTETHER_DATA does not name the directory of the recordings")
+    if not Path(folder).is_dir():
+        require("data", f"SKYTETHER_DATA names {folder}, which is no directory")
+    return Path(folder)
