@@ -1,0 +1,341 @@
+"""The program on the robot: asks for a service, runs its end of the bridge, drives (Mello, thesis, figure 18(a)).
+
+Three threads that never wait for each other: the control loop at a fixed rate with absolute deadlines, the asker that
+speaks REST, and a watch on the bridge's counters. The bridge has its own. What is decided is decided in `driver`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import count
+from math import isfinite, nan
+from random import Random
+from types import TracebackType
+from typing import Any
+
+from skytether.api import rest
+from skytether.api.client import Client
+from skytether.bridge import Bridge, BridgeError, SessionSpec
+from skytether.bridge.port import Port
+from skytether.messages import Message, Twist, type_hash, warm
+from skytether.wire.stats import SessionStats
+from skytether.wire.topic import Role
+
+from . import fallback
+from .arbiter import Needs
+from .asker import Asker, Orchestrator
+from .command import Source
+from .driver import Base, Driver, DriverStatus, Observer
+from .link import LinkMonitor
+from .session import Endpoint, LiveSession
+from .supervisor import Limits
+from .table import Offer, robot_table
+
+_log = logging.getLogger(__name__)
+
+_WATCH_S = 0.1
+"""Between looks at the bridge's counters."""
+_JOIN_S = 2.0
+"""A thread that does not end by then is left behind; the wheels have been stopped before."""
+
+Address = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """One robot and the service it wants.
+
+    Attributes:
+        robot: Its name at the orchestrator.
+        url: The orchestrator's base address.
+        token: The robot's.
+        service: What it asks for.
+        params: The service's parameters.
+        measurements: What it measured towards the sites, by site.
+        fallback: Entry point of the group ``skytether.fallbacks``.
+        fallback_options: The fallback's.
+        limits: The supervisor's; from here only.
+        needs: The arbiter's patience; round trip and loss come from the service's manifest.
+        command_topic: The service's topic (geometry_msgs/msg/Twist) that drives the robot.
+        rate_hz: Of the control loop.
+        lease_s: The instance ends when the robot was not heard of for this long.
+        renew_s: Between renewals, which carry the report.
+        request_timeout_s: Of each request to the orchestrator.
+        bind: Local address of the robot's end of the bridge; port 0: any.
+        route: Where to send what is meant for the service's address; for experiments with an emulated link.
+    """
+
+    robot: str
+    url: str
+    service: str
+    token: str = field(repr=False)
+    params: Mapping[str, Any] = field(default_factory=dict)
+    measurements: Mapping[str, rest.Measurement] = field(default_factory=dict)
+    fallback: str = "stop"
+    fallback_options: Mapping[str, Any] = field(default_factory=dict)
+    limits: Limits = Limits()
+    needs: Needs = Needs()
+    command_topic: str = "cmd_vel"
+    rate_hz: float = 100.0
+    lease_s: float = 15.0
+    renew_s: float = 2.0
+    request_timeout_s: float = 5.0
+    bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
+    route: Callable[[str, int], Address] = lambda host, port: (host, port)
+
+
+@dataclass(frozen=True, slots=True)
+class AgentStatus:
+    """A snapshot of everything. Times are monotonic seconds.
+
+    Attributes:
+        driver: What the control loop knows.
+        instance: The last that was heard of it.
+        trouble: What stands in the way of asking, in one sentence; empty while all is well.
+        asked_at: When the service was first asked for.
+        connected: The bridge has a session.
+        session: The bridge's counters.
+        rtt: Round trip [s].
+        loss: Share of messages lost over the last seconds.
+        overruns: Ticks that started more than one period late.
+    """
+
+    driver: DriverStatus
+    instance: rest.Instance | None
+    trouble: str
+    asked_at: float | None
+    connected: bool
+    session: SessionStats | None
+    rtt: float
+    loss: float
+    overruns: int
+
+
+MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
+"""Session, port, address to bind, address of the service."""
+
+
+class Agent:
+    """Drives one robot. A context manager: entering starts it, leaving stops wheels, threads, bridge and instance.
+
+    Args:
+        config: What to do.
+        base: The robot's hardware.
+        observer: Told each command from the cloud; must return at once.
+        client: The orchestrator; made from the configuration if not given.
+        bridge: Makes the robot's end of the bridge.
+        clock: Monotonic seconds; the bridge's must be the same.
+        random: For the jitter of the back-off.
+
+    Raises:
+        FallbackError: The fallback cannot be had.
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        base: Base,
+        *,
+        observer: Observer | None = None,
+        client: Orchestrator | None = None,
+        bridge: MakeBridge = lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer),
+        clock: Callable[[], float] = time.monotonic,
+        random: Random | None = None,
+    ) -> None:
+        self._config = config
+        self._base = base
+        self._clock = clock
+        self._make_bridge = bridge
+        local = fallback.load(config.fallback, config.fallback_options)
+        self._driver = Driver(base, local, config.limits, config.needs, clock(), observer)
+        self._own_client = None if client else Client(config.url, config.token, timeout=config.request_timeout_s)
+        request = rest.InstanceCreate(
+            robot=config.robot,
+            service=config.service,
+            params=dict(config.params),
+            measurements=dict(config.measurements),
+            lease_s=config.lease_s,
+        )
+        self._asker = Asker(
+            client or self._own_client,  # type: ignore[arg-type]
+            request,
+            on_instance=self._follow,
+            report=self.report,
+            healthy=lambda: self._driver.status().source is Source.CLOUD,
+            renew_s=config.renew_s,
+            random=random,
+        )
+        self._instance: rest.Instance | None = None
+        self._epochs = count(1)
+        self._monitor = LinkMonitor()
+        self._stats: SessionStats | None = None
+        self._asked_at: float | None = None
+        self._overruns = 0
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Start driving and asking; returns at once."""
+        warm([*self._base.topics.values(), Twist], "cdr")
+        self._asked_at = self._clock()
+        for target in (self._control, self._ask, self._watch):
+            thread = threading.Thread(target=target, name=f"agent{target.__name__}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def close(self) -> None:
+        """Stop the wheels first, then the rest; the instance is let go."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(_JOIN_S + self._config.request_timeout_s * (thread.name == "agent_ask"))
+            if thread.is_alive():
+                _log.error("thread %s does not end; going on without it", thread.name)
+        self._threads.clear()
+        self._driver.halt()
+        session, self._driver.session = self._driver.session, None
+        if session is not None:
+            session.close()
+        self._asker.release()
+        if self._own_client is not None:
+            self._own_client.close()
+
+    def tick(self, now: float) -> None:
+        """One turn of the control loop; called by its thread, or by a test with made-up time."""
+        self._driver.tick(now)
+
+    def status(self) -> AgentStatus:
+        """What is known now; from any thread."""
+        session = self._driver.session
+        return AgentStatus(
+            driver=self._driver.status(),
+            instance=self._instance,
+            trouble=self._asker.trouble,
+            asked_at=self._asked_at,
+            connected=session is not None and session.connected,
+            session=self._stats,
+            rtt=self._driver.rtt,
+            loss=self._driver.loss,
+            overruns=self._overruns,
+        )
+
+    def report(self) -> rest.Report:
+        """What the orchestrator is told with each renewal."""
+        return report(self._driver.status(), self._stats, self._driver.rtt)
+
+    def _control(self) -> None:
+        period = 1 / self._config.rate_hz
+        deadline = self._clock()
+        try:
+            while not self._stop.is_set():
+                self.tick(self._clock())
+                deadline += period
+                late = self._clock() - deadline
+                if late < 0:
+                    self._stop.wait(-late)
+                elif late > period:
+                    self._overruns += 1
+                    deadline += late  # ticks that were missed are not made up for
+        finally:
+            self._driver.halt()
+
+    def _ask(self) -> None:
+        self._asker.run(self._stop)
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_WATCH_S):
+            self.watch(self._clock())
+
+    def watch(self, now: float) -> None:
+        """Look at the bridge's counters once."""
+        session = self._driver.session
+        if session is None or session.bridge is None:
+            return
+        try:
+            self._stats = session.bridge.stats()
+        except BridgeError:  # stopped between the two lines
+            return
+        self._driver.rtt, self._driver.loss = self._monitor.sample(self._stats, now)
+
+    def _follow(self, instance: rest.Instance) -> None:
+        """The orchestrator said something about the instance: open a new session, or follow the service's address."""
+        self._instance = instance
+        granted = instance.session
+        if granted is None or granted.host is None or granted.port is None:
+            return
+        peer = self._config.route(granted.host, granted.port)
+        current = self._driver.session
+        if current is not None and current.id == granted.id:
+            current.move(peer)
+            return
+        try:
+            session = self._open(granted, peer)
+        except (BridgeError, ValueError) as error:
+            _log.error("the bridge to %s:%d cannot be opened: %s", *peer, error)
+            return
+        self._monitor = LinkMonitor()
+        self._driver.rtt = self._driver.loss = nan
+        needs = granted.needs
+        self._driver.set_needs(None if needs.max_rtt_ms is None else needs.max_rtt_ms / 1000, needs.max_loss)
+        self._driver.session = session
+        if current is not None:
+            current.close()
+
+    def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
+        topics = robot_table(granted.topics, offers(self._base.topics))
+        spec = replace(SessionSpec.from_api(granted, Role.ROBOT), topics=topics)
+        session = LiveSession(
+            granted.id, frozenset(topic.name for topic in topics), self._config.command_topic, self._epochs
+        )
+        session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
+        return session
+
+    def __enter__(self) -> Agent:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def offers(topics: Mapping[str, type[Message]]) -> dict[str, Offer]:
+    """What a robot with these message classes can send."""
+    return {name: Offer(cls.TYPE, type_hash(cls, "cdr"), "cdr") for name, cls in topics.items()}
+
+
+def report(driver: DriverStatus | None, stats: SessionStats | None, rtt: float) -> rest.Report:
+    """Say for the orchestrator's metrics what bridge and control loop counted."""
+    return rest.Report(
+        rtt_s=_known(rtt),
+        topics=tuple(
+            rest.TopicReport(
+                topic=topic.topic,
+                direction="in" if topic.direction == "in" else "out",
+                priority=topic.priority,
+                sent=topic.sent,
+                delivered=topic.delivered,
+                lost=topic.lost,
+                late=topic.late,
+                expired=topic.expired,
+                replaced=topic.replaced,
+                superseded=topic.superseded,
+                duplicate=topic.duplicate,
+                bytes_sent=topic.bytes_sent,
+                delay_p50_s=_known(topic.delay_p50),
+                delay_p99_s=_known(topic.delay_p99),
+                jitter_s=_known(topic.jitter),
+            )
+            for topic in (stats.topics if stats else ())
+        ),
+        control_source=driver.source if driver else None,
+        fallback_transitions=dict(driver.transition_counts) if driver else {},
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if isfinite(value) else None

@@ -1,0 +1,42 @@
+"""One velocity command on its way to the wheels, and who may send one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Source(StrEnum):
+    """Who drives."""
+
+    CLOUD = "cloud"
+    """The service, over the bridge."""
+    FALLBACK = "fallback"
+    """The robot's own controller."""
+    STOP = "stop"
+    """Nobody: the wheels stand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A velocity that somebody wants, and where it comes from. All times in this robot's monotonic seconds.
+
+    Attributes:
+        source: Who wants it.
+        linear: Forward velocity in the robot's base frame [m/s].
+        angular: Rate about the vertical axis, positive to the left [rad/s].
+        epoch: Counts the handshakes of the bridge; a higher one starts the sequence anew.
+        sequence: Counts the commands of one source within one epoch.
+        sent_at: When it was made from what was then known; of a fallback's command, when its readings were taken.
+        sent_at_error: Bound of the error of ``sent_at`` [s]; inf while the peer's clock is not known.
+        received_at: When it reached this robot.
+    """
+
+    source: Source
+    linear: float
+    angular: float
+    epoch: int
+    sequence: int
+    sent_at: float
+    sent_at_error: float
+    received_at: float

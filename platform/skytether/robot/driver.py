@@ -1,0 +1,277 @@
+"""One tick of the control loop: readings in, source choice, supervisor, velocity out. Time is an argument.
+
+It is given a session when there is one, and drives without. Nothing here waits for anything.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from math import nan
+from typing import Protocol
+
+from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.messages import DecodeError, Message, Twist, Vector3, decode
+from skytether.wire.events import MessageReceived
+
+from . import arbiter, supervisor
+from .arbiter import Choice, Link, Needs
+from .command import Command, Source
+from .fallback import Fallback, Reading
+from .session import LiveSession
+from .supervisor import Limits, Objection, Supervised
+
+_log = logging.getLogger(__name__)
+
+_TRANSITIONS_KEPT = 1000
+"""The newest; all are counted."""
+
+
+class Base(Protocol):
+    """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick."""
+
+    topics: Mapping[str, type[Message]]
+    """What `read` may give, by topic name."""
+
+    def read(self, now: float) -> Iterable[tuple[str, Message]]:
+        """New readings since the last call, for the service and for the fallback."""
+        ...
+
+    def write(self, twist: Twist) -> None:
+        """What the wheels are to do until the next call."""
+        ...
+
+
+Observer = Callable[[Command, Objection | None], None]
+"""Told each command from the cloud that arrives, and what was wrong with it. Must return at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One change of who drives; the first is the start."""
+
+    at: float
+    source: Source
+    reason: arbiter.Reason
+
+
+@dataclass(frozen=True, slots=True)
+class DriverStatus:
+    """What the control loop knows at one moment. Times are monotonic seconds.
+
+    Attributes:
+        source: Who drives.
+        transitions: Changes of the source, oldest first (the newest 1000).
+        transition_counts: All of them, by reason.
+        seconds: Under each source.
+        velocity: What the wheels were last told.
+        objections: The supervisor's, by kind.
+        errors: Exceptions caught in the loop, by the part that raised them.
+        first_command_at: Arrival of the first command from the cloud that was admitted.
+        last_command_at: Of the newest.
+        readings: Messages read from the base, by topic.
+    """
+
+    source: Source
+    transitions: tuple[Transition, ...]
+    transition_counts: Mapping[str, int]
+    seconds: Mapping[Source, float]
+    velocity: Velocity
+    objections: Mapping[str, int]
+    errors: Mapping[str, int]
+    first_command_at: float | None
+    last_command_at: float | None
+    readings: Mapping[str, int]
+
+
+class Driver:
+    """The robot's control, tick by tick.
+
+    Args:
+        base: The hardware.
+        fallback: Who drives when the cloud does not.
+        limits: The supervisor's.
+        needs: The arbiter's; what a session says about the service replaces round trip and loss.
+        now: Monotonic seconds.
+        observer: See `Observer`.
+    """
+
+    def __init__(
+        self,
+        base: Base,
+        fallback: Fallback,
+        limits: Limits,
+        needs: Needs,
+        now: float,
+        observer: Observer | None = None,
+    ) -> None:
+        self.session: LiveSession | None = None
+        self.rtt = nan
+        self.loss = nan
+        self._base = base
+        self._fallback = fallback
+        self._limits = limits
+        self._observer = observer
+        self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
+        self._choice: Choice = arbiter.start(self._needs, now)
+        self._supervised = Supervised()
+        self._now = now
+        self._ticks = 0
+        self._readings: dict[str, Reading] = {}
+        self._transitions = deque([Transition(now, self._choice.source, self._choice.reason)], _TRANSITIONS_KEPT)
+        self._counts: Counter[str] = Counter({self._choice.reason: 1})
+        self._seconds = dict.fromkeys(Source, 0.0)
+        self._objections: Counter[str] = Counter()
+        self._errors: Counter[str] = Counter()
+        self._read: Counter[str] = Counter()
+        self._first_command_at: float | None = None
+
+    def set_needs(self, max_rtt_s: float | None, max_loss: float | None) -> None:
+        """Take over what the service's manifest needs of the link."""
+        self._needs = replace(self._needs, max_rtt_s=max_rtt_s, max_loss=max_loss)
+
+    def tick(self, now: float) -> None:
+        """One turn of the loop: exactly one velocity is written. Never raises.
+
+        Whatever goes wrong on the way brakes the wheels: what cannot be computed must not be driven.
+        """
+        self._seconds[self._choice.source] += max(0.0, now - self._now)
+        try:
+            self._take_readings(now)
+            self._take_commands(now)
+            self._choose(now)
+            velocity = self._drive(now)
+        except Exception as error:  # a plug-in, a driver, a bug: none of them may keep the wheels turning
+            self._caught("control", error)
+            velocity = self._brake(now)
+        self._now = now
+        self._ticks += 1
+        self._write(velocity)
+
+    def halt(self) -> None:
+        """Tell the wheels to stand; the last thing that the loop does."""
+        self._supervised = Supervised()
+        self._write(STANDSTILL)
+
+    def status(self) -> DriverStatus:
+        """A snapshot; from any thread."""
+        held = self._supervised.held.get(Source.CLOUD)
+        return DriverStatus(
+            source=self._choice.source,
+            transitions=tuple(self._transitions),
+            transition_counts=dict(self._counts),
+            seconds=dict(self._seconds),
+            velocity=self._supervised.velocity,
+            objections=dict(self._objections),
+            errors=dict(self._errors),
+            first_command_at=self._first_command_at,
+            last_command_at=held.received_at if held else None,
+            readings=dict(self._read),
+        )
+
+    def _take_readings(self, now: float) -> None:
+        for topic, message in self._base.read(now):
+            self._readings[topic] = Reading(message, now)
+            self._read[topic] += 1
+            if self.session is not None:
+                try:
+                    self.session.publish(topic, message)
+                except Exception as error:  # costs the cloud a reading; the robot's own control goes on
+                    self._caught("publish", error)
+
+    def _take_commands(self, now: float) -> None:
+        if self.session is None:
+            return
+        for epoch, message in self.session.take():
+            try:
+                command = _command(epoch, message)
+            except DecodeError as error:
+                self._caught("decode", error)
+                continue
+            objection = self._admit(command, now)
+            if objection is None and self._first_command_at is None:
+                self._first_command_at = command.received_at
+            if self._observer is not None:
+                try:
+                    self._observer(command, objection)
+                except Exception as error:  # measuring must not stop the robot
+                    self._caught("observer", error)
+
+    def _choose(self, now: float) -> None:
+        held = self._supervised.held.get(Source.CLOUD)
+        link = Link(
+            connected=self.session is not None and self.session.connected,
+            command_at=held.received_at if held else None,
+            rtt=self.rtt,
+            loss=self.loss,
+            clock_error=held.sent_at_error if held else nan,
+        )
+        before = self._choice
+        self._choice = arbiter.choose(self._needs, before, link, now)
+        if self._choice.source is not before.source:
+            self._counts[self._choice.reason] += 1
+            self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
+            _log.warning("control: %s -> %s (%s)", before.source, self._choice.source, self._choice.reason)
+
+    def _drive(self, now: float) -> Velocity:
+        source = self._choice.source
+        if source is Source.FALLBACK:
+            dt = min(max(0.0, now - self._now), self._limits.max_step_s)
+            wanted = self._fallback.step(self._supervised.velocity, self._readings, dt)
+            if wanted is not None:
+                (linear, angular), read_at = wanted
+                self._admit(Command(source, linear, angular, 0, self._ticks, read_at, 0.0, now), now)
+        return self._supervise(source, now)
+
+    def _supervise(self, source: Source, now: float) -> Velocity:
+        self._supervised, objections = supervisor.step(
+            self._limits, self._supervised, source, self._max_age(source), now
+        )
+        self._objections.update(objections)
+        return self._supervised.velocity
+
+    def _admit(self, command: Command, now: float) -> Objection | None:
+        age = self._max_age(command.source)
+        self._supervised, objection = supervisor.admit(self._limits, self._supervised, command, age, now)
+        if objection is not None:
+            self._objections[objection] += 1
+        return objection
+
+    def _max_age(self, source: Source) -> float:
+        return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)
+
+    def _brake(self, now: float) -> Velocity:
+        try:
+            return self._supervise(Source.STOP, now)
+        except Exception as error:  # nothing left to reason with
+            self._caught("supervisor", error)
+            self._supervised = Supervised()
+            return STANDSTILL
+
+    def _write(self, velocity: Velocity) -> None:
+        try:
+            self._base.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
+        except Exception as error:  # tried again at the next tick
+            self._caught("write", error)
+
+    def _caught(self, part: str, error: Exception) -> None:
+        """Count always; log the first of each part, with its trace."""
+        self._errors[part] += 1
+        if self._errors[part] == 1:
+            _log.error("%s failed, further ones are counted only: %s", part, error, exc_info=error)
+
+
+def _command(epoch: int, message: MessageReceived) -> Command:
+    twist = decode(Twist, message.payload)
+    return Command(
+        source=Source.CLOUD,
+        linear=twist.linear.x,
+        angular=twist.angular.z,
+        epoch=epoch,
+        sequence=message.sequence,
+        sent_at=message.sent_at,
+        sent_at_error=message.sent_at_error,
+        received_at=message.received_at,
+    )

@@ -1,0 +1,112 @@
+"""One bridge session of the agent, as the control loop sees it: send readings, take commands, know what is up.
+
+The bridge's thread puts in, the control loop takes out; neither ever waits for the other.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from itertools import count
+from typing import Protocol
+
+from skytether.bridge.port import Port, Publisher
+from skytether.messages import Message, encode
+from skytether.wire.events import Connected, Disconnected, Event, MessageReceived, Refused
+from skytether.wire.stats import SessionStats
+
+_log = logging.getLogger(__name__)
+
+_WAITING_COMMANDS = 16
+"""The control loop takes them every 10 ms; more than these in one tick are old news."""
+
+
+class Endpoint(Publisher, Protocol):
+    """What the agent needs of `skytether.bridge.Bridge`."""
+
+    def start(self) -> None:
+        """Bind."""
+        ...
+
+    def set_peer(self, host: str, port: int) -> None:
+        """Where the service is."""
+        ...
+
+    def stats(self) -> SessionStats:
+        """Counters."""
+        ...
+
+    def stop(self) -> None:
+        """Say goodbye and end."""
+        ...
+
+
+class LiveSession:
+    """A `Port` that keeps the arrivals of one topic, with the number of the handshake that they belong to.
+
+    Args:
+        id: The session's, to tell it from the next.
+        topics: What the robot may send in it.
+        command_topic: What it waits for.
+        epochs: Numbers of handshakes, shared with the sessions before and after it.
+    """
+
+    def __init__(self, id: str, topics: frozenset[str], command_topic: str, epochs: count[int]) -> None:  # noqa: A002
+        self.id = id
+        self.connected = False
+        self.bridge: Endpoint | None = None
+        self.peer: tuple[str, int] | None = None
+        self._topics = topics
+        self._command_topic = command_topic
+        self._epochs = epochs
+        self._epoch = next(epochs)
+        self._arrived: deque[tuple[int, MessageReceived]] = deque(maxlen=_WAITING_COMMANDS)
+
+    def open(self, make: Callable[[Port], Endpoint], peer: tuple[str, int]) -> None:
+        """Make the bridge and start it."""
+        bridge = make(self)
+        bridge.start()
+        self.bridge, self.peer = bridge, peer
+
+    def move(self, peer: tuple[str, int]) -> None:
+        """Follow the service to another address."""
+        if peer != self.peer and self.bridge is not None:
+            self.bridge.set_peer(*peer)
+            self.peer = peer
+
+    def close(self) -> None:
+        """End the bridge."""
+        self.connected = False
+        if self.bridge is not None:
+            self.bridge.stop()
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send a reading if the service takes it."""
+        if self.connected and self.bridge is not None and topic in self._topics:
+            self.bridge.publish(topic, encode(message, "cdr"))
+
+    def take(self) -> list[tuple[int, MessageReceived]]:
+        """What arrived since the last call, with the number of its handshake, oldest first."""
+        taken = []
+        while self._arrived:
+            taken.append(self._arrived.popleft())
+        return taken
+
+    def attach(self, publisher: Publisher) -> None:
+        """Port: nothing is needed from the bridge at this point."""
+
+    def deliver(self, message: MessageReceived) -> None:
+        """Port: keep commands; nothing else is waited for."""
+        if message.topic == self._command_topic:
+            self._arrived.append((self._epoch, message))
+
+    def notify(self, event: Event) -> None:
+        """Port: know what is up."""
+        if isinstance(event, Connected):
+            self._epoch = next(self._epochs)
+            self.connected = True
+        elif isinstance(event, Disconnected):
+            self.connected = False
+        elif isinstance(event, Refused):
+            _log.error("the service refused the session: %s", event.reason)

@@ -1,0 +1,244 @@
+"""The last gate before the wheels (Mello, thesis, section 5.1: Velocity Supervisor). Pure: time is an argument.
+
+A command passes twice. `admit` looks at it once, when it arrives: finite, in sequence, fresh. `step` runs at every tick
+of the control loop, takes what was last admitted from the source in charge, looks at its age again, and gives the
+wheels a velocity within the limits and within reach of the previous one. Whatever comes in, `step` gives a velocity
+that is safe; without a valid command it brakes to a standstill and stays there.
+
+No message, parameter or answer of the orchestrator changes a limit: they come from the robot's own configuration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from math import inf, isfinite, isnan, nan
+
+from skytether.control.admittance import STANDSTILL, Velocity
+
+from .command import Command, Source
+
+
+class Objection(StrEnum):
+    """What the supervisor found wrong; bounded, for counters."""
+
+    NOT_FINITE = "not_finite"
+    """A number of the command is NaN or infinite."""
+    SEQUENCE = "sequence"
+    """Not newer than one that was admitted in the same or a later handshake."""
+    STALE = "stale"
+    """Made from information that may be older than allowed."""
+    GAP = "gap"
+    """The last command arrived too long ago."""
+    FUTURE = "future"
+    """Sent or arrived later than now, beyond the clocks' error."""
+    CLOCK = "clock"
+    """The peer's clock is not known, or the robot's own did not advance."""
+    NO_COMMAND = "no_command"
+    """The source in charge has given none yet, or nobody is in charge."""
+    LINEAR_LIMIT = "linear_limit"
+    ANGULAR_LIMIT = "angular_limit"
+    LINEAR_ACCELERATION = "linear_acceleration"
+    ANGULAR_ACCELERATION = "angular_acceleration"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the robot's wheels may do, whoever drives. The defaults are the walker's (thesis section 2.5.1).
+
+    Attributes:
+        linear_max: Fastest forward [m/s].
+        linear_min: Fastest backward, 0 or negative [m/s]; 0: never backwards.
+        angular_max: Fastest to either side [rad/s].
+        linear_acceleration: Of ordinary changes, both ways [m/s^2].
+        angular_acceleration: Of ordinary changes, both ways [rad/s^2].
+        linear_braking: When no valid command is there [m/s^2].
+        angular_braking: When no valid command is there [rad/s^2].
+        max_gap_s: Longest time that a command from the cloud is repeated when no newer one arrives [s].
+        max_local_age_s: Oldest readings that a command of the robot's own fallback may be made from [s].
+        clock_tolerance_s: How far in the future a time may lie: readers of one clock in several threads [s].
+        period_s: Of the control loop; used to brake with when the clock fails [s].
+        max_step_s: Longest time that one step counts for, so that a stalled loop does not jump when it goes on [s].
+    """
+
+    linear_max: float = 0.25
+    linear_min: float = 0.0
+    angular_max: float = 0.5
+    linear_acceleration: float = 1.0
+    angular_acceleration: float = 2.0
+    linear_braking: float = 2.0
+    angular_braking: float = 4.0
+    max_gap_s: float = 0.15
+    max_local_age_s: float = 0.1
+    clock_tolerance_s: float = 0.01
+    period_s: float = 0.01
+    max_step_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse limits that would not limit.
+
+        Raises:
+            ValueError: A field is out of its range; the text names it.
+        """
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if name == "linear_min":
+                if not -inf < value <= 0:
+                    raise ValueError(f"limits: linear_min must be 0 or negative, not {value}")
+            elif not 0 < value < inf:
+                raise ValueError(f"limits: {name} must be above 0 and finite, not {value}")
+        if self.linear_braking < self.linear_acceleration or self.angular_braking < self.angular_acceleration:
+            raise ValueError("limits: braking must not be slower than ordinary acceleration")
+
+
+@dataclass(frozen=True, slots=True)
+class Supervised:
+    """What the supervisor remembers from tick to tick.
+
+    Attributes:
+        velocity: What the wheels were last told.
+        now: When they were told; None before the first step.
+        held: The command last admitted from each source.
+    """
+
+    velocity: Velocity = STANDSTILL
+    now: float | None = None
+    held: dict[Source, Command] = field(default_factory=dict)
+
+
+def admit(
+    limits: Limits, state: Supervised, command: Command, max_age_s: float, now: float
+) -> tuple[Supervised, Objection | None]:
+    """Look at a command that just arrived; hold it if it is good.
+
+    Args:
+        limits: The robot's.
+        state: What is remembered.
+        command: The arrival.
+        max_age_s: Oldest information that the source may act on [s]; see `max_age`.
+        now: Monotonic seconds.
+
+    Returns:
+        The new state, and what was wrong if the command was not admitted (the state is then unchanged).
+    """
+    objection = _objection_at_arrival(limits, state, command, max_age_s, now)
+    if objection:
+        return state, objection
+    return replace(state, held={**state.held, command.source: command}), None
+
+
+def step(
+    limits: Limits, state: Supervised, charge: Source, max_age_s: float, now: float
+) -> tuple[Supervised, tuple[Objection, ...]]:
+    """Decide what the wheels are told now: the ``velocity`` of the new state.
+
+    Args:
+        limits: The robot's.
+        state: What is remembered.
+        charge: Who is in charge, as the arbiter says; commands of others are not looked at.
+        max_age_s: Oldest information that the source in charge may act on [s].
+        now: Monotonic seconds.
+
+    Returns:
+        The new state, and everything that was objected to.
+    """
+    state, elapsed = _advance(limits, state, now)
+    dt = min(elapsed, limits.max_step_s)
+    command = state.held.get(charge)
+    objection = _objection_while_held(limits, command, max_age_s, now)
+    objections: tuple[Objection, ...]
+    if command is None or objection is not None:
+        velocity, objections = _brake(limits, state.velocity, dt), (objection or Objection.NO_COMMAND,)
+    else:
+        velocity, objections = _follow(limits, state.velocity, command, dt)
+    return replace(state, velocity=velocity), objections
+
+
+def max_age(limits: Limits, source: Source, max_rtt_s: float | None) -> float:
+    """Oldest information that a source may act on [s].
+
+    From the cloud: what a service needs of the round trip, and the time that a command may be repeated. The clock
+    offset's error is at most half a round trip, so the bound of a command's age at its arrival is at most one round
+    trip: a link that the service's manifest allows is never called stale.
+    """
+    if source is Source.CLOUD:
+        return (DEFAULT_MAX_RTT_S if max_rtt_s is None else max_rtt_s) + limits.max_gap_s
+    return limits.max_local_age_s
+
+
+DEFAULT_MAX_RTT_S = 1.0
+"""For services that state no need: no robot is driven by what is older."""
+
+
+def _advance(limits: Limits, state: Supervised, now: float) -> tuple[Supervised, float]:
+    """Take the time in. When the clock did not advance, nothing that is held can be judged by it any more."""
+    if state.now is None:
+        return replace(state, now=now if isfinite(now) else None), limits.period_s
+    elapsed = now - state.now
+    if isfinite(now) and elapsed > 0:
+        return replace(state, now=now), elapsed
+    held = {source: replace(command, received_at=nan) for source, command in state.held.items()}
+    return replace(state, now=now if isfinite(now) else state.now, held=held), limits.period_s
+
+
+def _objection_at_arrival(
+    limits: Limits, state: Supervised, command: Command, max_age_s: float, now: float
+) -> Objection | None:
+    if not (isfinite(command.linear) and isfinite(command.angular)):
+        return Objection.NOT_FINITE
+    held = state.held.get(command.source)
+    if held is not None and (command.epoch, command.sequence) <= (held.epoch, held.sequence):
+        return Objection.SEQUENCE
+    return _objection_while_held(limits, command, max_age_s, now)
+
+
+def _objection_while_held(limits: Limits, command: Command | None, max_age_s: float, now: float) -> Objection | None:
+    """Comparisons are written so that a NaN anywhere objects."""
+    if command is None:
+        return Objection.NO_COMMAND
+    if not 0 <= command.sent_at_error < inf:
+        return Objection.CLOCK
+    gap = now - command.received_at
+    if isnan(gap):
+        return Objection.CLOCK
+    age = now - command.sent_at
+    if not (gap >= -limits.clock_tolerance_s and age >= -limits.clock_tolerance_s - command.sent_at_error):
+        return Objection.FUTURE
+    if not gap <= limits.max_gap_s:
+        return Objection.GAP
+    if not age + command.sent_at_error <= max_age_s:
+        return Objection.STALE
+    return None
+
+
+def _brake(limits: Limits, velocity: Velocity, dt: float) -> Velocity:
+    return Velocity(
+        _approach(velocity.linear, 0.0, limits.linear_braking * dt),
+        _approach(velocity.angular, 0.0, limits.angular_braking * dt),
+    )
+
+
+def _follow(limits: Limits, velocity: Velocity, command: Command, dt: float) -> tuple[Velocity, tuple[Objection, ...]]:
+    linear = min(max(command.linear, limits.linear_min), limits.linear_max)
+    angular = min(max(command.angular, -limits.angular_max), limits.angular_max)
+    reached = Velocity(
+        _approach(velocity.linear, linear, limits.linear_acceleration * dt),
+        _approach(velocity.angular, angular, limits.angular_acceleration * dt),
+    )
+    objections = []
+    if linear != command.linear:
+        objections.append(Objection.LINEAR_LIMIT)
+    if angular != command.angular:
+        objections.append(Objection.ANGULAR_LIMIT)
+    if reached.linear != linear:
+        objections.append(Objection.LINEAR_ACCELERATION)
+    if reached.angular != angular:
+        objections.append(Objection.ANGULAR_ACCELERATION)
+    return reached, tuple(objections)
+
+
+def _approach(value: float, target: float, most: float) -> float:
+    """Go from ``value`` towards ``target``, at most by ``most``."""
+    if abs(target - value) <= most:
+        return target
+    return value + most if target > value else value - most

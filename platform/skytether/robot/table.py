@@ -1,0 +1,62 @@
+"""The robot's topic table: what it offers of what the service takes, in the robot's encoding. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.wire.topic import Direction, Topic
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A topic that the robot can send.
+
+    Attributes:
+        type: ROS 2 style type name.
+        type_hash: ROS 1 MD5 or ROS 2 RIHS01; empty: not checked.
+        encoding: ``cdr`` or ``ros1``.
+    """
+
+    type: str
+    type_hash: str = ""
+    encoding: str = "cdr"
+
+
+def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, encoding: str = "cdr") -> tuple[Topic, ...]:
+    """Join what a service takes with what a robot offers.
+
+    A row of the service that the robot offers too carries the robot's type, hash and encoding (a wrong type is told by
+    the handshake, which names both). A row ``*`` takes every other offer with its quality of service. Offers that the
+    service does not take are left out. The service's own topics are all wanted.
+
+    Args:
+        specs: The service's topics, from the session.
+        offers: The robot's, by name.
+        encoding: In which the robot wants the service's topics.
+    """
+    rows = list(specs)
+    named = {spec.name: spec for spec in rows}
+    anything = named.pop(ANY_TOPIC, None)
+    table = [_topic(spec, spec.name, Offer(spec.type, "", encoding)) for spec in rows if spec.direction == "out"]
+    for name, offer in offers.items():
+        row = named.get(name, anything)
+        if row is not None and row.direction == "in":
+            table.append(_topic(row, name, offer))
+    return tuple(table)
+
+
+def _topic(spec: TopicSpec, name: str, offer: Offer) -> Topic:
+    return Topic(
+        name=name,
+        type=offer.type,
+        direction=Direction(spec.direction),
+        type_hash=offer.type_hash,
+        encoding=offer.encoding,
+        priority=spec.priority,
+        period=None if spec.period_ms is None else spec.period_ms / 1000,
+        lifespan=spec.lifespan_ms / 1000,
+        depth=spec.depth,
+        delivery=spec.delivery,
+    )
