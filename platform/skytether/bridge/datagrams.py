@@ -35,7 +35,7 @@ Address = tuple[str, int] | tuple[str, int, int, int]
 _SEGMENT_SIZE = struct.Struct("=H")
 _GRO_SIZE = struct.Struct("=i")
 _GRO_SPACE = socket.CMSG_SPACE(_GRO_SIZE.size)
-_NO_BATCHES = (errno.EINVAL, errno.EIO, errno.EMSGSIZE, errno.EOPNOTSUPP)
+_NO_BATCHES = (errno.EINVAL, errno.EIO, errno.EOPNOTSUPP)
 """What a kernel or network device answers that cannot cut this batch."""
 
 

@@ -1,0 +1,244 @@
+"""One end of a session on a real network: what applications see of it, from any thread.
+
+The session runs in a thread with an event loop of its own (see `driver`). What an application does in its threads
+never runs there, and what runs there never waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import os
+import selectors
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+
+from skytether.wire import Config, Session
+from skytether.wire.stats import SessionStats
+
+from .datagrams import Address, DatagramSocket
+from .driver import Driver
+from .port import Port
+from .spec import SessionSpec
+
+_HANDOVER_BYTES = 32 * 1024 * 1024
+"""What publishers may have handed over before the bridge's thread gets to run: two of the largest messages."""
+_STATS_TIMEOUT = 2.0
+
+
+class BridgeError(Exception):
+    """An endpoint cannot do what it was told; the text says what to change."""
+
+
+class Bridge:
+    """Holds one end of a session: connects by itself, stays connected by itself, and moves messages.
+
+    Every method may be called from any thread.
+
+    Attributes:
+        address: Host and port where it is bound, once started.
+    """
+
+    def __init__(
+        self,
+        spec: SessionSpec,
+        port: Port,
+        *,
+        bind: tuple[str, int] = ("127.0.0.1", 0),
+        peer: tuple[str, int] | None = None,
+        config: Config | None = None,
+    ) -> None:
+        """Prepare; nothing is opened before `start`.
+
+        Args:
+            spec: The session and this end of it.
+            port: The graph to join.
+            bind: Local host and port; port 0 takes any free one. The robot's end needs an address from which
+                the peer can be reached, "0.0.0.0" (or "::") for any.
+            peer: Where the service's end listens; the robot's end needs it, now or by `set_peer`.
+            config: Of the protocol.
+        """
+        self.address = bind
+        self._spec = spec
+        self._port = port
+        self._peer = peer
+        self._config = config or Config()
+        self._sends = frozenset(t.name for t in spec.topics if t.direction.sender is spec.role)
+        self._handover: deque[tuple[str, bytes, float]] = deque()
+        self._handover_bytes = 0
+        self._overrun: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._last_stats = SessionStats(connected=False)
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._socket: DatagramSocket
+        self._driver: Driver
+        self._loop: asyncio.AbstractEventLoop
+
+    def start(self) -> None:
+        """Bind and begin; returns once packets are received. The session comes up later: `Port.notify` tells.
+
+        Raises:
+            BridgeError: The port is taken, the address is not this machine's, or the peer has no address.
+        """
+        if self._thread is not None:
+            raise BridgeError("this bridge was started before; make a new one")
+        host, port = self.address
+        try:
+            self._socket = DatagramSocket(self.address)
+        except OSError as error:
+            raise BridgeError(f"cannot listen on UDP {host}:{port}: {error.strerror or error}") from error
+        try:
+            self.address = self._socket.address
+            spec = self._spec
+            session = Session(
+                spec.role, spec.id, spec.key, spec.topics, config=self._config, entropy=os.urandom, now=time.monotonic()
+            )
+            if self._peer is not None:
+                session.set_peer(self._resolve(*self._peer))
+            self._loop = _new_loop(self._socket)
+        except BaseException:
+            self._socket.close()
+            raise
+        self._driver = Driver(session, self._socket, self._port, self._loop)
+        self._port.attach(self)
+        self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
+        self._thread.start()
+
+    def publish(self, topic: str, payload: bytes | memoryview) -> bool:
+        if topic not in self._sends:
+            raise KeyError(f"topic '{topic}' is not one that this end ({self._spec.role}) sends")
+        size = len(payload) if isinstance(payload, bytes) else payload.nbytes
+        if size > self._config.max_message:
+            raise ValueError(
+                f"topic '{topic}': {size} bytes are more than a message may have, {self._config.max_message}"
+            )
+        if self._thread is None or topic not in self._driver.agreed:
+            return False
+        with self._lock:
+            # The caller may use its buffer again, so anything but bytes is copied.
+            self._handover.append((topic, bytes(payload), time.monotonic()))
+            self._handover_bytes += size
+            while self._handover_bytes > _HANDOVER_BYTES:
+                oldest, dropped, _ = self._handover.popleft()
+                self._handover_bytes -= len(dropped)
+                self._overrun[oldest] += 1
+            first = len(self._handover) == 1
+        return not first or self._soon(self._on_handover)
+
+    def set_peer(self, host: str, port: int) -> None:
+        """Speak to a service's end elsewhere from now on.
+
+        Raises:
+            BridgeError: The name has no address.
+        """
+        self._peer = (host, port)
+        if self._thread is not None:
+            address = self._resolve(host, port)
+            self._soon(lambda: self._driver.set_peer(address))
+
+    def stats(self) -> SessionStats:
+        """A snapshot; after `stop` the last one."""
+        if threading.current_thread() is self._thread:
+            return self._take_stats()
+        answer: concurrent.futures.Future[SessionStats] = concurrent.futures.Future()
+        if self._soon(lambda: answer.set_result(self._take_stats())):
+            try:
+                return answer.result(_STATS_TIMEOUT)
+            except concurrent.futures.TimeoutError:
+                pass  # stopped in between, or a port that does not return
+        return self._last_stats
+
+    def stop(self) -> None:
+        """Say goodbye, end the thread, free the port. May be called again; from a port it does not wait."""
+        with self._lock:
+            first, self._stopping = not self._stopping, True
+        if first:
+            self._soon(self._on_stop)
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def __enter__(self) -> Bridge:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    # --- in the bridge's thread ------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        self._loop.call_soon(self._driver.begin)
+        try:
+            self._loop.run_forever()
+            # What others asked for meanwhile (statistics) gets its answer.
+            self._loop.run_until_complete(asyncio.sleep(0))
+        finally:
+            self._loop.close()
+            self._socket.close()
+
+    def _on_handover(self) -> None:
+        with self._lock:
+            messages, self._handover = self._handover, deque()
+            self._handover_bytes = 0
+        self._driver.publish(messages)
+
+    def _on_stop(self) -> None:
+        self._driver.close()
+        self._last_stats = self._take_stats()
+        self._loop.stop()
+
+    def _take_stats(self) -> SessionStats:
+        stats = self._driver.stats()
+        if not self._overrun:
+            return stats
+        # Dropped before the session saw them: offered and replaced all the same.
+        topics = tuple(
+            replace(t, offered=t.offered + dropped, replaced=t.replaced + dropped)
+            if t.topic in self._sends and (dropped := self._overrun[t.topic])
+            else t
+            for t in stats.topics
+        )
+        return replace(stats, topics=topics)
+
+    # --- helpers ---------------------------------------------------------------------------------------------------
+
+    def _soon(self, callback: Callable[[], None]) -> bool:
+        """Have something done in the bridge's thread; False if that has ended or was never started."""
+        if self._thread is None:
+            return False
+        try:
+            self._loop.call_soon_threadsafe(callback)
+        except RuntimeError:  # the loop is closed
+            return False
+        return True
+
+    def _resolve(self, host: str, port: int) -> Address:
+        try:
+            return self._socket.resolve(host, port)
+        except OSError as error:
+            raise BridgeError(f"peer {host}:{port} has no address: {error.strerror or error}") from error
+
+
+def _new_loop(sock: DatagramSocket) -> asyncio.AbstractEventLoop:
+    """An event loop that keeps time to some microseconds.
+
+    The default's epoll has its time-outs rounded up to milliseconds, which would be added to every copy and every
+    paced burst; select has not, but it takes descriptors below 1024 only.
+    """
+    selector = selectors.SelectSelector()
+    loop = asyncio.SelectorEventLoop(selector)
+    try:
+        selector.register(sock, selectors.EVENT_READ)
+        selector.select(0)
+        selector.unregister(sock)
+    except ValueError:
+        loop.close()
+        return asyncio.SelectorEventLoop()
+    return loop

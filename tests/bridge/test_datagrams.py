@@ -1,0 +1,174 @@
+import errno
+import select
+import socket
+
+import pytest
+
+from skytether.bridge.datagrams import MAX_SEGMENTS, DatagramSocket
+
+
+@pytest.fixture
+def sockets():
+    """Makes bound sockets and closes them."""
+    made = []
+
+    def make(host="127.0.0.1", port=0, **options):
+        sock = DatagramSocket((host, port), **options)
+        made.append(sock)
+        return sock
+
+    yield make
+    for sock in made:
+        sock.close()
+
+
+def receive(sock, size):
+    """All datagrams up to a total size, one by one."""
+    datagrams = []
+    while sum(map(len, datagrams)) < size:
+        assert select.select([sock], (), (), 2)[0], f"only {len(datagrams)} datagrams came"
+        while (batch := sock.receive()) is not None:
+            data, _, segment = batch
+            step = segment or len(data) or 1
+            datagrams += [bytes(data[i : i + step]) for i in range(0, len(data), step)]
+    return datagrams
+
+
+def cut(data, segment):
+    return [data[i : i + segment] for i in range(0, len(data), segment)]
+
+
+@pytest.mark.parametrize("sender_batches", [True, False])
+@pytest.mark.parametrize("receiver_batches", [True, False])
+@pytest.mark.parametrize("size", [1, 1200, 1201, 2400, 47_611, 65_536, 200_000])
+def test_a_batch_arrives_as_its_datagrams_whatever_the_kernels_can(sockets, size, sender_batches, receiver_batches):
+    sender, receiver = sockets(batches=sender_batches), sockets(batches=receiver_batches)
+    assert (sender.segmentation, receiver.coalescing) <= (sender_batches, receiver_batches)
+    data = bytes(i * 7 % 251 for i in range(size))
+    assert sender.send(data, receiver.address, 1200) == size
+    assert receive(receiver, size) == cut(data, 1200)
+    assert not sender.errors
+
+
+def test_without_a_segment_size_it_is_one_datagram(sockets):
+    sender, receiver = sockets(), sockets()
+    assert sender.send(b"one", receiver.address) == 3
+    assert receive(receiver, 3) == [b"one"]
+
+
+def test_the_sender_is_told(sockets):
+    sender, receiver = sockets(), sockets()
+    sender.send(b"x", receiver.address)
+    select.select([receiver], (), (), 2)
+    assert receiver.receive()[1] == sender.address
+
+
+class RefusingSocket:
+    """A real socket whose sendmsg refuses to cut, as kernels and devices without UDP_SEGMENT do."""
+
+    def __init__(self, real, number):
+        self._real, self._number = real, number
+
+    def sendmsg(self, *_):
+        raise OSError(self._number, "refused")
+
+    def __getattr__(self, name):
+        return getattr(self._real, name)
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
+def test_a_kernel_that_refuses_batches_gets_datagrams_from_then_on(sockets, number):
+    sender, receiver = sockets(), sockets()
+    if not sender.segmentation:
+        pytest.skip("this kernel has no UDP_SEGMENT")
+    sender._socket = RefusingSocket(sender._socket, number)
+    data = bytes(range(250)) * 20
+    assert sender.send(data, receiver.address, 1200) == len(data)
+    assert receive(receiver, len(data)) == cut(data, 1200)
+    assert not sender.segmentation
+    assert not sender.errors
+
+
+def test_a_batch_beyond_what_the_kernel_cuts_at_once_is_split(sockets):
+    sender, receiver = sockets(), sockets()
+    data = bytes(100 * (2 * MAX_SEGMENTS + 1))
+    assert sender.send(data, receiver.address, 100) == len(data)
+    assert len(receive(receiver, len(data))) == 2 * MAX_SEGMENTS + 1
+
+
+def test_a_datagram_too_large_for_the_path_is_dropped_and_counted_never_fragmented(sockets):
+    sender, receiver = sockets(), sockets()
+    assert sender.send(bytes(70_000), receiver.address) == 70_000
+    assert sender.errors == {"EMSGSIZE": 1}
+    sender.send(b"next", receiver.address)
+    assert receive(receiver, 4) == [b"next"]
+
+
+def test_no_route_is_counted_and_the_next_datagram_goes_out(sockets):
+    sender, receiver = sockets(), sockets()
+    sender.send(b"x", ("203.0.113.1", 9))  # bound to loopback: the kernel refuses to send it outside
+    assert sum(sender.errors.values()) == 1
+    sender.send(b"next", receiver.address)
+    assert receive(receiver, 4) == [b"next"]
+
+
+class FullSocket:
+    """A real socket whose buffer takes a number of datagrams and is full then."""
+
+    def __init__(self, real, takes):
+        self._real, self._takes = real, takes
+
+    def sendto(self, data, address):
+        if not self._takes:
+            raise BlockingIOError(errno.EAGAIN, "full")
+        self._takes -= 1
+        return self._real.sendto(data, address)
+
+    def __getattr__(self, name):
+        return getattr(self._real, name)
+
+
+def test_a_full_buffer_returns_how_far_it_got(sockets):
+    sender, receiver = sockets(batches=False), sockets()
+    sender._socket = FullSocket(sender._socket, 2)
+    data = bytes(range(250)) * 20
+    assert sender.send(data, receiver.address, 1200) == 2400
+    assert receive(receiver, 2400) == cut(data, 1200)[:2]
+
+
+def test_an_icmp_answer_harms_nothing(sockets):
+    sender, receiver, gone = sockets(), sockets(), sockets()
+    # With IP_RECVERR Linux reports ICMP answers on unconnected sockets too, as other systems always do.
+    sender._socket.setsockopt(socket.IPPROTO_IP, 11, 1)
+    nobody = gone.address
+    gone.close()
+    sender.send(b"x", nobody)
+    assert sender.receive() is None
+    receiver.send(b"y", sender.address)
+    assert receive(sender, 1) == [b"y"]
+    assert sender.errors["ECONNREFUSED"] >= 1
+
+
+def test_ipv6(sockets):
+    try:
+        sender, receiver = sockets("::1"), sockets("::1")
+    except OSError:
+        pytest.skip("no IPv6 here")
+    data = bytes(5000)
+    assert sender.send(data, sender.resolve("::1", receiver.address[1]), 1200) == 5000
+    assert receive(receiver, 5000) == cut(data, 1200)
+
+
+def test_a_dual_stack_socket_reaches_an_ipv4_peer(sockets):
+    try:
+        sender = sockets("::")
+    except OSError:
+        pytest.skip("no IPv6 here")
+    receiver = sockets()
+    sender.send(b"x", sender.resolve(*receiver.address))
+    assert receive(receiver, 1) == [b"x"]
+
+
+def test_a_taken_port_is_an_error_and_leaves_no_socket_behind(sockets):
+    with pytest.raises(OSError, match="in use"):
+        sockets(port=sockets().address[1])  # an open socket would fail this test with a ResourceWarning
