@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import count
 from math import isfinite, nan
 from random import Random
@@ -21,6 +21,7 @@ from skytether.api import rest
 from skytether.api.client import Client
 from skytether.bridge import Bridge, BridgeError, SessionSpec
 from skytether.bridge.port import Port
+from skytether.bridge.spec import parse_id, parse_key
 from skytether.messages import Message, Twist, type_hash, warm
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
@@ -77,8 +78,8 @@ class AgentConfig:
     measurements: Mapping[str, rest.Measurement] = field(default_factory=dict)
     fallback: str = "stop"
     fallback_options: Mapping[str, Any] = field(default_factory=dict)
-    limits: Limits = Limits()
-    needs: Needs = Needs()
+    limits: Limits = field(default_factory=Limits)
+    needs: Needs = field(default_factory=Needs)
     command_topic: str = "cmd_vel"
     rate_hz: float = 100.0
     lease_s: float = 15.0
@@ -286,7 +287,7 @@ class Agent:
 
     def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
         topics = robot_table(granted.topics, offers(self._base.topics))
-        spec = replace(SessionSpec.from_api(granted, Role.ROBOT), topics=topics)
+        spec = SessionSpec(parse_id(granted.id), parse_key(granted.key), Role.ROBOT, topics)
         session = LiveSession(
             granted.id, frozenset(topic.name for topic in topics), self._config.command_topic, self._epochs
         )

@@ -100,9 +100,9 @@ class Asker:
         except Unreachable as error:
             return self._say(str(error), self._backoff.next())
         except ApiError as error:
-            if error.status == 404 and self._instance is not None:
+            if error.problem.status == 404 and self._instance is not None:
                 return self._lost(f"instance {self._instance.id} is gone; asking for {self._request.service} again")
-            if error.status in (401, 403):
+            if error.problem.status in (401, 403):
                 return self._say(str(error), _REFUSED_S)
             return self._say(str(error), self._backoff.next())
         if instance.state.final or instance.state is State.STOPPING:

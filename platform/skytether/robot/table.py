@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
-from skytether.wire.topic import Direction, Topic
+from skytether.bridge.spec import topic_from_api
+from skytether.wire.topic import Topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +49,4 @@ def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, enco
 
 
 def _topic(spec: TopicSpec, name: str, offer: Offer) -> Topic:
-    return Topic(
-        name=name,
-        type=offer.type,
-        direction=Direction(spec.direction),
-        type_hash=offer.type_hash,
-        encoding=offer.encoding,
-        priority=spec.priority,
-        period=None if spec.period_ms is None else spec.period_ms / 1000,
-        lifespan=spec.lifespan_ms / 1000,
-        depth=spec.depth,
-        delivery=spec.delivery,
-    )
+    return replace(topic_from_api(spec), name=name, type=offer.type, type_hash=offer.type_hash, encoding=offer.encoding)
