@@ -1,0 +1,99 @@
+from collections.abc import Callable, Iterable
+from math import nan
+
+import pytest
+
+from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
+from skytether.robot.session import LiveSession
+from skytether.wire.events import Connected, MessageReceived
+from skytether.wire.stats import SessionStats
+
+
+class PushedBase:
+    """A base whose force sensor feels a constant push, and that remembers every velocity it was told."""
+
+    topics = {"force": WrenchStamped}
+
+    def __init__(self) -> None:
+        self.push = 12.0
+        self.written: list[tuple[float, float]] = []
+        self.on_read: Callable[[], None] = lambda: None
+        self.on_write: Callable[[], None] = lambda: None
+
+    def read(self, now: float) -> Iterable[tuple[str, Message]]:
+        self.on_read()
+        return [("force", WrenchStamped(wrench=Wrench(force=Vector3(x=self.push))))]
+
+    def write(self, twist: Twist) -> None:
+        self.on_write()
+        self.written.append((twist.linear.x, twist.angular.z))
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        return self.written[-1]
+
+
+class RecordingBridge:
+    """The robot's end of a bridge without a network: keeps what it was told."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[str, bytes]] = []
+        self.peers: list[tuple[str, int]] = []
+        self.running = False
+        self.snapshot = SessionStats(connected=True)
+
+    def start(self) -> None:
+        self.running = True
+
+    def publish(self, topic: str, payload: bytes | memoryview) -> bool:
+        self.published.append((topic, bytes(payload)))
+        return True
+
+    def set_peer(self, host: str, port: int) -> None:
+        self.peers.append((host, port))
+
+    def stats(self) -> SessionStats:
+        return self.snapshot
+
+    def stop(self) -> None:
+        self.running = False
+
+
+class Cloud:
+    """The service's side of a `LiveSession`: connects and sends commands."""
+
+    def __init__(self, session: LiveSession) -> None:
+        self.session = session
+        self.sequence = 0
+        session.notify(Connected(()))
+
+    def send(self, now: float, linear: float = 0.2, angular: float = 0.1, *, delay: float = 0.02) -> None:
+        payload = encode(Twist(linear=Vector3(x=linear), angular=Vector3(z=angular)), "cdr")
+        self.send_bytes(now, payload, delay=delay)
+
+    def send_bytes(self, now: float, payload: bytes, *, delay: float = 0.02) -> None:
+        self.session.deliver(MessageReceived("cmd_vel", payload, self.sequence, now - delay, 0.01, now))
+        self.sequence += 1
+
+
+@pytest.fixture
+def base() -> PushedBase:
+    return PushedBase()
+
+
+NAN_TWIST = encode(Twist(linear=Vector3(x=nan)), "cdr")
+
+
+@pytest.fixture
+def nan_twist() -> bytes:
+    return NAN_TWIST
+
+
+@pytest.fixture
+def bridge() -> RecordingBridge:
+    return RecordingBridge()
+
+
+@pytest.fixture
+def make_cloud() -> type[Cloud]:
+    return Cloud

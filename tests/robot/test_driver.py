@@ -1,0 +1,250 @@
+import logging
+from itertools import count, pairwise
+from math import nan
+
+import pytest
+
+from skytether.control.admittance import Velocity
+from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
+from skytether.robot.arbiter import Needs, Reason
+from skytether.robot.command import Source
+from skytether.robot.driver import Driver
+from skytether.robot.fallback import Admittance, Stop
+from skytether.robot.session import LiveSession
+from skytether.robot.supervisor import Limits
+from skytether.wire.events import Connected, Disconnected
+
+TICK = 0.01
+
+
+class BrokenFallback:
+    drives = True
+
+    def step(self, velocity, readings, dt):
+        raise ZeroDivisionError
+
+
+class Rig:
+    """A driver with made-up time, a base and, after `connect`, a cloud."""
+
+    def __init__(self, base, cloud, fallback=None, observer=None):
+        self.base = base
+        self.now = 100.0
+        self.driver = Driver(base, fallback or Admittance(), Limits(), Needs(), self.now, observer)
+        self._make_cloud = cloud
+        self._epochs = count(1)
+        self.cloud = None
+
+    def connect(self, bridge):
+        session = LiveSession("1", frozenset({"force"}), "cmd_vel", self._epochs)
+        session.open(lambda port: bridge, ("127.0.0.1", 1))
+        self.cloud = self._make_cloud(session)
+        self.driver.session = session
+
+    def run(self, seconds, **command):
+        """Tick; if a cloud is there and a command is given, it sends one before each tick."""
+        for _ in range(round(seconds / TICK)):
+            self.now += TICK
+            if command and self.cloud:
+                self.cloud.send(self.now, **command)
+            self.driver.tick(self.now)
+        return self.driver.status()
+
+
+@pytest.fixture
+def rig(base, make_cloud):
+    return Rig(base, make_cloud)
+
+
+@pytest.fixture
+def driven(rig, bridge):
+    rig.connect(bridge)
+    assert rig.run(1.5, linear=0.2, angular=0.1).source is Source.CLOUD
+    return rig
+
+
+def test_without_a_cloud_the_person_drives(rig):
+    status = rig.run(3.0)
+    assert status.source is Source.FALLBACK
+    assert [t.reason for t in status.transitions] == [Reason.START]
+    # 12 N push: 6 N mean force over 60 N s/m.
+    assert rig.base.velocity == pytest.approx((0.1, 0.0), abs=1e-3)
+    assert len(rig.base.written) == 300
+
+
+def test_with_stop_as_fallback_the_wheels_stand(base, make_cloud):
+    rig = Rig(base, make_cloud, fallback=Stop())
+    assert rig.run(0.5).source is Source.STOP
+    assert set(base.written) == {(0.0, 0.0)}
+
+
+def test_the_cloud_drives_and_gets_the_readings(driven, bridge):
+    status = driven.driver.status()
+    assert driven.base.velocity == pytest.approx((0.2, 0.1))
+    assert [(t.source, t.reason) for t in status.transitions] == [
+        (Source.FALLBACK, Reason.START),
+        (Source.CLOUD, Reason.RECOVERED),
+    ]
+    assert status.first_command_at == pytest.approx(100.01)
+    assert status.seconds[Source.FALLBACK] == pytest.approx(1.01, abs=0.02)
+    assert status.seconds[Source.CLOUD] == pytest.approx(0.49, abs=0.02)
+    assert len(bridge.published) == 150
+    assert decode(WrenchStamped, bridge.published[0][1]).wrench.force.x == 12.0
+
+
+def test_silence_hands_over_to_the_person_within_300_ms_without_a_jump_and_back(driven, caplog):
+    caplog.set_level(logging.WARNING)
+    silence = driven.now
+    status = driven.run(0.3)
+    assert status.source is Source.FALLBACK
+    assert status.transitions[-1].reason is Reason.NO_COMMAND
+    assert status.transitions[-1].at - silence <= 0.17
+    driven.run(2.0)
+    assert driven.base.velocity == pytest.approx((0.1, 0.0), abs=1e-3)
+    status = driven.run(1.5, linear=0.25, angular=-0.5)
+    assert status.source is Source.CLOUD
+    assert status.transition_counts == {"start": 1, "no_command": 1, "recovered": 2}
+    assert [record.message for record in caplog.records] == [
+        "control: cloud -> fallback (no_command)",
+        "control: fallback -> cloud (recovered)",
+    ]
+    limits = Limits()
+    for (v0, w0), (v1, w1) in pairwise(driven.base.written):
+        assert abs(v1 - v0) <= limits.linear_acceleration * TICK + 1e-9, "no braking in between, no jump"
+        assert abs(w1 - w0) <= limits.angular_acceleration * TICK + 1e-9
+
+
+def test_a_session_that_ends_hands_over_at_the_next_tick(driven):
+    driven.cloud.session.notify(Disconnected("silent"))
+    status = driven.run(TICK, linear=0.2)
+    assert status.transitions[-1].reason is Reason.DISCONNECTED
+
+
+def test_a_new_handshake_starts_the_sequence_anew(driven):
+    driven.cloud.session.notify(Connected(()))
+    driven.cloud.sequence = 0
+    status = driven.run(0.5, linear=0.2)
+    assert status.source is Source.CLOUD
+    assert "sequence" not in status.objections
+
+
+def test_a_replayed_sequence_is_not_followed(driven):
+    driven.cloud.sequence = 0
+    status = driven.run(0.5, linear=0.2)
+    assert status.source is Source.FALLBACK
+    assert status.objections["sequence"] == 50
+
+
+def test_nonsense_from_the_cloud_is_counted_and_not_followed(driven, nan_twist):
+    driven.cloud.send_bytes(driven.now, b"no twist")
+    driven.cloud.send_bytes(driven.now, nan_twist)
+    status = driven.run(0.3)
+    assert status.errors == {"decode": 1}
+    assert status.objections["not_finite"] == 1
+    assert status.source is Source.FALLBACK
+
+
+def test_a_sensor_that_raises_brakes_the_wheels_and_is_logged_once(driven, caplog):
+    def fail():
+        raise OSError("cable")
+
+    driven.base.on_read = fail
+    status = driven.run(0.3, linear=0.2)
+    assert driven.base.velocity == (0.0, 0.0)
+    assert driven.base.written[-30] == pytest.approx((0.18, 0.06)), "braked, not stopped dead"
+    assert status.errors == {"control": 30}
+    assert len([record for record in caplog.records if "control failed" in record.message]) == 1
+    driven.base.on_read = lambda: None
+    driven.run(1.5, linear=0.2)
+    assert driven.base.velocity[0] == pytest.approx(0.2)
+
+
+def test_a_fallback_that_raises_brakes_the_wheels(base, make_cloud):
+    rig = Rig(base, make_cloud, fallback=BrokenFallback())
+    assert rig.run(0.1).errors == {"control": 10}
+    assert set(base.written) == {(0.0, 0.0)}
+
+
+def test_a_supervisor_that_raises_stops_the_wheels(driven, monkeypatch):
+    monkeypatch.setattr("skytether.robot.driver.supervisor.step", lambda *args: 1 / 0)
+    assert driven.run(TICK).errors == {"control": 1, "supervisor": 1}
+    assert driven.base.velocity == (0.0, 0.0)
+
+
+def test_wheels_that_cannot_be_written_are_tried_again(driven):
+    def fail():
+        raise OSError("bus")
+
+    driven.base.on_write = fail
+    assert driven.run(0.1, linear=0.2).errors == {"write": 10}
+    driven.base.on_write = lambda: None
+    driven.run(TICK, linear=0.2)
+    assert driven.base.velocity == pytest.approx((0.2, 0.0), abs=0.11)
+
+
+def test_a_bridge_that_raises_costs_the_cloud_a_reading_only(driven, bridge, monkeypatch):
+    monkeypatch.setattr(bridge, "publish", lambda topic, payload: 1 / 0)
+    status = driven.run(0.2, linear=0.2, angular=0.1)
+    assert status.errors == {"publish": 20}
+    assert driven.base.velocity == pytest.approx((0.2, 0.1))
+
+
+def test_sensors_that_went_silent_stop_the_fallback(rig, monkeypatch):
+    rig.run(1.0)
+    monkeypatch.setattr(rig.base, "read", lambda now: [])
+    status = rig.run(0.5)
+    assert rig.base.velocity == (0.0, 0.0)
+    assert status.objections["stale"] > 0
+
+
+def test_a_clock_that_jumps_back_brakes(driven):
+    driven.now -= 10
+    driven.run(TICK)
+    assert driven.base.velocity[0] < 0.2
+    driven.run(2.0, linear=0.2)
+    assert driven.driver.status().source is Source.CLOUD
+
+
+def test_the_services_needs_decide(driven):
+    driven.driver.set_needs(0.1, None)
+    driven.driver.rtt = 0.3
+    status = driven.run(0.6, linear=0.2)
+    assert status.transitions[-1].reason is Reason.RTT
+    driven.driver.rtt = nan
+    driven.driver.set_needs(None, 0.2)
+    assert driven.run(1.2, linear=0.2).source is Source.CLOUD
+    driven.driver.loss = 0.3
+    assert driven.run(0.6, linear=0.2).transitions[-1].reason is Reason.LOSS
+
+
+def test_the_observer_sees_each_command_and_cannot_stop_the_robot(base, make_cloud, bridge):
+    seen = []
+
+    def observe(command, objection):
+        seen.append((command.sequence, objection))
+        raise RuntimeError
+
+    rig = Rig(base, make_cloud, observer=observe)
+    rig.connect(bridge)
+    status = rig.run(1.5, linear=0.2)
+    assert seen == [(i, None) for i in range(150)]
+    assert status.source is Source.CLOUD
+
+
+def test_halt_writes_zero(driven):
+    driven.driver.halt()
+    assert driven.base.velocity == (0.0, 0.0)
+    assert driven.driver.status().velocity == Velocity(0.0, 0.0)
+
+
+def test_only_what_the_service_takes_is_sent(rig, bridge):
+    rig.connect(bridge)
+    rig.driver.session.publish("diary", WrenchStamped())
+    assert bridge.published == []
+
+
+def test_what_else_the_service_sends_is_not_a_command(rig, bridge):
+    rig.connect(bridge)
+    message = encode(Twist(linear=Vector3(x=0.2)), "cdr")
+    rig.cloud.session.deliver(type("M", (), {"topic": "path", "payload": message})())
+    assert rig.cloud.session.take() == []
