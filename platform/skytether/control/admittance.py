@@ -2,10 +2,10 @@
 
 The thesis's law is ``v_c = (F - m v') / d``, the same for rotation. Taken literally, with the acceleration v' measured
 on the walker, it is an algebraic loop: the command follows the walker's acceleration, which follows the command through
-a motor lag T and a network delay. Its gain at high frequency is (m / d) / T; above 1 it oscillates at any delay, and the
-useful m / d (0.2 to 0.5 s) is well above T = 0.1 s. So v' is the acceleration of the commanded velocity itself: the law
-is the differential equation ``m v' + d v = F``, solved implicitly per step (backward Euler), which is stable for every
-m, d > 0 and every step. For a walker that follows its commands both are the same law.
+a motor lag T and a network delay. Its gain at high frequency is (m / d) / T; above 1 it oscillates at any delay, and
+the useful m / d (0.2 to 0.5 s) is well above T = 0.1 s. So v' is the acceleration of the commanded velocity itself: the
+law is the differential equation ``m v' + d v = F``, solved implicitly per step (backward Euler), which is stable for
+every m, d > 0 and every step. For a walker that follows its commands both are the same law.
 
 The state is the velocity itself and is limited, not only the output, so nothing winds up behind a limit.
 """
