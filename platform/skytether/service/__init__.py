@@ -1,0 +1,28 @@
+"""What a service author needs: one class with typed topics, parameters and a step, and `run`.
+
+Everything that knows of sockets, sessions or the orchestrator is behind it; a service imports this package and
+`skytether.messages`, nothing else of Skytether. Its tests use `skytether.testing.service.Harness`.
+"""
+
+from .errors import ConfigError, ServiceError
+from .mailbox import RawReceived, Received
+from .main import run
+from .params import NoParams, param
+from .service import Context, Service, params_schema
+from .topics import AnyInput, Input, Output
+
+__all__ = [
+    "AnyInput",
+    "ConfigError",
+    "Context",
+    "Input",
+    "NoParams",
+    "Output",
+    "RawReceived",
+    "Received",
+    "Service",
+    "ServiceError",
+    "param",
+    "params_schema",
+    "run",
+]

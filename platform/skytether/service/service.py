@@ -1,0 +1,108 @@
+"""The class that a service author writes a subclass of."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
+
+from .mailbox import Mailbox, RawQueue, Sender
+from .params import NoParams, schema_of
+from .topics import AnyInput, Declared, Input, Output
+
+P = TypeVar("P")
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """For whom a service runs, and where it may write."""
+
+    robot: str = ""
+    instance: str = ""
+    data_dir: Path = Path()
+    """For what it produces (recordings); nothing else on the file system is its own."""
+    epoch: float = 0.0
+    """Unix time at which the monotonic clock stood at 0: add it to ``now`` to get a date."""
+
+
+class Service(ABC, Generic[P]):
+    """One robot's service: topics in, topics out, parameters, and a step between them.
+
+    A subclass names its parameter dataclass, ``class Guide(Service[GuideParams])`` (`NoParams` for none), declares its
+    topics, and sets either ``rate_hz`` or ``trigger``. All its methods are called from one thread, in which the bridge
+    has no part. An exception ends the process with a traceback; the orchestrator starts it again, so a service keeps
+    no state that a crash could not lose.
+    """
+
+    rate_hz: float | None = None
+    """Steps per second, at absolute times. `start` may set it, from a parameter."""
+    trigger: ClassVar[str | None] = None
+    """Instead of a rate: the topic of an `Input`; one step for its newest message, whenever there is a new one."""
+
+    params_type: ClassVar[type[Any]] = NoParams
+    declared: ClassVar[tuple[Declared, ...]] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Collect the declared topics and the parameter type.
+
+        Raises:
+            TypeError: Two topics have one name, or the trigger is no input.
+        """
+        super().__init_subclass__(**kwargs)
+        for base in getattr(cls, "__orig_bases__", ()):
+            if get_origin(base) is Service and not isinstance(get_args(base)[0], TypeVar):
+                cls.params_type = get_args(base)[0]
+        found = {d.attribute: d for c in reversed(cls.__mro__) for d in vars(c).values() if isinstance(d, Declared)}
+        cls.declared = tuple(found.values())
+        topics = [d.topic for d in cls.declared]
+        for topic in topics:
+            if topics.count(topic) > 1:
+                raise TypeError(f"{cls.__name__}: topic '{topic}' is declared twice")
+        triggers = [d.topic for d in cls.declared if isinstance(d, Input)]
+        if cls.trigger is not None and cls.trigger not in triggers:
+            raise TypeError(f"{cls.__name__}: trigger '{cls.trigger}' is no Input; there are {', '.join(triggers)}")
+
+    def __init__(self, params: P, context: Context | None = None) -> None:
+        self.params = params
+        self.context = context or Context()
+        self.log = logging.getLogger(type(self).__name__)
+        self.mailboxes: dict[str, Mailbox[Any]] = {}
+        self.senders: dict[str, Sender[Any]] = {}
+        self.anything: RawQueue | None = None
+        for declared in self.declared:
+            self.__dict__[declared.attribute] = self._open(declared)
+
+    def start(self) -> None:
+        """Called once before the first step, parameters read and no robot connected yet.
+
+        Raises:
+            ServiceError: The service cannot work; its sentence is all that is printed.
+        """
+
+    @abstractmethod
+    def step(self, now: float) -> None:
+        """Look at the inputs, publish outputs. ``now``: seconds of the monotonic clock."""
+
+    def stop(self) -> None:
+        """Called once after the last step, also after one that raised: close what is open."""
+
+    def _open(self, declared: Declared) -> object:
+        """Make what stands behind one declaration."""
+        match declared:
+            case Input():
+                self.mailboxes[declared.topic] = Mailbox(declared.topic, declared.cls, self.log)
+                return self.mailboxes[declared.topic]
+            case Output():
+                self.senders[declared.topic] = Sender(declared.topic, declared.cls)
+                return self.senders[declared.topic]
+            case AnyInput():
+                self.anything = RawQueue(declared.max_messages, declared.max_bytes)
+                return self.anything
+        raise TypeError(f"{type(declared).__name__} is no Input, AnyInput or Output")
+
+
+def params_schema(cls: type[Service[Any]]) -> dict[str, Any]:
+    """JSON schema of a service's parameters: what ``spec.params`` of its manifest has to hold."""
+    return schema_of(cls.params_type)

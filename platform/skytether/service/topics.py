@@ -1,0 +1,88 @@
+"""How a service's author declares typed topics in the class body."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
+
+from skytether.messages import Message
+from skytether.wire.topic import Direction
+
+from .mailbox import Mailbox, RawQueue, Sender
+
+if TYPE_CHECKING:
+    from .service import Service
+
+ANY = "*"
+M = TypeVar("M", bound=Message)
+
+
+class Declared:
+    """Base of the declarations in a service's class body. The topic's name is the attribute's unless given."""
+
+    direction: ClassVar[Direction]
+
+    def __init__(self, type_name: str, topic: str | None) -> None:
+        self.type_name = type_name
+        self.topic = topic or ""
+        self.attribute = ""
+
+    def __set_name__(self, owner: type[Any], name: str) -> None:
+        self.attribute = name
+        self.topic = self.topic or name
+
+
+class Typed(Declared, Generic[M]):
+    """A declaration with a message class."""
+
+    def __init__(self, cls: type[M], topic: str | None = None) -> None:
+        super().__init__(cls.TYPE, topic)
+        self.cls = cls
+
+
+class Input(Typed[M]):
+    """A topic from the robot, of which the newest message matters: ``force = Input(WrenchStamped)``."""
+
+    direction = Direction.IN
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> Mailbox[M]: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Mailbox[M]:
+        return self  # an instance has its mailbox under the same name
+
+
+class AnyInput(Declared):
+    """Every topic from the robot that no other input takes, as bytes in the order of arrival, none left out.
+
+    Args:
+        max_messages: Unread messages that may wait; beyond it the oldest are dropped and counted.
+        max_bytes: The same for their bytes.
+    """
+
+    direction = Direction.IN
+
+    def __init__(self, max_messages: int = 100_000, max_bytes: int = 64 * 2**20) -> None:
+        super().__init__(ANY, ANY)
+        self.max_messages = max_messages
+        self.max_bytes = max_bytes
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> RawQueue: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | RawQueue:
+        return self
+
+
+class Output(Typed[M]):
+    """A topic to the robot: ``cmd_vel = Output(Twist)``."""
+
+    direction = Direction.OUT
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> Sender[M]: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Sender[M]:
+        return self

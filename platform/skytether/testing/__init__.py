@@ -1,0 +1,1 @@
+"""Tools for tests, shipped so that users can test their own services, runtimes and robots."""
