@@ -1,4 +1,4 @@
-"""Run a service with made-up time, without process, bridge or network.
+"""Run a service, or only the loop around it, with made-up time: no process, no bridge, no network.
 
     harness = Harness(WallStop, {"distance": 0.5})
     harness.send("scan", LaserScan(ranges=[0.4]))
@@ -10,8 +10,9 @@ Messages go through the codec and the mailboxes on both ways, as in the real pro
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -24,6 +25,47 @@ from skytether.wire.events import Connected, Disconnected, MessageReceived
 from skytether.wire.topic import Topic
 
 S = TypeVar("S", bound=Service[Any])
+
+
+class FakeClock:
+    """A clock that only moves when somebody sleeps on it, or says so; for `skytether.service.loop.Loop`.
+
+    What was planned with `at` happens when its time comes, in order.
+    """
+
+    def __init__(self, now: float = 1000.0) -> None:
+        self._now = now
+        self._woken = False
+        self._plan: list[tuple[float, Callable[[], None]]] = []
+
+    def at(self, when: float, action: Callable[[], None]) -> None:
+        """Plan something for a later time."""
+        self._plan.append((when, action))
+        self._plan.sort(key=lambda entry: entry[0])
+
+    def now(self) -> float:
+        return self._now
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass while somebody computes."""
+        self._pass_until(self._now + seconds)
+
+    def sleep_until(self, deadline: float) -> None:
+        while not self._woken and self._now < deadline:
+            if not self._plan and deadline == math.inf:
+                raise RuntimeError("this sleep would never end: nothing is planned")
+            self._pass_until(min(deadline, self._plan[0][0]) if self._plan else deadline)
+        self._woken = False
+
+    def wake(self) -> None:
+        self._woken = True
+
+    def _pass_until(self, when: float) -> None:
+        while self._plan and self._plan[0][0] <= when:
+            self._now, action = max(self._now, self._plan[0][0]), self._plan[0][1]
+            del self._plan[0]
+            action()
+        self._now = when
 
 
 class Harness(Generic[S]):
