@@ -1,8 +1,10 @@
 from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
 from math import nan
 
 import pytest
 
+from skytether.api.rest import Instance, InstanceCreate, Renew, Session, State
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
@@ -97,3 +99,57 @@ def bridge() -> RecordingBridge:
 @pytest.fixture
 def make_cloud() -> type[Cloud]:
     return Cloud
+
+
+class ObedientOrchestrator:
+    """Gives every robot what it asks for, without a network; fails as it is told."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, object]] = []
+        self.fail: Exception | None = None
+        self.healthy = True
+        self.states = [State.RUNNING]
+        self.reason = ""
+        self.session: Session | None = None
+        self._number = 0
+
+    def create_instance(self, request: InstanceCreate, *, idempotency_key: str) -> Instance:
+        self._number += self.fail is None
+        return self._answer("create", idempotency_key)
+
+    def get_instance(self, instance_id: str) -> Instance:
+        return self._answer("get", instance_id)
+
+    def renew_instance(self, instance_id: str, renew: Renew) -> Instance:
+        return self._answer("renew", renew)
+
+    def delete_instance(self, instance_id: str) -> Instance:
+        return self._answer("delete", instance_id)
+
+    def _answer(self, name: str, what: object) -> Instance:
+        self.calls.append((name, what))
+        if self.fail is not None:
+            raise self.fail
+        state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
+        epoch = datetime(2026, 1, 1, tzinfo=UTC)
+        return Instance(
+            id=f"i{self._number}",
+            robot="walker",
+            service="virtual-trail",
+            state=state,
+            reason=self.reason,
+            session=self.session,
+            created_at=epoch,
+            updated_at=epoch,
+            lease_expires_at=epoch,
+        )
+
+
+@pytest.fixture
+def orchestrator() -> ObedientOrchestrator:
+    return ObedientOrchestrator()
+
+
+@pytest.fixture
+def make_bridge() -> type[RecordingBridge]:
+    return RecordingBridge

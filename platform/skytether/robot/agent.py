@@ -96,7 +96,7 @@ class AgentStatus:
     Attributes:
         driver: What the control loop knows.
         instance: The last that was heard of it.
-        trouble: What stands in the way of asking, in one sentence; empty while all is well.
+        trouble: What stands in the way of a session, in one sentence; empty while all is well.
         asked_at: When the service was first asked for.
         connected: The bridge has a session.
         session: The bridge's counters.
@@ -174,6 +174,7 @@ class Agent:
         self._epochs = count(1)
         self._monitor = LinkMonitor()
         self._stats: SessionStats | None = None
+        self._trouble = ""
         self._asked_at: float | None = None
         self._overruns = 0
         self._stop = threading.Event()
@@ -214,7 +215,7 @@ class Agent:
         return AgentStatus(
             driver=self._driver.status(),
             instance=self._instance,
-            trouble=self._asker.trouble,
+            trouble=self._asker.trouble or self._trouble,
             asked_at=self._asked_at,
             connected=session is not None and session.connected,
             session=self._stats,
@@ -275,8 +276,12 @@ class Agent:
         try:
             session = self._open(granted, peer)
         except (BridgeError, ValueError) as error:
-            _log.error("the bridge to %s:%d cannot be opened: %s", *peer, error)
+            sentence = f"the bridge to {peer[0]}:{peer[1]} cannot be opened: {error}"
+            if sentence != self._trouble:
+                _log.error("%s", sentence)
+                self._trouble = sentence
             return
+        self._trouble = ""
         self._monitor = LinkMonitor()
         self._driver.rtt = self._driver.loss = nan
         needs = granted.needs

@@ -121,15 +121,21 @@ class Asker:
         while not stop.wait(self.step()):
             pass
 
-    def release(self) -> None:
-        """Let the instance go; an orchestrator that does not answer frees it when the lease ends."""
+    def release(self) -> str | None:
+        """Let the instance go; an orchestrator that does not answer frees it when the lease ends.
+
+        Returns:
+            The instance's id, if there was one and the orchestrator took it back.
+        """
         if self._instance is None:
-            return
+            return None
+        released, self._instance = self._instance.id, None
         try:
-            self._client.delete_instance(self._instance.id)
+            self._client.delete_instance(released)
         except (ApiError, Unreachable) as error:
-            _log.warning("instance %s was not released, its lease will end it: %s", self._instance.id, error)
-        self._instance = None
+            _log.warning("instance %s was not released, its lease will end it: %s", released, error)
+            return None
+        return released
 
     def _exchange(self) -> Instance:
         if self._instance is None:

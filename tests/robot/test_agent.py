@@ -1,0 +1,220 @@
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+
+from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import TopicSpec
+from skytether.api.rest import Session, TopicReport
+from skytether.bridge import BridgeError
+from skytether.messages import WrenchStamped, type_hash
+from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.arbiter import Reason
+from skytether.robot.command import Source
+from skytether.robot.fallback import FallbackError
+from skytether.wire.events import Connected
+from skytether.wire.stats import PathStats, SessionStats, TopicStats
+from skytether.wire.topic import Role
+
+SESSION = Session(
+    id="00000000000000ab",
+    key="MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE=",
+    host="10.0.0.1",
+    port=4000,
+    topics=(
+        TopicSpec(name="force", type="geometry_msgs/msg/WrenchStamped", direction="in", priority=120),
+        TopicSpec(name="wheels", type="sensor_msgs/msg/JointState", direction="in"),
+        TopicSpec(name="cmd_vel", type="geometry_msgs/msg/Twist", direction="out", priority=127),
+    ),
+    needs=ServiceNeeds(max_rtt_ms=600, max_loss=0.2),
+)
+CONFIG = AgentConfig(
+    robot="walker", url="http://nowhere", token="secret-token", service="virtual-trail", fallback="admittance"
+)
+
+
+class Rig:
+    """An agent whose threads do not run, a made-up clock, and the bridges that it made."""
+
+    def __init__(self, base, orchestrator, make_bridge, config=CONFIG):
+        self.now = 50.0
+        self.made = []
+
+        def bridge(spec, port, bind, peer):
+            endpoint = make_bridge()
+            self.made.append((spec, port, bind, peer, endpoint))
+            return endpoint
+
+        self.agent = Agent(config, base, client=orchestrator, bridge=bridge, clock=lambda: self.now)
+
+    def ask(self):
+        self.agent._asker.step()
+
+    @property
+    def bridges(self):
+        return [endpoint for *_, endpoint in self.made]
+
+
+@pytest.fixture
+def rig(base, orchestrator, make_bridge):
+    orchestrator.session = SESSION
+    return Rig(base, orchestrator, make_bridge)
+
+
+def test_a_session_is_opened_with_the_topics_that_both_have(rig):
+    rig.ask()
+    spec, _, bind, peer, endpoint = rig.made[0]
+    assert (spec.id, spec.key, spec.role) == (0xAB, b"01234567890123456789012345678901", Role.ROBOT)
+    assert {topic.name: topic.type_hash for topic in spec.topics} == {
+        "force": type_hash(WrenchStamped, "cdr"),
+        "cmd_vel": "",
+    }
+    assert (bind, peer) == (("0.0.0.0", 0), ("10.0.0.1", 4000))
+    assert endpoint.running
+    rig.ask()
+    assert len(rig.made) == 1
+    assert endpoint.peers == []
+
+
+def test_an_instance_without_an_address_is_waited_for(rig, orchestrator):
+    orchestrator.session = SESSION.model_copy(update={"port": None})
+    rig.ask()
+    assert rig.made == []
+
+
+def test_the_bridge_follows_a_service_that_came_back_elsewhere(rig, orchestrator):
+    rig.ask()
+    orchestrator.session = SESSION.model_copy(update={"port": 4001})
+    rig.ask()
+    assert len(rig.made) == 1
+    assert rig.bridges[0].peers == [("10.0.0.1", 4001)]
+
+
+def test_an_experiment_may_put_a_link_in_between(base, orchestrator, make_bridge):
+    orchestrator.session = SESSION
+    rig = Rig(base, orchestrator, make_bridge, replace(CONFIG, route=lambda host, port: ("127.0.0.1", port + 1)))
+    rig.ask()
+    assert rig.made[0][3] == ("127.0.0.1", 4001)
+    orchestrator.session = SESSION.model_copy(update={"port": 5000})
+    rig.ask()
+    assert rig.bridges[0].peers == [("127.0.0.1", 5001)]
+
+
+def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
+    rig.ask()
+    old = rig.agent._driver.session
+    make_cloud(old)
+    orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
+    rig.ask()
+    assert [endpoint.running for endpoint in rig.bridges] == [False, True]
+    assert not rig.agent.status().connected
+    cloud = make_cloud(rig.agent._driver.session)
+    assert rig.agent.status().connected
+    cloud.send(rig.now)
+    rig.agent.tick(rig.now)
+    assert rig.agent.status().driver.first_command_at == rig.now
+
+
+def test_a_bridge_that_cannot_be_opened_is_said_once_and_tried_again(rig, monkeypatch, caplog, make_bridge):
+    def taken(self):
+        raise BridgeError("the port is taken")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(make_bridge, "start", taken)
+        rig.ask()
+        rig.ask()
+        sentence = "the bridge to 10.0.0.1:4000 cannot be opened: the port is taken"
+        assert rig.agent.status().trouble == sentence
+        assert caplog.messages == [sentence]
+    rig.ask()
+    assert rig.agent.status().trouble == ""
+    assert rig.bridges[-1].running
+
+
+def test_the_bridges_counters_feed_choice_and_report(rig):
+    rig.ask()
+    topic = TopicStats("cmd_vel", "out", 127, sent=100, delivered=70, lost=30, delay_p50=0.05, bytes_sent=8000)
+    rig.bridges[0].snapshot = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.1),))
+    rig.agent.watch(rig.now)
+    rig.bridges[0].snapshot = SessionStats(
+        True, (replace(topic, sent=200, delivered=140, lost=60),), (PathStats(0, None, rtt=0.12),)
+    )
+    rig.agent.watch(rig.now + 1)
+    status = rig.agent.status()
+    assert (status.rtt, status.loss) == (0.12, pytest.approx(0.3))
+    report = rig.agent.report()
+    assert (report.rtt_s, report.control_source, report.fallback_transitions) == (0.12, "fallback", {"start": 1})
+    assert report.topics == (
+        TopicReport(
+            topic="cmd_vel",
+            direction="out",
+            priority=127,
+            sent=200,
+            delivered=140,
+            lost=60,
+            bytes_sent=8000,
+            delay_p50_s=0.05,
+        ),
+    )
+
+
+def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
+    rig.ask()
+    cloud = make_cloud(rig.agent._driver.session)
+    rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
+    for _ in range(200):
+        rig.now += 0.01
+        cloud.send(rig.now)
+        rig.agent.tick(rig.now)
+    assert rig.agent.status().driver.source is Source.CLOUD
+    rig.agent.watch(rig.now)
+    for _ in range(60):
+        rig.now += 0.01
+        cloud.send(rig.now)
+        rig.agent.tick(rig.now)
+    assert rig.agent.status().driver.transitions[-1].reason is Reason.RTT
+
+
+def test_nothing_shows_the_token():
+    assert "secret-token" not in repr(CONFIG)
+
+
+def test_a_fallback_that_cannot_be_had_is_told_before_anything_runs(base, orchestrator):
+    with pytest.raises(FallbackError, match="no fallback 'levitate'"):
+        Agent(replace(CONFIG, fallback="levitate"), base, client=orchestrator)
+
+
+@pytest.mark.slow
+def test_the_loop_keeps_its_rate_while_the_orchestrator_blocks_and_the_wheels_stand_last(
+    base, orchestrator, make_bridge
+):
+    orchestrator.session = SESSION
+    answering, blocked, go = orchestrator.renew_instance, threading.Event(), threading.Event()
+
+    def block(instance_id, renew):
+        blocked.set()
+        go.wait(5)
+        return answering(instance_id, renew)
+
+    orchestrator.renew_instance = block
+    made = []
+
+    def bridge(spec, port, bind, peer):
+        made.append(make_bridge())
+        port.notify(Connected(spec.topics))
+        return made[-1]
+
+    with Agent(replace(CONFIG, renew_s=0.01), base, client=orchestrator, bridge=bridge) as agent:
+        assert blocked.wait(5)
+        written, began = len(base.written), time.monotonic()
+        time.sleep(0.5)
+        ticks, elapsed = len(base.written) - written, time.monotonic() - began
+        assert ticks + agent.status().overruns >= 0.9 * 100 * elapsed - 1
+        assert base.written[-1][0] > 0
+        go.set()
+    assert base.written[-1] == (0.0, 0.0)
+    assert orchestrator.calls[-1] == ("delete", "i1")
+    assert [endpoint.running for endpoint in made] == [False]
+    assert made[0].published
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("agent")]

@@ -1,0 +1,131 @@
+import threading
+from random import Random
+
+import pytest
+from skytether.api.client import ApiError, Unreachable
+
+from skytether.api.rest import InstanceCreate, Problem, Report, State
+from skytether.robot.asker import Asker
+
+REQUEST = InstanceCreate(robot="walker", service="virtual-trail")
+
+
+@pytest.fixture
+def asked(orchestrator):
+    """An asker and what it told about the instance."""
+    told = []
+    asker = Asker(
+        orchestrator,
+        REQUEST,
+        on_instance=told.append,
+        report=lambda: Report(rtt_s=0.1),
+        healthy=lambda: orchestrator.healthy,
+        random=Random(1),
+    )
+    return asker, told
+
+
+def test_it_asks_once_looks_until_it_runs_then_renews_with_a_report(orchestrator, asked):
+    asker, told = asked
+    orchestrator.states = [State.PENDING, State.STARTING, State.RUNNING]
+    assert [asker.step() for _ in range(4)] == [0.03, 0.03, 2.0, 2.0]
+    assert [name for name, _ in orchestrator.calls] == ["create", "get", "get", "renew"]
+    assert [instance.state for instance in told] == ["pending", "starting", "running", "running"]
+    assert orchestrator.calls[-1][1].report == Report(rtt_s=0.1)
+    assert asker.trouble == ""
+
+
+def test_while_the_link_is_bad_it_looks_more_often(orchestrator, asked):
+    orchestrator.healthy = False
+    assert asked[0].step() == 0.2
+
+
+def test_an_orchestrator_that_is_away_is_tried_again_with_back_off_and_the_same_key(orchestrator, asked, caplog):
+    asker, told = asked
+    orchestrator.fail = Unreachable("nobody answers")
+    delays = [asker.step() for _ in range(8)]
+    assert delays[0] <= 0.2 < 1.6 <= max(delays) <= 5.0
+    assert (asker.trouble, told) == ("nobody answers", [])
+    assert [record.message for record in caplog.records] == ["nobody answers"], "said once"
+    orchestrator.fail = None
+    asker.step()
+    assert asker.trouble == ""
+    assert len({key for name, key in orchestrator.calls if name == "create"}) == 1
+
+
+def test_an_orchestrator_that_goes_away_later_does_not_lose_the_instance(orchestrator, asked):
+    asker, told = asked
+    asker.step()
+    orchestrator.fail = Unreachable("nobody answers")
+    for _ in range(3):
+        asker.step()
+    orchestrator.fail = None
+    asker.step()
+    assert {instance.id for instance in told} == {"i1"}
+    assert [name for name, _ in orchestrator.calls].count("create") == 1
+
+
+def test_an_instance_that_is_gone_is_asked_for_again_under_a_new_key(orchestrator, asked, caplog):
+    asker, told = asked
+    asker.step()
+    orchestrator.fail = problem(404, "no such instance")
+    assert asker.step() <= 0.2
+    orchestrator.fail = None
+    asker.step()
+    assert [instance.id for instance in told] == ["i1", "i2"]
+    keys = [key for name, key in orchestrator.calls if name == "create"]
+    assert len(set(keys)) == 2
+    assert caplog.messages == ["instance i1 is gone; asking for virtual-trail again"]
+
+
+@pytest.mark.parametrize("state", [State.FAILED, State.STOPPED, State.STOPPING])
+def test_an_instance_that_ended_is_asked_for_again(orchestrator, asked, state):
+    asker, told = asked
+    orchestrator.states = [State.RUNNING, state, State.RUNNING]
+    orchestrator.reason = "it crashed 5 times"
+    asker.step()
+    asker.step()
+    assert asker.trouble == f"instance i1 is {state}: it crashed 5 times"
+    asker.step()
+    assert [instance.id for instance in told] == ["i1", "i2"]
+
+
+def test_a_token_that_is_refused_is_said_once_and_tried_slowly(orchestrator, asked, caplog):
+    asker, _ = asked
+    orchestrator.fail = problem(401, "the token is not known")
+    assert [asker.step() for _ in range(3)] == [10.0, 10.0, 10.0]
+    assert caplog.messages == ["the token is not known"]
+
+
+def test_an_unknown_service_is_said_and_tried_again(orchestrator, asked):
+    orchestrator.fail = problem(404, "there is no service virtual-trail")
+    assert asked[0].step() <= 0.2
+    assert asked[0].trouble == "there is no service virtual-trail"
+
+
+def test_release_lets_the_instance_go(orchestrator, asked):
+    asker, _ = asked
+    assert asker.release() is None
+    asker.step()
+    assert asker.release() == "i1"
+    assert orchestrator.calls[-1] == ("delete", "i1")
+    assert asker.release() is None
+
+
+def test_release_does_not_fail_when_nobody_answers(orchestrator, asked, caplog):
+    asker, _ = asked
+    asker.step()
+    orchestrator.fail = Unreachable("nobody answers")
+    assert asker.release() is None
+    assert "its lease will end it" in caplog.text
+
+
+def test_run_ends_when_told(orchestrator, asked):
+    stop = threading.Event()
+    stop.set()
+    asked[0].run(stop)
+    assert len(orchestrator.calls) == 1
+
+
+def problem(status: int, detail: str) -> ApiError:
+    return ApiError(Problem(title="no", status=status, detail=detail))
