@@ -1,7 +1,8 @@
 """Simulated smart walker (Mello, thesis, section 2.4): two driven wheels, encoders, two forearm force sensors.
 
-The motors follow a velocity command with a first-order lag of 100 ms; sampled every 10 ms. The person cannot push the
-wheels themselves, as on the real walker: the forces are measured, and only a controller turns them into motion.
+The motors follow a velocity command with a first-order lag of 100 ms; sampled every 10 ms. They are stiff but not
+rigid: the person's push and twist add a little to what is commanded. That is what makes a person with another way in
+mind a disturbance to the guidance.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ class WalkerParams:
 
     Attributes:
         time_constant: Of the response to a velocity command [s] (thesis section 2.4).
+        give: Velocity that a push of both arms adds [m/s per N].
+        turn_give: Angular velocity that a twist adds [rad/s per N m].
         wheel_radius: [m].
         track: Distance between the driven wheels [m].
         sensor_distance: Distance d between the two forearm sensors [m] (thesis eq. 2.4).
@@ -31,6 +34,8 @@ class WalkerParams:
     """
 
     time_constant: float = 0.1
+    give: float = 0.0004
+    turn_give: float = 0.03
     wheel_radius: float = 0.1
     track: float = 0.55
     sensor_distance: float = 0.5
@@ -45,6 +50,9 @@ class Velocity(NamedTuple):
 
     linear: float
     angular: float
+
+
+STANDSTILL = Velocity(0.0, 0.0)
 
 
 class Arms(NamedTuple):
@@ -72,20 +80,23 @@ class Walker:
         self._random = random
         self.pose = ORIGIN
         """True pose."""
-        self.velocity = Velocity(0.0, 0.0)
+        self.velocity = STANDSTILL
         """True velocity."""
         self._angles = (0.0, 0.0)
         self.wheels = WheelState(0.0, 0.0, 0.0, 0.0)
         self.odometry = ORIGIN
         """Pose by the walker's own dead reckoning from its encoders."""
 
-    def step(self, command: Velocity, dt: float) -> None:
-        """Move for dt seconds under a constant command."""
+    def step(self, command: Velocity, arms: Arms, dt: float) -> None:
+        """Move for dt seconds under a constant command and constant forces of the person."""
         p = self.params
         answer = -math.expm1(-dt / p.time_constant)
+        push, twist = arms.left + arms.right, (arms.right - arms.left) * p.sensor_distance / 2
+        if command == STANDSTILL:
+            push = twist = 0.0  # the brake holds
         self.velocity = Velocity(
-            self.velocity.linear + (command.linear - self.velocity.linear) * answer,
-            self.velocity.angular + (command.angular - self.velocity.angular) * answer,
+            self.velocity.linear + (command.linear + p.give * push - self.velocity.linear) * answer,
+            self.velocity.angular + (command.angular + p.turn_give * twist - self.velocity.angular) * answer,
         )
         half = self.velocity.angular * p.track / 2
         left, right = (self.velocity.linear - half) * dt, (self.velocity.linear + half) * dt

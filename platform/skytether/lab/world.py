@@ -76,6 +76,7 @@ class World:
         self.trail = trail
         self.walker = Walker(walker, of_walker)
         self.person = Person(person, trail, of_person)
+        self._arms = Arms(0.0, 0.0)
         self._steps = 0
 
     @property
@@ -101,8 +102,8 @@ class World:
             command: Velocity that the motors are to reach.
         """
         walker = self.walker
-        walker.step(Velocity(command.linear.x, command.angular.z), STEP)
-        arms = self.person.step(walker.pose, walker.velocity, walker.params.sensor_distance, STEP)
+        walker.step(Velocity(command.linear.x, command.angular.z), self._arms, STEP)
+        arms = self._arms = self.person.step(walker.pose, walker.velocity, walker.params.sensor_distance, STEP)
         due = self._steps % _ODOMETRY_EVERY == 0
         self._steps += 1
         stamp = Time.from_seconds(now)
