@@ -44,7 +44,7 @@ def test_error_takes_the_short_way_round() -> None:
 
 
 def test_preview_makes_a_steady_turn_of_the_arc_s_curvature() -> None:
-    # eq. 2.4 and 2.3, steady: omega = k_tau v d error / d_omega; on curvature c the error is c * preview, so omega = c v
+    # steady, eq. 2.4 in 2.3: omega = k_tau v d error / d_omega; on curvature c the error is c preview, so omega = c v
     preview = preview_distance(torque_gain=50, sensor_distance=0.5, angular_damping=6)
     assert preview == pytest.approx(0.24)
     curvature, v = 0.8, 0.2

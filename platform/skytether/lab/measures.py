@@ -62,22 +62,23 @@ def kinematic_tracking_error(errors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.abs(np.mean(errors)) ** 2 + np.var(errors)))
 
 
-def measure(samples: Sequence[Sample], trail: Trail, *, tolerance: float = 0.25) -> Measures:
-    """Judge a walk.
+def measure(samples: Sequence[Sample], trail: Trail, *, tolerance: float = 0.1, corridor: float = 0.5) -> Measures:
+    """Judge a walk, up to the moment at which it reached the end.
 
     The tracking error is taken at points of the path 1 cm apart, so that standing still somewhere has no weight.
 
     Args:
         samples: The walk, in the order of time.
         trail: What was to be followed.
-        tolerance: The end counts as reached when the walk comes this near to it [m], along and beside the trail.
+        tolerance: The end counts as reached this far before it, along the trail [m].
+        corridor: What is passed further away than this is not passed, to either side [m].
 
     Raises:
         ValueError: There is no sample.
     """
     if not samples:
         raise ValueError("measure: the walk has no samples; record at least one")
-    progress = Progress(trail)
+    progress = Progress(trail, corridor=corridor)
     errors: list[float] = []
     source_s: dict[Source, float] = dict.fromkeys(Source, 0.0)
     distance, completed, last = 0.0, False, samples[0]
@@ -89,7 +90,7 @@ def measure(samples: Sequence[Sample], trail: Trail, *, tolerance: float = 0.25)
         s = progress.update(sample.x, sample.y)
         if distance >= len(errors) * _SPACING:
             errors.append(progress.offset)
-        if s >= trail.length - tolerance and math.hypot(sample.x - trail.end.x, sample.y - trail.end.y) <= tolerance:
+        if s >= trail.length - tolerance:
             completed = True
             break
     time = last.time - samples[0].time

@@ -88,15 +88,13 @@ class Trail:
         last = max(int(np.searchsorted(self._s, high)), first + 1)
         delta = self.points[first:last] - (x, y)
         nearest = first + int(np.argmin(np.einsum("ij,ij->i", delta, delta)))
-        # Along the tangent from the nearest point to the foot; beyond an end there is no foot, only the end.
+        # Along the tangent from the nearest point to the foot, which an end of the trail or of the window may cut off.
         heading = self._headings[min(nearest, len(self._headings) - 1)]
         dx, dy = x - self.points[nearest, 0], y - self.points[nearest, 1]
-        along = dx * math.cos(heading) + dy * math.sin(heading)
-        across = dy * math.cos(heading) - dx * math.sin(heading)
-        s = float(self._s[nearest] + along)
-        if 0 <= s <= self.length:
-            return Place(min(max(s, low), high), float(across))
-        return Place(min(max(s, 0.0), self.length), math.copysign(math.hypot(dx, dy), across))
+        s = float(self._s[nearest] + dx * math.cos(heading) + dy * math.sin(heading))
+        across = float(dy * math.cos(heading) - dx * math.sin(heading))
+        foot = min(max(s, low, 0.0), high, self.length)
+        return Place(foot, math.copysign(math.hypot(across, s - foot), across))
 
 
 class Progress:
