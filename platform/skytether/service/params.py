@@ -32,6 +32,7 @@ def param(
     le: float | None = None,
     min_length: int | None = None,
     max_length: int | None = None,
+    pattern: str | None = None,
 ) -> Any:
     """Declare a parameter in a frozen dataclass; also in one that another parameter nests.
 
@@ -45,9 +46,18 @@ def param(
         le: Must be at most this.
         min_length: Of a text or a list.
         max_length: Of a text or a list.
+        pattern: Regular expression that a text must match.
     """
-    limits = {"gt": gt, "ge": ge, "lt": lt, "le": le, "min_length": min_length, "max_length": max_length}
-    metadata: dict[str, Any] = {key: value for key, value in limits.items() if value is not None}
+    limits: dict[str, Any] = {
+        "gt": gt,
+        "ge": ge,
+        "lt": lt,
+        "le": le,
+        "min_length": min_length,
+        "max_length": max_length,
+        "pattern": pattern,
+    }
+    metadata = {key: value for key, value in limits.items() if value is not None}
     metadata["description"] = doc
     if unit is not None:
         metadata["json_schema_extra"] = {"unit": unit}

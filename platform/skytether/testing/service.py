@@ -130,6 +130,10 @@ class Harness(Generic[S]):
         self._sequence[topic] += 1
         self._port.deliver(MessageReceived(topic, payload, sequence, self.now - age, 0.0, self.now))
 
+    def skip(self, topic: str) -> None:
+        """The link loses the topic's next message."""
+        self._sequence[topic] += 1
+
     def step(self, elapsed: float | None = None) -> None:
         """Let time pass (one period of the rate; nothing for a service with a trigger), then step once."""
         rate = self.service.rate_hz
