@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from skytether.lab.measures import Sample, kinematic_tracking_error, measure
+from skytether.lab.measures import Judge, Sample, kinematic_tracking_error, measure
 from skytether.lab.trail import Trail
 from skytether.robot.command import Source
 
@@ -79,3 +79,16 @@ def test_needs_a_sample() -> None:
     with pytest.raises(ValueError, match="no samples"):
         measure([], STRAIGHT)
     assert measure([Sample(0, 0, 0, Source.STOP)], STRAIGHT).mean_speed_m_s == 0
+
+
+def test_judges_while_the_walk_goes_on_and_no_further_than_the_end() -> None:
+    judge = Judge(STRAIGHT)
+    samples = walk((0, 0.1), (4, 0.1), (4, 3))
+    for sample in samples[:1000]:
+        judge.add(sample)
+    assert not judge.completed
+    assert judge.s == pytest.approx(2.0, abs=0.01)
+    assert judge.result().time_s == pytest.approx(9.99)
+    for sample in samples[1000:]:
+        judge.add(sample)
+    assert judge.result() == measure(walk((0, 0.1), (4, 0.1)), STRAIGHT)

@@ -51,6 +51,12 @@ def test_turns_towards_the_way_with_a_difference_of_the_arms() -> None:
     assert right.left > right.right + 1
 
 
+def test_waits_until_told_to_walk() -> None:
+    p = person()
+    assert all(p.step(ORIGIN, STILL, D, DT, walking=False) == (0, 0) for _ in range(100))
+    assert push(p, 100).left > 1
+
+
 def test_lets_go_at_the_end() -> None:
     p = person(trail=Trail([{"length": 0.3}]))
     push(p, 200)

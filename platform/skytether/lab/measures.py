@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -62,44 +62,80 @@ def kinematic_tracking_error(errors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.abs(np.mean(errors)) ** 2 + np.var(errors)))
 
 
-def measure(samples: Sequence[Sample], trail: Trail, *, tolerance: float = 0.1, corridor: float = 0.5) -> Measures:
-    """Judge a walk, up to the moment at which it reached the end.
+class Judge:
+    """Judges a walk while it goes on: give it sample after sample, in the order of time.
 
-    The tracking error is taken at points of the path 1 cm apart, so that standing still somewhere has no weight.
+    The tracking error is taken at points of the path 1 cm apart, so that standing still somewhere has no weight. What
+    comes after the end was reached is not judged.
+    """
 
-    Args:
-        samples: The walk, in the order of time.
-        trail: What was to be followed.
-        tolerance: The end counts as reached this far before it, along the trail [m].
-        corridor: What is passed further away than this is not passed, to either side [m].
+    def __init__(self, trail: Trail, *, tolerance: float = 0.1, corridor: float = 0.5) -> None:
+        """Judge by a trail.
+
+        Args:
+            trail: What is to be followed.
+            tolerance: The end counts as reached this far before it, along the trail [m].
+            corridor: What is passed further away than this is not passed, to either side [m].
+        """
+        self._end = trail.length - tolerance
+        self._progress = Progress(trail, corridor=corridor)
+        self._errors: list[float] = []
+        self._source_s = dict.fromkeys(Source, 0.0)
+        self._distance = 0.0
+        self._began = 0.0
+        self._last: Sample | None = None
+
+    @property
+    def s(self) -> float:
+        """Arc length of the trail reached so far [m]."""
+        return self._progress.s
+
+    @property
+    def completed(self) -> bool:
+        """The whole trail was passed in order and its end was reached."""
+        return self.s >= self._end
+
+    def add(self, sample: Sample) -> None:
+        """Take the next sample."""
+        if self.completed:
+            return
+        if self._last is None:
+            self._began = sample.time
+        else:
+            self._source_s[self._last.source] += sample.time - self._last.time
+            self._distance += math.hypot(sample.x - self._last.x, sample.y - self._last.y)
+        self._last = sample
+        self._progress.update(sample.x, sample.y)
+        if self._distance >= len(self._errors) * _SPACING:
+            self._errors.append(self._progress.offset)
+
+    def result(self) -> Measures:
+        """The measures so far.
+
+        Raises:
+            ValueError: There was no sample.
+        """
+        if self._last is None:
+            raise ValueError("the walk has no samples; give at least one")
+        time = self._last.time - self._began
+        return Measures(
+            completed=self.completed,
+            time_s=time,
+            distance_m=self._distance,
+            mean_speed_m_s=self._distance / time if time > 0 else 0.0,
+            kte_m=kinematic_tracking_error(np.array(self._errors)),
+            deviation_max_m=max(map(abs, self._errors)),
+            source_s=dict(self._source_s),
+        )
+
+
+def measure(samples: Iterable[Sample], trail: Trail) -> Measures:
+    """Judge a whole walk.
 
     Raises:
         ValueError: There is no sample.
     """
-    if not samples:
-        raise ValueError("measure: the walk has no samples; record at least one")
-    progress = Progress(trail, corridor=corridor)
-    errors: list[float] = []
-    source_s: dict[Source, float] = dict.fromkeys(Source, 0.0)
-    distance, completed, last = 0.0, False, samples[0]
+    judge = Judge(trail)
     for sample in samples:
-        step = math.hypot(sample.x - last.x, sample.y - last.y)
-        source_s[last.source] += sample.time - last.time
-        distance += step
-        last = sample
-        s = progress.update(sample.x, sample.y)
-        if distance >= len(errors) * _SPACING:
-            errors.append(progress.offset)
-        if s >= trail.length - tolerance:
-            completed = True
-            break
-    time = last.time - samples[0].time
-    return Measures(
-        completed=completed,
-        time_s=time,
-        distance_m=distance,
-        mean_speed_m_s=distance / time if time > 0 else 0.0,
-        kte_m=kinematic_tracking_error(np.array(errors)),
-        deviation_max_m=max(map(abs, errors)),
-        source_s=source_s,
-    )
+        judge.add(sample)
+    return judge.result()

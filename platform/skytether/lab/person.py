@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from .trail import Pose, Progress, Trail
-from .walker import Arms, Velocity
+from .walker import STANDSTILL, Arms, Velocity
 
 T = TypeVar("T")
 V = TypeVar("V", float, "np.typing.NDArray[np.float64]")
@@ -98,13 +98,13 @@ class Person:
             params.strongest_turn,
             params.reaction_time,
         )
-        self._seen = _Delay(params.reaction_time, Velocity(0.0, 0.0))
+        self._seen = _Delay(params.reaction_time, STANDSTILL)
         self._sight = 0.0
         self._mood = 0.0
         self._tremor = np.zeros(2)
         self._phase = 0.0
 
-    def step(self, pose: Pose, velocity: Velocity, sensor_distance: float, dt: float) -> Arms:
+    def step(self, pose: Pose, velocity: Velocity, sensor_distance: float, dt: float, *, walking: bool = True) -> Arms:
         """Forces over the next dt seconds on a walker that is and moves like this.
 
         Args:
@@ -112,15 +112,16 @@ class Person:
             velocity: The walker's true velocity.
             sensor_distance: Distance between the forearm supports [m].
             dt: Step [s].
+            walking: False: the person stands and waits.
         """
         p = self.params
-        wish = self._seen.step(self._wish(pose, dt), dt)
+        wish = self._seen.step(self._wish(pose, dt) if walking else STANDSTILL, dt)
         push = self._forward.step(wish.linear, velocity.linear, dt)
         torque = self._around.step(wish.angular, velocity.angular, dt)
-        walking = min(abs(velocity.linear) / 0.2, 1.0)
+        stride = min(abs(velocity.linear) / 0.2, 1.0)
         self._phase += math.tau * p.step_rate * dt + _PHASE_NOISE * math.sqrt(dt) * self._random.normal()
-        push += walking * p.step_force * math.sin(self._phase)
-        torque += walking * p.sway_torque * math.sin(self._phase / 2)
+        push += stride * p.step_force * math.sin(self._phase)
+        torque += stride * p.sway_torque * math.sin(self._phase / 2)
         self._tremor += _wander(self._tremor, p.tremor, _TREMOR_TIME, dt, self._random.normal(size=2))
         # torque = (right - left) d / 2, push = left + right
         half = torque / sensor_distance
@@ -133,7 +134,7 @@ class Person:
         self._mood += _wander(self._mood, p.speed_error, p.speed_wander, dt, self._random.normal())
         s = self._progress.update(pose.x, pose.y)
         if s >= self._trail.length:
-            return Velocity(0.0, 0.0)
+            return STANDSTILL
         goal = self._trail.at(s + p.look_ahead)
         beyond = max(s + p.look_ahead - self._trail.length, 0.0)
         x, y = goal.x + beyond * math.cos(goal.heading), goal.y + beyond * math.sin(goal.heading)

@@ -94,16 +94,19 @@ class World:
         """Simulated time, s."""
         return self._steps * STEP
 
-    def step(self, now: float, command: Twist) -> Sensors:
+    def step(self, now: float, command: Twist, *, walking: bool = True) -> Sensors:
         """Advance by ``STEP``.
 
         Args:
             now: Robot's clock [s]; only stamps the messages.
             command: Velocity that the motors are to reach.
+            walking: False: the person stands at the walker and waits.
         """
         walker = self.walker
         walker.step(Velocity(command.linear.x, command.angular.z), self._arms, STEP)
-        arms = self._arms = self.person.step(walker.pose, walker.velocity, walker.params.sensor_distance, STEP)
+        arms = self._arms = self.person.step(
+            walker.pose, walker.velocity, walker.params.sensor_distance, STEP, walking=walking
+        )
         due = self._steps % _ODOMETRY_EVERY == 0
         self._steps += 1
         stamp = Time.from_seconds(now)
