@@ -124,7 +124,7 @@ def test_a_bridge_that_cannot_be_opened_is_said_once_and_tried_again(rig, monkey
         patch.setattr(make_bridge, "start", taken)
         rig.ask()
         rig.ask()
-        sentence = "the bridge to 10.0.0.1:4000 cannot be opened: the port is taken"
+        sentence = "no bridge to 10.0.0.1:4000: the port is taken"
         assert rig.agent.status().trouble == sentence
         assert caplog.messages == [sentence]
     rig.ask()

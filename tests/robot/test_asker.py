@@ -2,8 +2,8 @@ import threading
 from random import Random
 
 import pytest
-from skytether.api.client import ApiError, Unreachable
 
+from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import InstanceCreate, Problem, Report, State
 from skytether.robot.asker import Asker
 
@@ -35,9 +35,16 @@ def test_it_asks_once_looks_until_it_runs_then_renews_with_a_report(orchestrator
     assert asker.trouble == ""
 
 
-def test_while_the_link_is_bad_it_looks_more_often(orchestrator, asked):
+def test_when_the_link_goes_bad_it_looks_sooner(orchestrator, asked):
+    asker, _ = asked
     orchestrator.healthy = False
-    assert asked[0].step() == 0.2
+    looks = [asker.step() for _ in range(6)]
+    assert looks[0] <= 0.2
+    assert 1.0 <= looks[-1] <= 2.0
+    orchestrator.healthy = True
+    assert asker.step() == 2.0
+    orchestrator.healthy = False
+    assert asker.step() <= 0.2
 
 
 def test_an_orchestrator_that_is_away_is_tried_again_with_back_off_and_the_same_key(orchestrator, asked, caplog):
@@ -51,6 +58,8 @@ def test_an_orchestrator_that_is_away_is_tried_again_with_back_off_and_the_same_
     asker.step()
     assert asker.trouble == ""
     assert len({key for name, key in orchestrator.calls if name == "create"}) == 1
+    orchestrator.fail = Unreachable("nobody answers")
+    assert asker.step() <= 0.2, "the back-off starts anew"
 
 
 def test_an_orchestrator_that_goes_away_later_does_not_lose_the_instance(orchestrator, asked):
@@ -120,11 +129,19 @@ def test_release_does_not_fail_when_nobody_answers(orchestrator, asked, caplog):
     assert "its lease will end it" in caplog.text
 
 
-def test_run_ends_when_told(orchestrator, asked):
+def test_run_goes_on_after_what_nobody_expected_and_ends_when_told(orchestrator, asked, monkeypatch):
+    asker, told = asked
     stop = threading.Event()
-    stop.set()
-    asked[0].run(stop)
-    assert len(orchestrator.calls) == 1
+    answers = iter([ZeroDivisionError("strange"), None])
+
+    def wait(delay: float) -> bool:
+        orchestrator.fail = next(answers, None)
+        return bool(told)
+
+    monkeypatch.setattr(stop, "wait", wait)
+    asker.run(stop)
+    assert [name for name, _ in orchestrator.calls] == ["create", "create"]
+    assert asker.trouble == ""
 
 
 def problem(status: int, detail: str) -> ApiError:

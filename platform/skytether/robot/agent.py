@@ -256,10 +256,7 @@ class Agent:
         session = self._driver.session
         if session is None or session.bridge is None:
             return
-        try:
-            self._stats = session.bridge.stats()
-        except BridgeError:  # stopped between the two lines
-            return
+        self._stats = session.bridge.stats()
         self._driver.rtt, self._driver.loss = self._monitor.sample(self._stats, now)
 
     def _follow(self, instance: rest.Instance) -> None:
@@ -270,13 +267,13 @@ class Agent:
             return
         peer = self._config.route(granted.host, granted.port)
         current = self._driver.session
-        if current is not None and current.id == granted.id:
-            current.move(peer)
-            return
         try:
+            if current is not None and current.id == granted.id:
+                current.move(peer)
+                return
             session = self._open(granted, peer)
         except (BridgeError, ValueError) as error:
-            sentence = f"the bridge to {peer[0]}:{peer[1]} cannot be opened: {error}"
+            sentence = f"no bridge to {peer[0]}:{peer[1]}: {error}"
             if sentence != self._trouble:
                 _log.error("%s", sentence)
                 self._trouble = sentence

@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 _POLL_S = 0.03
 """Between looks at an instance that is coming up; a start takes some hundred milliseconds."""
 _LOOK_S = 0.2
-"""Between looks while the link is bad: the service may have come back at another address."""
+"""Until the first look when the link went bad: the service may have come back at another address."""
 _REFUSED_S = 10.0
 """Before a refused token is tried again: an operator has to act."""
 
@@ -79,7 +79,9 @@ class Asker:
         self._report = report
         self._healthy = healthy
         self._renew_s = renew_s
-        self._backoff = Backoff(0.2, 5.0, random or Random())
+        random = random or Random()
+        self._backoff = Backoff(0.2, 5.0, random)
+        self._looks = Backoff(min(_LOOK_S, renew_s), renew_s, random)
         self._key = str(uuid.uuid4())
         self._instance: Instance | None = None
         self._trouble = ""
@@ -114,12 +116,20 @@ class Asker:
             return _POLL_S
         self._backoff.reset()
         self._trouble = ""
-        return self._renew_s if self._healthy() else min(_LOOK_S, self._renew_s)
+        if not self._healthy():
+            return self._looks.next()
+        self._looks.reset()
+        return self._renew_s
 
     def run(self, stop: threading.Event) -> None:
         """Exchange until told to stop."""
-        while not stop.wait(self.step()):
-            pass
+        delay = 0.0
+        while not stop.wait(delay):
+            try:
+                delay = self.step()
+            except Exception as error:  # a robot must not stop asking because of one strange answer
+                _log.debug("asking failed", exc_info=error)
+                delay = self._say(f"asking failed unexpectedly: {error!r}", self._backoff.next())
 
     def release(self) -> str | None:
         """Let the instance go; an orchestrator that does not answer frees it when the lease ends.

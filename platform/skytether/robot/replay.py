@@ -186,6 +186,7 @@ class _Replay:
         self._instance: rest.Instance | None = None
         self._ended = ""
         self._bridge: Bridge | None = None
+        self._peer: Address | None = None
         self._settled = threading.Event()
         self._refused = ""
         self._stop = threading.Event()
@@ -197,7 +198,7 @@ class _Replay:
         self._progress(Progress("starting", 0, 0))
         session = self._wait_until_running()
         table = self._table(session)
-        peer = self._config.route(session.host or "", session.port or 0)
+        peer = self._peer = self._config.route(session.host or "", session.port or 0)
         spec = SessionSpec(parse_id(session.id), parse_key(session.key), Role.ROBOT, table)
         try:
             self._bridge = Bridge(spec, self, bind=self._config.bind, peer=peer)
@@ -273,7 +274,10 @@ class _Replay:
         self._instance = instance
         session = instance.session
         if self._bridge is not None and session is not None and session.host and session.port:
-            self._bridge.set_peer(*self._config.route(session.host, session.port))
+            peer = self._config.route(session.host, session.port)
+            if peer != self._peer:
+                self._peer = peer
+                self._bridge.set_peer(*peer)
 
     def _report(self) -> rest.Report | None:
         if self._bridge is None:
