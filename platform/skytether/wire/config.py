@@ -1,0 +1,78 @@
+"""Settings of one end of a session. The defaults suit a robot on a mobile network and a service in a data centre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MIN_MTU = 512
+"""Smaller than any path in use; bounds the number of shards that a message may claim to have."""
+MAX_MTU = 65_507
+"""Largest UDP payload over IPv4."""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Sizes in bytes, times in seconds. Both ends may differ: nothing here has to match the peer's."""
+
+    mtu: int = 1200
+    """Largest UDP payload sent. 1,200 passes every path in use (QUIC relies on it too), so IP never fragments."""
+    rate_bps: float = 50e6
+    """Pacing budget of a path, bits per second of UDP payload (rule 6)."""
+    burst: int = 19_200
+    """Most that one call of ``transmit`` returns: 16 packets. A higher priority waits for no more than this."""
+    max_message: int = 16 * 2**20
+    """Largest payload published or accepted."""
+    reassembly_limit: int = 32 * 2**20
+    """Most memory for messages that arrived in part; must hold one of the largest."""
+    queue_limit: int = 64 * 2**20
+    """Most memory for messages that wait to be sent; the lowest priorities give way first."""
+    keepalive: float = 0.1
+    """Time between pings: keeps NAT bindings open, measures round trip and clock offset."""
+    report_interval: float = 0.5
+    """Time between reports of counters to the peer."""
+    probe_after: float = 0.15
+    """The robot's end asks whether the service still knows the session after this much silence. One lost ping is
+    enough for that, and costs one packet; a restarted service is found within one more ``probe_interval``."""
+    probe_interval: float = 0.1
+    """Time between such probes at first; it grows to 2 % of the silence, at most ``hello_retry_max``."""
+    silence: float = 1.0
+    """A peer not heard for this long is reported as disconnected; its keys stay valid."""
+    hello_retry: float = 0.05
+    """First wait for an answer to a handshake; doubles up to ``hello_retry_max``."""
+    hello_retry_max: float = 1.0
+    old_keys: float = 2.0
+    """How long the keys before a new handshake still open packets that were on their way."""
+    assumed_loss: float = 0.05
+    """Share of packets that redundancy is sized for (rule 5)."""
+    max_copies: int = 5
+    """Most packets that carry the same one-shard message."""
+    max_parity: float = 0.5
+    """Most parity shards per data shard."""
+    copy_spacing: float = 0.002
+    """Time between copies of a one-shard message: longer than most bursts of loss, shorter than a control period."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work.
+
+        Raises:
+            ValueError: The text names the setting and its range.
+        """
+        if not MIN_MTU <= self.mtu <= MAX_MTU:
+            raise ValueError(f"mtu must be {MIN_MTU} to {MAX_MTU} bytes, not {self.mtu}")
+        if self.burst < self.mtu:
+            raise ValueError(f"burst must be at least the mtu ({self.mtu} bytes), not {self.burst}")
+        if not 0 < self.max_message <= 2**30:
+            raise ValueError(f"max_message must be 1 to {2**30} bytes, not {self.max_message}")
+        for name in ("reassembly_limit", "queue_limit"):
+            if getattr(self, name) < 1.5 * self.max_message:  # the largest message and the book-keeping of its shards
+                raise ValueError(f"{name} must be at least 1.5 times max_message ({self.max_message} bytes)")
+        positive = ("rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence")
+        for name in (*positive, "hello_retry", "hello_retry_max"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+        if not 0 <= self.assumed_loss < 0.9:
+            raise ValueError(f"assumed_loss must be 0 to below 0.9, not {self.assumed_loss}")
+        if self.max_copies < 1 or self.max_parity < 0 or self.copy_spacing < 0 or self.old_keys < 0:
+            raise ValueError(
+                "max_copies must be at least 1; max_parity, copy_spacing and old_keys must not be negative"
+            )

@@ -1,0 +1,122 @@
+"""Codec of control messages: what the two ends tell each other beside the topics. Only ever read after opening."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from typing import NamedTuple
+
+PING = 1
+REPORT = 2
+GOODBYE = 3
+
+_PING = struct.Struct(">BQI")
+_REPORT = struct.Struct(">BffHH")
+_SENDER = struct.Struct(">HIQQQQQ")
+_RECEIVER = struct.Struct(">HQQQQQQQffffffff")
+NO_ECHO = 2**64 - 1
+ROWS_SIZE = 1000
+"""Bytes of rows in one report, so that it is one packet whatever the mtu is."""
+
+
+class Ping(NamedTuple):
+    """Keepalive and clock exchange. The time of sending is the message's own time of publishing."""
+
+    echo: int | None
+    """The peer's latest time stamp (microseconds of its clock); None if it sent none yet."""
+    hold: int
+    """Microseconds since that arrived."""
+
+
+class SenderRow(NamedTuple):
+    """A topic's counters at its sender; names as in `stats.TopicStats`."""
+
+    topic: int
+    used: int
+    """Sequence numbers used in this epoch."""
+    offered: int
+    sent: int
+    expired: int
+    replaced: int
+    bytes_sent: int
+
+
+class ReceiverRow(NamedTuple):
+    """A topic's counters at its receiver; names as in `stats.TopicStats`."""
+
+    topic: int
+    delivered: int
+    lost: int
+    late: int
+    expired: int
+    superseded: int
+    duplicate: int
+    bytes_delivered: int
+    delay_p50: float
+    delay_p99: float
+    delay_max: float
+    delay_error: float
+    jitter: float
+    jitter_in_order: float
+    period_p50: float
+    period_p99: float
+
+
+class Report(NamedTuple):
+    """What one end counted."""
+
+    loss: float
+    """Share of packets from the peer that did not arrive; NaN if unknown."""
+    burst: float
+    senders: tuple[SenderRow, ...]
+    receivers: tuple[ReceiverRow, ...]
+
+
+class Goodbye(NamedTuple):
+    """The peer ends the session."""
+
+
+def push_ping(ping: Ping) -> bytes:
+    """Encode."""
+    return _PING.pack(PING, NO_ECHO if ping.echo is None else ping.echo, min(max(ping.hold, 0), 2**32 - 1))
+
+
+def push_goodbye() -> bytes:
+    """Encode."""
+    return bytes([GOODBYE])
+
+
+def push_reports(loss: float, burst: float, senders: list[SenderRow], receivers: list[ReceiverRow]) -> Iterator[bytes]:
+    """Encode as many messages of one packet as the rows need, at least one."""
+    while True:
+        count_s = min(len(senders), ROWS_SIZE // _SENDER.size)
+        count_r = min(len(receivers), (ROWS_SIZE - count_s * _SENDER.size) // _RECEIVER.size)
+        rows = [_SENDER.pack(*row) for row in senders[:count_s]] + [_RECEIVER.pack(*row) for row in receivers[:count_r]]
+        yield _REPORT.pack(REPORT, loss, burst, count_s, count_r) + b"".join(rows)
+        senders, receivers = senders[count_s:], receivers[count_r:]
+        if not senders and not receivers:
+            return
+
+
+def pull_control(data: bytes) -> Ping | Report | Goodbye | None:
+    """Decode any of them; None if it is none. Longer messages of later versions are cut to what is known."""
+    try:
+        kind = data[0]
+        if kind == PING:
+            _, echo, hold = _PING.unpack_from(data)
+            return Ping(None if echo == NO_ECHO else echo, hold)
+        if kind == REPORT:
+            _, loss, burst, count_s, count_r = _REPORT.unpack_from(data)
+            at = _REPORT.size
+            end = at + count_s * _SENDER.size
+            senders = tuple(SenderRow(*row) for row in _SENDER.iter_unpack(data[at:end]))
+            receivers = tuple(
+                ReceiverRow(*row) for row in _RECEIVER.iter_unpack(data[end : end + count_r * _RECEIVER.size])
+            )
+            return Report(loss if math.isfinite(loss) else math.nan, burst, senders, receivers)
+        if kind == GOODBYE:
+            return Goodbye()
+    except (IndexError, struct.error):
+        pass
+    return None

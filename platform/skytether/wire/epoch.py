@@ -1,0 +1,92 @@
+"""What one handshake made: keys, message numbers, the agreed topics and the state that ends with them."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from .crypto import Ciphers
+from .measure import Inbound, Outbound, SequenceTracker
+from .replay import ReplayWindow
+from .topic import Direction, Topic
+
+CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9)
+"""Pings, reports and goodbye: sealed and numbered like a topic, both ways."""
+CONTROL_PRIORITY = 128
+"""Above every topic's."""
+
+Waiting = tuple[bytes, float, int | None]
+"""Payload, time of publishing, extra packets (None: as the redundancy policy says)."""
+
+
+class SendTopic:
+    """A topic that this end sends, during one epoch."""
+
+    __slots__ = (
+        "counters", "delivery", "depth", "index", "lifespan", "name", "priority", "ready", "sequence", "topic",
+        "waiting",
+    )  # fmt: skip
+
+    def __init__(self, index: int, topic: Topic, counters: Outbound, priority: int | None = None) -> None:
+        self.index = index
+        self.topic = topic
+        self.name = topic.name
+        self.priority = topic.priority if priority is None else priority
+        self.lifespan = topic.lifespan
+        self.depth = topic.depth
+        self.delivery = topic.delivery
+        self.counters = counters
+        self.waiting: deque[Waiting] = deque()
+        self.ready = False
+        """Whether the send queue has it in its heap."""
+        self.sequence = 0
+        """Of the next message to leave the queue."""
+
+
+class ReceiveTopic:
+    """A topic that the peer sends, during one epoch."""
+
+    __slots__ = ("counters", "index", "lifespan", "name", "newest", "newest_only", "settled", "topic", "tracker")
+
+    def __init__(self, index: int, topic: Topic, counters: Inbound) -> None:
+        self.index = index
+        self.topic = topic
+        self.name = topic.name
+        self.lifespan = topic.lifespan
+        self.newest_only = topic.depth == 1
+        self.newest = -1
+        """Highest sequence delivered."""
+        self.tracker = SequenceTracker(topic.lifespan)
+        self.settled = 0
+        """Losses of the tracker that are in the counters."""
+        self.counters = counters
+
+    def settle(self, now: float) -> None:
+        """Bring the counters' losses up to date."""
+        tracker = self.tracker
+        tracker.settle(now)
+        self.counters.lost += tracker.lost - self.settled
+        self.settled = tracker.lost
+
+
+class Epoch:
+    """The state that a handshake begins and the next one ends."""
+
+    __slots__ = ("ciphers", "id", "next_number", "receive", "replay", "send", "topics")
+
+    def __init__(
+        self,
+        epoch_id: int,
+        ciphers: Ciphers,
+        topics: tuple[Topic, ...],
+        send: list[SendTopic],
+        receive: list[ReceiveTopic],
+    ) -> None:
+        self.id = epoch_id
+        """One byte that tells its packets from those of the epochs before and after."""
+        self.ciphers = ciphers
+        self.next_number = 0
+        """Of the next message sealed, whatever its topic: the nonce."""
+        self.replay = ReplayWindow()
+        self.topics = topics
+        self.send = {t.name: t for t in send}
+        self.receive = {t.index: t for t in receive}

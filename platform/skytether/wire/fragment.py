@@ -1,0 +1,158 @@
+"""A sealed message as equal shards in blocks, with parity: what the sender cuts and the receiver reassembles.
+
+A message of ``length`` bytes in shards of ``size`` bytes has ``ceil(length / size)`` data shards, in as few blocks
+of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from two numbers. Parity is
+systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row only, so the receiver
+need not know how many parity shards there are.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import zfec
+
+from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT
+
+Bytes = npt.NDArray[np.uint8]
+
+BLOCK_SHARDS = 100
+"""Data shards of a block: the cost of coding grows with k times m, and one block may have 256 shards in all."""
+MAX_SHARDS = 256
+"""Shards of a block with parity: what GF(256) allows."""
+MIN_SHARD = 240
+"""A message of several shards has none smaller than this: half of what fits the smallest mtu."""
+MAX_BLOCKS = 65_535
+
+
+class Shape:
+    """How a message of several shards is laid out."""
+
+    __slots__ = ("blocks", "extra", "k", "length", "shards", "size")
+
+    def __init__(self, length: int, size: int) -> None:
+        self.length = length
+        self.size = size
+        self.shards = -(-length // size)
+        """Data shards of the whole message."""
+        self.blocks = -(-self.shards // BLOCK_SHARDS)
+        self.k, self.extra = divmod(self.shards, self.blocks)
+        """Data shards of a block; the first ``extra`` blocks have one more."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether a sender of this protocol would cut a message like this."""
+        fits = -(-self.length // self.shards) == self.size
+        return fits and self.shards > 1 and self.size >= MIN_SHARD and self.blocks <= MAX_BLOCKS
+
+    def block_k(self, block: int) -> int:
+        """Data shards of one block."""
+        return self.k + (block < self.extra)
+
+    def block_start(self, block: int) -> int:
+        """Position in the message of a block's first shard."""
+        return block * self.k + min(block, self.extra)
+
+
+def shape_for(length: int, room: int) -> Shape:
+    """Fewest equal shards that hold ``length`` bytes with at most ``room`` bytes each."""
+    shards = -(-length // room)
+    return Shape(length, -(-length // shards))
+
+
+@lru_cache(maxsize=BLOCK_SHARDS)
+def _encoder(k: int) -> zfec.Encoder:
+    return zfec.Encoder(k, MAX_SHARDS)
+
+
+@lru_cache(maxsize=BLOCK_SHARDS)
+def _decoder(k: int) -> zfec.Decoder:
+    return zfec.Decoder(k, MAX_SHARDS)
+
+
+def encode(data: tuple[memoryview, ...], rows: tuple[int, ...]) -> list[bytes]:
+    """Parity shards of one block: ``rows`` are their indices, from ``len(data)`` up."""
+    parity: list[bytes] = _encoder(len(data)).encode(data, rows)
+    return parity
+
+
+def decode(shards: tuple[memoryview | bytes | Bytes, ...], indices: tuple[int, ...]) -> list[bytes]:
+    """Data shards of one block from any k of its shards, distinct, of equal size."""
+    data: list[bytes] = _decoder(len(shards)).decode(shards, indices)
+    return data
+
+
+@lru_cache(maxsize=256)
+def _order(count: int, parity: int) -> Bytes:
+    """Order of sending, as the packets' own parts of the header: block, index, zeros.
+
+    Data goes first, in order. Parity follows, one shard of each block in turn, so that a run of losses hits
+    different blocks.
+    """
+    shape = Shape(count, 1)
+    sizes = np.array([shape.block_k(b) for b in range(shape.blocks)])
+    block = np.concatenate([np.repeat(np.arange(shape.blocks), sizes), np.tile(np.arange(shape.blocks), parity)])
+    within = [np.arange(k) for k in sizes]
+    index = np.concatenate([*within, *(sizes + j for j in range(parity))])
+    tails = np.zeros((len(block), HEADER_SIZE - COMMON_SIZE), np.uint8)
+    tails[:, 0], tails[:, 1], tails[:, 2] = block >> 8, block & 255, index
+    return tails
+
+
+class Shards:
+    """One sealed message on its way out. Packets are made as they are sent, parity when it is needed."""
+
+    __slots__ = ("_common", "_data", "_parity", "_sent", "_shape", "_tails", "packet_size", "remaining")
+
+    def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int) -> None:
+        """Take a sealed message.
+
+        Args:
+            common: The header's common part.
+            sealed: ``shape.shards * shape.size`` bytes, zeros after ``shape.length``.
+            shape: Its layout, with more than one shard.
+            parity: Parity shards of each block.
+        """
+        self._common = np.frombuffer(common, np.uint8)
+        self._data: Bytes = np.frombuffer(sealed, np.uint8).reshape(shape.shards, shape.size)
+        self._shape = shape
+        self._tails = _order(shape.shards, parity)
+        self._parity: dict[tuple[int, int], bytes] = {}
+        self._sent = 0
+        self.packet_size = HEADER_SIZE + shape.size
+        self.remaining = len(self._tails)
+        """Packets not yet taken."""
+
+    def take(self, count: int, path: int, first_number: int) -> memoryview:
+        """The next ``count`` packets, one after the other, each of ``packet_size`` bytes."""
+        start, end, shards = self._sent, self._sent + count, self._shape.shards
+        rows = np.empty((count, self.packet_size), np.uint8)
+        rows[:, :COMMON_SIZE] = self._common
+        rows[:, COMMON_SIZE:HEADER_SIZE] = self._tails[start:end]
+        rows[:, NUMBER_AT - 1] = path
+        numbers = np.arange(first_number, first_number + count).astype(">u4")
+        rows[:, NUMBER_AT:HEADER_SIZE] = numbers.view(np.uint8).reshape(count, 4)
+        data_end = min(end, shards)
+        if start < data_end:
+            rows[: data_end - start, HEADER_SIZE:] = self._data[start:data_end]
+        if end > shards:
+            first = max(start, shards)
+            parity = b"".join([self._parity_shard(i) for i in range(first, end)])
+            rows[first - start :, HEADER_SIZE:] = np.frombuffer(parity, np.uint8).reshape(end - first, -1)
+        self._sent = end
+        self.remaining -= count
+        return rows.reshape(-1).data
+
+    def _parity_shard(self, position: int) -> bytes:
+        blocks, parity = self._shape.blocks, (len(self._tails) - self._shape.shards) // self._shape.blocks
+        turn, block = divmod(position - self._shape.shards, blocks)
+        k, start = self._shape.block_k(block), self._shape.block_start(block)
+        if (block, turn) not in self._parity:
+            data = tuple(row.data for row in self._data[start : start + k])
+            # All of a single block at once; of many blocks only what is sent now, so that no call takes long.
+            turns = range(parity) if blocks == 1 else range(turn, turn + 1)
+            made = encode(data, tuple(k + t for t in turns))
+            self._parity.update(zip(((block, t) for t in turns), made, strict=True))
+        return self._parity.pop((block, turn))

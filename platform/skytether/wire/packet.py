@@ -1,0 +1,74 @@
+"""Codec of a packet's clear header. Nothing here knows keys, sessions or time.
+
+Every packet of every type starts with the same 30 bytes, big-endian::
+
+    offset  size  field
+         0     1  version (high four bits) and type (low four bits)
+         1     8  session id
+         9     1  epoch: which handshake's keys seal this message (0 in handshake packets)
+        10     6  message number, per direction and epoch: the cipher's nonce, so it never repeats
+        16     2  topic index: 0 for control, else position in the robot's topic table plus 1
+        18     4  length of the sealed message
+    --- the 22 bytes above are the same in all shards of a message, and its associated data ---
+        22     2  block
+        24     1  shard within the block: data shards first, then parity
+        25     1  path
+        26     4  packet number, per path and direction, for loss and burst statistics
+    --- then one shard; all shards of a message have the same size ---
+
+Shard size and sealed length give the number of shards and blocks (``fragment.Shape``). Block, shard, path and
+packet number are not authenticated: a false shard spoils the one message it claims to belong to, a false packet
+number is believed only within a plausible window (``path``).
+"""
+
+from __future__ import annotations
+
+import struct
+
+VERSION = 1
+
+DATA = VERSION << 4
+HELLO = VERSION << 4 | 1
+WELCOME = VERSION << 4 | 2
+
+HEADER = struct.Struct(">BQBHIHIHBBI")
+COMMON = struct.Struct(">BQBHIHI")
+SHARD = struct.Struct(">HBBI")
+_SESSION = struct.Struct(">BQ")
+
+HEADER_SIZE = HEADER.size
+COMMON_SIZE = COMMON.size
+BLOCK_END = COMMON_SIZE + 2
+"""Packets that agree up to here belong to the same block of the same message."""
+INDEX_AT = 24
+PATH_AT = 25
+NUMBER_AT = 26
+
+Fields = tuple[int, int, int, int, int, int, int, int, int, int]
+"""type, session id, epoch, message number, topic index, sealed length, block, shard, path, packet number."""
+
+
+def push_common(kind: int, session_id: int, epoch: int, number: int, topic: int, length: int) -> bytes:
+    """The part of the header that all shards of a message share."""
+    return COMMON.pack(kind, session_id, epoch, number >> 32, number & 0xFFFFFFFF, topic, length)
+
+
+def push_shard(block: int, index: int, path: int, packet: int) -> bytes:
+    """The part of the header that is a packet's own."""
+    return SHARD.pack(block, index, path, packet)
+
+
+def pull_header(data: memoryview | bytes) -> Fields | None:
+    """Both parts; None if the packet is shorter than a header. Values are not checked."""
+    if len(data) < HEADER_SIZE:
+        return None
+    kind, session_id, epoch, high, low, topic, length, block, index, path, packet = HEADER.unpack_from(data)
+    return kind, session_id, epoch, high << 32 | low, topic, length, block, index, path, packet
+
+
+def peek_session_id(data: memoryview | bytes) -> int | None:
+    """Session id of a packet of any version, for demultiplexing; None if this cannot be one of our packets."""
+    if len(data) < HEADER_SIZE:
+        return None
+    session_id: int = _SESSION.unpack_from(data)[1]
+    return session_id

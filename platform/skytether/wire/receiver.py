@@ -1,0 +1,256 @@
+"""The receiving half of a session: packets -> reassembly -> open -> quality of service -> events.
+
+Total: any bytes may come, at any time; what is refused counts under a bounded reason. Nothing but an authentic,
+complete message changes more than a counter or a bounded buffer.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable
+from itertools import pairwise
+
+import numpy as np
+
+from .config import Config
+from .epoch import CONTROL, Epoch
+from .fragment import Bytes
+from .handshake import MAX_HANDSHAKE
+from .packet import (
+    BLOCK_END,
+    COMMON_SIZE,
+    DATA,
+    HEADER,
+    HEADER_SIZE,
+    HELLO,
+    NUMBER_AT,
+    PATH_AT,
+    VERSION,
+    WELCOME,
+    pull_header,
+)
+from .path import Path
+from .reassembly import Entry, Reassembly
+from .replay import Seen
+from .sender import INNER, OVERHEAD
+
+FAR_AHEAD = 65_536
+"""An incomplete message whose number is further than this above the highest authentic one is refused."""
+MIN_RUN = 3
+"""Packets of one block in a batch from which handling them as an array is worth its fixed cost."""
+
+HANDSHAKE_LIFESPAN = 1.0
+"""Seconds for the shards of one handshake message to arrive."""
+
+Accept = Callable[[Epoch, int, bytes, bool, Hashable, float], None]
+"""Epoch, topic index, plaintext, whether its number is the highest so far, address, time of arrival."""
+TakeHandshake = Callable[[int, bytes, bytes, Hashable, float], None]
+"""Type, common part of the header, message, address, time of arrival."""
+
+
+class Receiver:
+    """Takes packets of one session on all its paths.
+
+    Args:
+        session_id: Of the session.
+        config: Bounds.
+        find_epoch: Epoch by its id, or None.
+        accept: Called with each authentic message, once.
+        handshake: Called with each complete, not yet authenticated handshake message.
+        on_expired: Called with the topic index of each message that stayed incomplete for too long.
+    """
+
+    def __init__(
+        self,
+        session_id: int,
+        config: Config,
+        find_epoch: Callable[[int], Epoch | None],
+        accept: Accept,
+        handshake: TakeHandshake,
+        on_expired: Callable[[int], None],
+    ) -> None:
+        self._session_id = session_id
+        self._max_length = config.max_message + OVERHEAD
+        self._find_epoch = find_epoch
+        self._accept = accept
+        self._handshake = handshake
+        self.rejected: Counter[str] = Counter()
+        self.messages = Reassembly(config.reassembly_limit, on_expired)
+        self._handshakes = Reassembly(2 * MAX_HANDSHAKE, _nothing)
+
+    def receive(self, data: memoryview, address: Hashable, path: Path, now: float, segment: int | None) -> None:
+        """Take a datagram, or a batch of datagrams of ``segment`` bytes (the last may be shorter)."""
+        total = len(data)
+        path.bytes_received += total
+        if segment is None or not 0 < segment < total:
+            path.packets_received += 1
+            self._packet(data, address, path, now)
+            return
+        whole = total // segment
+        path.packets_received += -(-total // segment)
+        first = pull_header(data)
+        if whole < MIN_RUN or first is None or segment <= HEADER_SIZE or first[5] == segment - HEADER_SIZE:
+            for start in range(0, total, segment):
+                self._packet(data[start : start + segment], address, path, now)
+            return
+        rows = np.frombuffer(data, np.uint8, whole * segment).reshape(whole, segment)
+        change = (rows[1:, :BLOCK_END] != rows[:-1, :BLOCK_END]).any(axis=1)
+        for start, end in pairwise([0, *(np.flatnonzero(change) + 1).tolist(), whole]):
+            if end - start < MIN_RUN or not self._run(rows[start:end], address, path, now):
+                for i in range(start, end):
+                    self._packet(data[i * segment : (i + 1) * segment], address, path, now)
+        if total > whole * segment:
+            self._packet(data[whole * segment :], address, path, now)
+
+    def sweep(self, now: float) -> None:
+        """Drop incomplete messages that are too old."""
+        self.messages.expire_all(now)
+        self._handshakes.expire_all(now)
+
+    def _packet(self, data: memoryview, address: Hashable, path: Path, now: float) -> None:
+        size = len(data) - HEADER_SIZE
+        if size <= 0:
+            self.rejected["short"] += 1
+            return
+        kind, session_id, epoch_id, high, low, topic, length, block, index, path_id, packet = HEADER.unpack_from(data)
+        if kind != DATA or session_id != self._session_id:
+            self._other(data, kind, session_id, size, length, block, index, address, now)
+            return
+        epoch = self._find_epoch(epoch_id)
+        if epoch is None:
+            self.rejected["epoch"] += 1
+            return
+        if path_id != path.id:
+            self.rejected["path"] += 1
+            return
+        path.arrivals.add(packet)
+        number = high << 32 | low
+        if length != size:
+            entry = self._entry(epoch, number, topic, length, block, bytes(data[:COMMON_SIZE]), size, 1, now)
+            if entry is not None:
+                sealed = self.messages.add(entry, block, index, data[HEADER_SIZE:])
+                if sealed is not None:
+                    self._open(epoch, number, topic, sealed, entry.key[0], address, now)
+        elif not self._refused(epoch, number, topic, 1):
+            if block or index:
+                self.rejected["shape"] += 1
+            else:
+                self._open(epoch, number, topic, data[HEADER_SIZE:], data[:COMMON_SIZE], address, now)
+
+    def _run(self, rows: Bytes, address: Hashable, path: Path, now: float) -> bool:
+        """Several packets of one block of a large message; False if they have to be looked at one by one."""
+        fields = pull_header(rows[0].data)
+        if fields is None or fields[0] != DATA or fields[1] != self._session_id:
+            return False
+        _, _, epoch_id, number, topic, length, block, _, _, _ = fields
+        epoch = self._find_epoch(epoch_id)
+        size = rows.shape[1] - HEADER_SIZE
+        if epoch is None or length == size or (rows[:, PATH_AT] != path.id).any():
+            return False
+        numbers = np.ascontiguousarray(rows[:, NUMBER_AT:HEADER_SIZE]).view(">u4")
+        path.arrivals.add_all(numbers.astype(np.uint32).tobytes())
+        common = rows[0, :COMMON_SIZE].tobytes()
+        entry = self._entry(epoch, number, topic, length, block, common, size, len(rows), now)
+        if entry is not None:
+            sealed = self.messages.add_rows(entry, block, rows.copy())
+            if sealed is not None:
+                self._open(epoch, number, topic, sealed, common, address, now)
+        return True
+
+    def _entry(
+        self,
+        epoch: Epoch,
+        number: int,
+        topic: int,
+        length: int,
+        block: int,
+        common: bytes,
+        size: int,
+        packets: int,
+        now: float,
+    ) -> Entry | None:
+        """The incomplete message that packets of a large message claim to belong to; None (counted) if none can be."""
+        if self._refused(epoch, number, topic, packets):
+            return None
+        if length > self._max_length:
+            self.rejected["too_large"] += packets
+            return None
+        if number > epoch.replay.highest + FAR_AHEAD:
+            self.rejected["implausible"] += packets
+            return None
+        lifespan = epoch.receive[topic].lifespan if topic else CONTROL.lifespan
+        entry = self.messages.entry(common, size, length, topic, block, lifespan, now)
+        if entry is None:
+            self.rejected["shape"] += packets
+        return entry
+
+    def _refused(self, epoch: Epoch, number: int, topic: int, packets: int) -> bool:
+        """Whether a message cannot be wanted: already accepted, too old, or of no topic."""
+        receiver = epoch.receive.get(topic)
+        if receiver is None and topic:
+            self.rejected["topic"] += packets
+            return True
+        seen = epoch.replay.check(number)
+        if seen is Seen.NEW:
+            return False
+        if seen is Seen.OLD:
+            self.rejected["old"] += packets
+        elif receiver is not None:
+            receiver.counters.duplicate += packets
+        return True
+
+    def _open(
+        self,
+        epoch: Epoch,
+        number: int,
+        topic: int,
+        sealed: memoryview,
+        common: memoryview | bytes,
+        address: Hashable,
+        now: float,
+    ) -> None:
+        plaintext = epoch.ciphers.open(number, sealed, common)
+        if plaintext is None or len(plaintext) < INNER.size:
+            self.rejected["forged"] += 1
+            return
+        newest = number > epoch.replay.highest
+        if epoch.replay.accept(number):
+            self._accept(epoch, topic, plaintext, newest, address, now)
+
+    def _other(
+        self,
+        data: memoryview,
+        kind: int,
+        session_id: int,
+        size: int,
+        length: int,
+        block: int,
+        index: int,
+        address: Hashable,
+        now: float,
+    ) -> None:
+        """A packet that is not of an established session's messages: a handshake, or nothing of ours."""
+        if kind >> 4 != VERSION:
+            self.rejected["version"] += 1
+        elif session_id != self._session_id:
+            self.rejected["session"] += 1
+        elif kind not in (HELLO, WELCOME):
+            self.rejected["type"] += 1
+        elif not size <= length <= MAX_HANDSHAKE:
+            self.rejected["shape"] += 1
+        else:
+            common = bytes(data[:COMMON_SIZE])
+            if length == size:
+                self._handshake(kind, common, bytes(data[HEADER_SIZE:]), address, now)
+                return
+            entry = self._handshakes.entry(common, size, length, 0, block, HANDSHAKE_LIFESPAN, now)
+            if entry is None:
+                self.rejected["shape"] += 1
+                return
+            message = self._handshakes.add(entry, block, index, data[HEADER_SIZE:])
+            if message is not None:
+                self._handshake(kind, common, bytes(message), address, now)
+
+
+def _nothing(_topic: int) -> None:
+    """Nobody counts handshake messages that stay incomplete."""
