@@ -96,6 +96,17 @@ class Instance(Strict):
     lease_expires_at: datetime
 
 
+class InstanceEvent(Strict):
+    """A change of an instance's state or reason, as server-sent events tell it."""
+
+    id: int
+    """Counts up; ``Last-Event-ID`` resumes after it."""
+    instance: str
+    at: datetime
+    state: State
+    reason: str = ""
+
+
 class TopicReport(Strict):
     """One topic's quality as the robot knows it, counted since the session began."""
 

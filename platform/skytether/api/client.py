@@ -1,0 +1,268 @@
+"""The thin client that robots, command line and lab use: one method for each thing one can ask."""
+
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from .manifest import Manifest
+from .rest import (
+    Instance,
+    InstanceCreate,
+    InstanceEvent,
+    Problem,
+    Renew,
+    Robot,
+    RobotCreate,
+    RobotCreated,
+    Site,
+    SiteCreate,
+    State,
+)
+
+_Model = TypeVar("_Model", bound=BaseModel)
+_PREFIX = "/api/v1"
+_PING_LIMIT = 45.0
+"""Seconds without a sign of life after which an event stream counts as dead; the server pings every 15."""
+
+
+class ApiError(Exception):
+    """The orchestrator answered that it will not; ``str()`` is its one sentence."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        super().__init__(problem.detail or problem.title)
+
+
+class Unreachable(Exception):  # noqa: N818 (a state of affairs, not a mistake)
+    """No orchestrator answers; ``str()`` says what to do."""
+
+
+class NotRunning(Exception):  # noqa: N818
+    """An instance ended, or did not get ready in time; ``str()`` says why."""
+
+
+class Client:
+    """One orchestrator, as the owner of one token sees it. Safe from any thread; use it as a context manager.
+
+    Every method raises :class:`ApiError` or :class:`Unreachable`, and nothing else.
+    """
+
+    def __init__(self, base_url: str, token: str | None = None, *, timeout: float = 10.0) -> None:
+        """``timeout``: seconds for each step of a request: connect, send, receive."""
+        self._url = base_url.rstrip("/")
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
+        self._http = httpx.Client(base_url=self._url, headers=headers, timeout=timeout, trust_env=False)
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._http.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # Instances
+
+    def create_instance(self, request: InstanceCreate, *, idempotency_key: str | None = None) -> Instance:
+        """Ask for a service; with the same key as before, the instance made then is answered."""
+        headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
+        return self._one(Instance, "POST", "/instances", request, headers)
+
+    def instances(self) -> list[Instance]:
+        """Newest first, without their sessions."""
+        return self._many(Instance, "/instances")
+
+    def get_instance(self, instance_id: str) -> Instance:
+        """One instance, with its session."""
+        return self._one(Instance, "GET", f"/instances/{instance_id}")
+
+    def renew_instance(self, instance_id: str, renew: Renew | None = None) -> Instance:
+        """Keep the lease. What has ended is not revived: look at the state."""
+        return self._one(Instance, "POST", f"/instances/{instance_id}/renew", renew or Renew())
+
+    def delete_instance(self, instance_id: str) -> None:
+        """End it; may be called again."""
+        self._request("DELETE", f"/instances/{instance_id}")
+
+    def logs(self, instance_id: str, tail: int = 200) -> str:
+        """The last lines that it wrote."""
+        return self._request("GET", f"/instances/{instance_id}/logs?tail={tail}").text
+
+    def watch(self, instance_id: str, after: int = 0, *, timeout: float | None = None) -> Iterator[InstanceEvent]:
+        """Every change so far after event ``after``, then each as it comes, until the instance has ended.
+
+        Args:
+            instance_id: Which.
+            after: Id of the last event that is known already.
+            timeout: Seconds after which to stop watching; None: never.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        try:
+            yield from self._watch(f"{_PREFIX}/instances/{instance_id}/events", after, deadline)
+        except httpx.ReadTimeout:
+            if deadline is None or time.monotonic() < deadline:
+                raise self._unreachable() from None
+        except httpx.TransportError as error:
+            raise self._unreachable() from error
+
+    def _watch(self, path: str, after: int, deadline: float | None) -> Iterator[InstanceEvent]:
+        patience = _PING_LIMIT if deadline is None else max(0.001, min(_PING_LIMIT, deadline - time.monotonic()))
+        timeout = httpx.Timeout(self._http.timeout.connect, read=patience)
+        with self._http.stream("GET", path, headers={"Last-Event-ID": str(after)}, timeout=timeout) as response:
+            if response.is_error:
+                response.read()
+                raise ApiError(_problem(response))
+            for line in response.iter_lines():
+                if line.startswith("data:"):
+                    yield _parse(InstanceEvent, json.loads(line.removeprefix("data:")))
+                if deadline is not None and time.monotonic() >= deadline:
+                    return
+
+    def wait_running(self, instance_id: str, timeout: float = 30.0) -> Instance:
+        """Wait until an instance is running, and give it with its session.
+
+        Raises:
+            NotRunning: It ended, or it took too long.
+        """
+        state, reason = State.PENDING, ""
+        for event in self.watch(instance_id, timeout=timeout):
+            state, reason = event.state, event.reason
+            if state is State.RUNNING:
+                instance = self.get_instance(instance_id)
+                if instance.state is State.RUNNING:
+                    return instance
+        why = f": {reason}" if reason else ""
+        waited = "" if state.final else f" after {timeout:g} s"
+        raise NotRunning(f"instance {instance_id} is {state}{waited}{why}")
+
+    # Catalogue
+
+    def services(self) -> list[Manifest]:
+        """What one may ask for."""
+        return self._many(Manifest, "/catalog")
+
+    def get_service(self, name: str) -> Manifest:
+        """One service's manifest."""
+        return self._one(Manifest, "GET", f"/catalog/{name}")
+
+    def put_service(self, name: str, manifest: Manifest | dict[str, Any]) -> Manifest:
+        """Add or change a service. A plain document is validated by the orchestrator."""
+        return self._one(Manifest, "PUT", f"/catalog/{name}", manifest)
+
+    def delete_service(self, name: str) -> None:
+        """Remove a service that was put."""
+        self._request("DELETE", f"/catalog/{name}")
+
+    # Sites
+
+    def sites(self) -> list[Site]:
+        """Where instances can run."""
+        return self._many(Site, "/sites")
+
+    def get_site(self, name: str) -> Site:
+        """One site."""
+        return self._one(Site, "GET", f"/sites/{name}")
+
+    def create_site(self, site: SiteCreate) -> Site:
+        """Add a site."""
+        return self._one(Site, "POST", "/sites", site)
+
+    def delete_site(self, name: str) -> None:
+        """Forget a site that has no instances."""
+        self._request("DELETE", f"/sites/{name}")
+
+    def probe(self, site: str) -> float:
+        """One round trip to where a site answers, in seconds; the first one also opens the connection."""
+        before = time.perf_counter()
+        self._request("GET", f"/sites/{site}/probe")
+        return time.perf_counter() - before
+
+    # Robots
+
+    def robots(self) -> list[Robot]:
+        """All registered robots."""
+        return self._many(Robot, "/robots")
+
+    def create_robot(self, robot: RobotCreate) -> RobotCreated:
+        """Register a robot; its token is in the answer, and nowhere else."""
+        return self._one(RobotCreated, "POST", "/robots", robot)
+
+    def delete_robot(self, name: str) -> None:
+        """Revoke a robot's token and end what it holds."""
+        self._request("DELETE", f"/robots/{name}")
+
+    # Everything
+
+    def metrics(self) -> str:
+        """In Prometheus' text format."""
+        return self._request("GET", "/metrics", prefix="").text
+
+    def _one(
+        self, model: type[_Model], method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    ) -> _Model:
+        return _parse(model, _json(self._request(method, path, body, headers)))
+
+    def _many(self, model: type[_Model], path: str) -> list[_Model]:
+        document = _json(self._request("GET", path))
+        try:
+            return TypeAdapter(list[model]).validate_python(document)  # type: ignore[valid-type]
+        except ValidationError as error:
+            raise ApiError(_strange(str(error))) from error
+
+    def _request(
+        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None, prefix: str = _PREFIX
+    ) -> httpx.Response:
+        document = body.model_dump(mode="json", by_alias=True) if isinstance(body, BaseModel) else body
+        try:
+            response = self._http.request(method, prefix + path, json=document, headers=headers)
+        except (httpx.TransportError, httpx.InvalidURL) as error:
+            raise self._unreachable() from error
+        if not response.is_success:
+            raise ApiError(_problem(response))
+        return response
+
+    def _unreachable(self) -> Unreachable:
+        return Unreachable(
+            f"no orchestrator answers at {self._url}: "
+            "start one with `skytether orchestrator run`, or give its address with --url"
+        )
+
+
+def _json(response: httpx.Response) -> Any:
+    try:
+        return response.json()
+    except ValueError as error:
+        raise ApiError(_strange("no JSON")) from error
+
+
+def _parse(model: type[_Model], document: Any) -> _Model:
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        raise ApiError(_strange(str(error))) from error
+
+
+def _problem(response: httpx.Response) -> Problem:
+    try:
+        return Problem.model_validate_json(response.content)
+    except ValidationError:
+        detail = f"the answer was HTTP {response.status_code}: is this the address of an orchestrator?"
+        return Problem(title=response.reason_phrase, status=response.status_code, detail=detail)
+
+
+def _strange(what: str) -> Problem:
+    detail = f"the orchestrator's answer is not understood: has it another version? ({what.splitlines()[0]})"
+    return Problem(title="Strange answer", status=502, detail=detail)

@@ -1,0 +1,75 @@
+"""Which orchestrator a command speaks to, and with whose token."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .output import fail
+
+if TYPE_CHECKING:
+    from skytether.api.client import Client
+
+_STATE_DIR = Path("~/.local/state/skytether")
+_DEFAULT_URL = "http://127.0.0.1:8600"
+
+Url = Annotated[
+    str | None,
+    typer.Option(
+        "--url",
+        envvar="SKYTETHER_URL",
+        help="Of the orchestrator; without it the one of this machine.",
+        show_default=False,
+    ),
+]
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--token-file",
+        envvar="SKYTETHER_TOKEN_FILE",
+        help="File with a token; SKYTETHER_TOKEN may hold one too; without both the operator's of this machine.",
+        show_default=False,
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, and nothing else.")]
+
+
+@contextmanager
+def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
+    """A client; what goes wrong in the block ends the command with one sentence."""
+    from skytether.api.client import ApiError, Client, NotRunning, Unreachable
+
+    try:
+        with Client(url or _local_url(), _token(token_file)) as client:
+            yield client
+    except (ApiError, NotRunning, Unreachable) as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        fail("interrupted", 130)
+
+
+def _local_url() -> str:
+    try:
+        return (_STATE_DIR.expanduser() / "address").read_text().strip()
+    except OSError:
+        return _DEFAULT_URL
+
+
+def _token(given: Path | None) -> str:
+    """A file named on the command line goes before the environment, and that before this machine's."""
+    if given is None and os.environ.get("SKYTETHER_TOKEN"):
+        return os.environ["SKYTETHER_TOKEN"].strip()
+    path = given or _STATE_DIR.expanduser() / "operator.token"
+    try:
+        return path.read_text(encoding="ascii").strip()
+    except FileNotFoundError:
+        if given is None:
+            return ""  # nothing runs here, or it is another user's: the answer will say which
+        fail(f"there is no token file {path}", 2)
+    except (OSError, UnicodeDecodeError) as error:
+        fail(f"cannot read the token file {path}: {getattr(error, 'strerror', None) or 'it is no text'}", 2)

@@ -1,0 +1,251 @@
+"""``skytether apply, service, site, instance, robot``: small verbs over the REST client."""
+
+from __future__ import annotations
+
+import json as json_module
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .connection import Json, TokenFile, Url, connected
+from .output import console, fail, print_json
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+service_app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
+site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
+instance_app = typer.Typer(help="What runs, for whom.", no_args_is_help=True)
+robot_app = typer.Typer(help="Who may ask.", no_args_is_help=True)
+
+_PRIVATE = {"session": {"key"}}
+"""Never printed: the output of a command ends up in logs and bug reports."""
+
+
+def apply(
+    file: Annotated[Path, typer.Option("--file", "-f", help="YAML file with one or more manifests.")],
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Add the services of a file to the catalogue, or change them."""
+    documents = _documents(file)
+    with connected(url, token_file) as client:
+        done = [client.put_service(_name(document, file), document) for document in documents]
+    if json:
+        print_json([manifest.model_dump(mode="json", by_alias=True) for manifest in done])
+    for manifest in done:
+        console.print(f"service {manifest.metadata.name}, version {manifest.metadata.version}: applied")
+
+
+def _documents(file: Path) -> list[Any]:
+    import yaml
+
+    try:
+        documents = [d for d in yaml.safe_load_all(file.read_text(encoding="utf-8")) if d is not None]
+    except OSError as error:
+        fail(f"cannot read {file}: {error.strerror}", 2)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        fail(f"{file} is no YAML: {' '.join(str(error).split())}", 2)
+    if not documents:
+        fail(f"{file} holds no manifest", 2)
+    return documents
+
+
+def _name(document: Any, file: Path) -> str:
+    metadata = document.get("metadata") if isinstance(document, dict) else None
+    name = metadata.get("name") if isinstance(metadata, dict) else None
+    if not isinstance(name, str):
+        fail(f"{file}: metadata.name: is missing", 2)
+    return name
+
+
+@service_app.command("list")
+def list_services(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """List the catalogue."""
+    with connected(url, token_file) as client:
+        found = client.services()
+    if json:
+        print_json([manifest.model_dump(mode="json", by_alias=True) for manifest in found])
+        return
+    rows = [
+        (m.metadata.name, m.metadata.version, ", ".join(m.spec.needs.tiers), " ".join(t.name for t in m.spec.topics))
+        for m in found
+    ]
+    _table(("service", "version", "tiers", "topics"), rows)
+
+
+@service_app.command("delete")
+def delete_service(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+    """Remove a service that was applied; its instances run on."""
+    with connected(url, token_file) as client:
+        client.delete_service(name)
+
+
+@site_app.command("list")
+def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """List the sites."""
+    with connected(url, token_file) as client:
+        found = client.sites()
+    if json:
+        print_json([_plain(site) for site in found])
+        return
+    rows = [(s.name, s.tier, s.runtime, s.state, _or_dash(s.cpu), _or_dash(s.memory_mb), s.instances) for s in found]
+    _table(("site", "tier", "runtime", "state", "cores", "MiB", "instances"), rows)
+
+
+@instance_app.command("list")
+def list_instances(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """List the instances, newest first."""
+    with connected(url, token_file) as client:
+        found = client.instances()
+    if json:
+        print_json([_plain(instance) for instance in found])
+        return
+    rows = [
+        (i.id, i.robot, i.service, i.state, _or_dash(i.placement and i.placement.site), i.restarts, i.reason)
+        for i in found
+    ]
+    _table(("instance", "robot", "service", "state", "site", "restarts", "reason"), rows)
+
+
+@instance_app.command("create")
+def create_instance(
+    service: Annotated[str, typer.Argument(help="What to run.")],
+    robot: Annotated[str, typer.Option(help="For whom.")],
+    params: Annotated[str, typer.Option(help="Parameters as a JSON object.")] = "{}",
+    lease_s: Annotated[
+        float, typer.Option(min=1, max=86_400, help="Ends when not renewed for so many seconds.")
+    ] = 3600,
+    wait: Annotated[bool, typer.Option(help="Wait until it runs.")] = True,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Run a service by hand, for tests; robots ask by themselves."""
+    from pydantic import ValidationError
+
+    from skytether.api.rest import InstanceCreate
+
+    try:
+        values = json_module.loads(params)
+        request = InstanceCreate(robot=robot, service=service, params=values, lease_s=lease_s)
+    except ValidationError as error:
+        first = error.errors()[0]
+        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg']}", 2)
+    except ValueError as error:
+        fail(f"--params is no JSON: {error}", 2)
+    with connected(url, token_file) as client:
+        made = client.create_instance(request)
+        made = client.wait_running(made.id) if wait else made
+    _show(made, json)
+
+
+@instance_app.command("show")
+def show_instance(instance: str, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """Show one instance, but for its session's key."""
+    with connected(url, token_file) as client:
+        found = client.get_instance(instance)
+    _show(found, json)
+
+
+@instance_app.command("logs")
+def show_logs(
+    instance: str,
+    tail: Annotated[int, typer.Option(min=1, help="Lines.")] = 200,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Print what an instance wrote."""
+    with connected(url, token_file) as client:
+        text = client.logs(instance, tail)
+    if json:
+        print_json({"instance": instance, "lines": text.splitlines()})
+    else:
+        typer.echo(text, nl=False)
+
+
+@instance_app.command("delete")
+def delete_instance(instance: str, url: Url = None, token_file: TokenFile = None) -> None:
+    """End an instance."""
+    with connected(url, token_file) as client:
+        client.delete_instance(instance)
+
+
+@robot_app.command("list")
+def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """List the registered robots."""
+    with connected(url, token_file) as client:
+        found = client.robots()
+    if json:
+        print_json([_plain(robot) for robot in found])
+        return
+    rows = [(r.name, ", ".join(r.services), r.created_at, _or_dash(r.last_seen_at)) for r in found]
+    _table(("robot", "may ask for", "registered", "last seen"), rows)
+
+
+@robot_app.command("add")
+def add_robot(
+    name: str,
+    service: Annotated[
+        list[str] | None, typer.Option(help="What it may ask for; may be given again; all else.")
+    ] = None,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Register a robot. Its token is printed on standard output, this once."""
+    from pydantic import ValidationError
+
+    from skytether.api.rest import RobotCreate
+
+    try:
+        request = RobotCreate(name=name, services=tuple(service or ("*",)))
+    except ValidationError:
+        fail(f"'{name}' is no name: lower-case letters, digits and '-', at most 63", 2)
+    with connected(url, token_file) as client:
+        made = client.create_robot(request)
+    if json:
+        print_json(_plain(made))
+        return
+    console.print(f"robot {made.name} is registered; its token, which cannot be shown again:")
+    typer.echo(made.token)
+
+
+@robot_app.command("delete")
+def delete_robot(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+    """Revoke a robot's token and end what it holds."""
+    with connected(url, token_file) as client:
+        client.delete_robot(name)
+
+
+def _plain(model: BaseModel) -> Any:
+    return model.model_dump(mode="json", exclude=_PRIVATE if "session" in type(model).model_fields else None)
+
+
+def _show(instance: BaseModel, json: bool) -> None:
+    import yaml
+
+    if json:
+        print_json(_plain(instance))
+    else:
+        typer.echo(yaml.safe_dump(_plain(instance), sort_keys=False), nl=False)
+
+
+def _or_dash(value: Any) -> Any:
+    return "-" if value is None else value
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """A table for people, on standard output."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*head, box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    Console(highlight=False).print(table)

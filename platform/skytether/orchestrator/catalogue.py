@@ -1,0 +1,170 @@
+"""The services that robots can ask for: built-in ones, those of a folder, those that were PUT; the last wins."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Iterable, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from skytether.api.manifest import Manifest
+
+from .errors import ConflictError, Fault, InvalidError, NotFoundError
+from .store import Store
+from .validation import check_schema, parse
+
+log = logging.getLogger(__name__)
+
+SERVICES = "skytether.services"
+MANIFEST = "service.yaml"
+
+
+def parse_manifest(document: Any, what: str = "") -> Manifest:
+    """Validate a manifest.
+
+    Raises:
+        InvalidError: With each wrong key; ``what`` names the document.
+    """
+    manifest = parse(Manifest, document, what)
+    try:
+        check_schema(manifest.spec.params, "spec.params")
+    except InvalidError as error:
+        raise InvalidError(error.faults, what) from None
+    return manifest
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read one from a YAML file.
+
+    Raises:
+        InvalidError: It cannot be read, is no YAML, or has wrong keys; the text begins with the path.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidError([Fault("", f"cannot be read: {error.strerror}")], str(path)) from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        text = f"is no YAML{where}: {getattr(error, 'problem', None) or error}"
+        raise InvalidError([Fault("", " ".join(text.split()))], str(path)) from None
+    return parse_manifest(document, str(path))
+
+
+def read_folder(folder: Path) -> dict[str, Manifest]:
+    """All manifests of a folder (``*.yaml``, ``*.yml``), by name.
+
+    Raises:
+        InvalidError: One of them is wrong, two have the same name, or the folder cannot be read.
+    """
+    if not folder.is_dir():
+        raise InvalidError([Fault("", "there is no such folder")], str(folder))
+    found: dict[str, Manifest] = {}
+    for path in sorted(p for p in folder.iterdir() if p.suffix in (".yaml", ".yml")):
+        manifest = read_manifest(path)
+        if manifest.metadata.name in found:
+            twice = f"another file has a service '{manifest.metadata.name}' too"
+            raise InvalidError([Fault("metadata.name", twice)], str(path))
+        found[manifest.metadata.name] = manifest
+    return found
+
+
+def read_builtin(points: Iterable[EntryPoint]) -> tuple[dict[str, Manifest], dict[str, str]]:
+    """Manifests of installed services, and why others cannot be used, by name.
+
+    A service's module is located, not imported: what it needs may be missing on this machine, and is not needed here.
+    One that is broken must not keep the others, and the orchestrator, from working.
+    """
+    good, broken = {}, {}
+    for point in points:
+        try:
+            manifest = read_manifest(_manifest_path(point))
+        except InvalidError as error:
+            broken[point.name] = str(error)
+            continue
+        if manifest.metadata.name != point.name:
+            broken[point.name] = f"its manifest calls it '{manifest.metadata.name}'"
+            continue
+        good[point.name] = manifest
+    return good, broken
+
+
+def _manifest_path(point: EntryPoint) -> Path:
+    try:
+        spec = importlib.util.find_spec(point.module)
+    except ImportError as error:
+        raise InvalidError([Fault("", f"module {point.module} cannot be found: {error}")]) from error
+    if spec is None or not spec.submodule_search_locations:
+        raise InvalidError([Fault("", f"there is no package {point.module}")])
+    return Path(next(iter(spec.submodule_search_locations))) / MANIFEST
+
+
+class Catalogue:
+    """All services by name."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._fixed: dict[str, Manifest] = {}
+        self._broken: Mapping[str, str] = {}
+
+    def load(self, folder: Path | None) -> None:
+        """Read what is installed, and the folder.
+
+        Raises:
+            InvalidError: The folder or one of its files is wrong.
+        """
+        builtin, self._broken = read_builtin(entry_points(group=SERVICES))
+        for name, why in self._broken.items():
+            log.warning("service %s is installed but cannot be used: %s", name, why)
+        self._fixed = builtin | (read_folder(folder) if folder else {})
+
+    def all(self) -> list[Manifest]:
+        """By name."""
+        stored = {name: Manifest.model_validate(m) for name, m in self._store.services().items()}
+        return [manifest for _, manifest in sorted((self._fixed | stored).items())]
+
+    def get(self, name: str) -> Manifest:
+        """One service.
+
+        Raises:
+            NotFoundError: There is none of that name; the text names those there are.
+        """
+        stored = self._store.services().get(name)
+        if stored is not None:
+            return Manifest.model_validate(stored)
+        if name in self._fixed:
+            return self._fixed[name]
+        if name in self._broken:
+            raise NotFoundError(f"service '{name}' is installed but cannot be used: {self._broken[name]}")
+        known = ", ".join(m.metadata.name for m in self.all()) or "none"
+        raise NotFoundError(f"there is no service '{name}'; known are: {known}")
+
+    def put(self, name: str, manifest: Manifest) -> bool:
+        """Add a service or change it for instances to come; True if it is new.
+
+        Raises:
+            InvalidError: Its name is another one, or its parameters' schema is none.
+        """
+        if manifest.metadata.name != name:
+            raise InvalidError(
+                [Fault("metadata.name", f"is '{manifest.metadata.name}', but the address says '{name}'")]
+            )
+        check_schema(manifest.spec.params, "spec.params")
+        new = name not in self._fixed and name not in self._store.services()
+        self._store.put_service(name, manifest.model_dump(mode="json", by_alias=True))
+        return new
+
+    def delete(self, name: str) -> None:
+        """Remove a service that was put; what runs of it runs on. One that is gone already is no error.
+
+        Raises:
+            ConflictError: It is built in, or comes from the folder.
+        """
+        if name in self._store.services():
+            self._store.delete_service(name)
+        elif name in self._fixed:
+            raise ConflictError(f"service '{name}' is built in or comes from the catalogue folder: it is removed there")

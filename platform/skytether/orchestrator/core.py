@@ -1,0 +1,120 @@
+"""One orchestrator: its parts, put together, started and stopped. No HTTP here."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from .access import Access
+from .catalogue import Catalogue
+from .events import Broker
+from .instances import Instances
+from .loops import Loop
+from .metrics import Metrics, Running
+from .reconcile import Reconciler
+from .runtimes.base import Runtime
+from .security import Secrets
+from .settings import Settings
+from .sites import Sites, load_runtime
+from .store import Store
+
+log = logging.getLogger(__name__)
+
+_STOP_POLL = 0.02
+
+
+class Orchestrator:
+    """Everything behind the HTTP interface."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        clock: Callable[[], float] = time.time,
+        find_runtime: Callable[[str], type[Runtime]] = load_runtime,
+    ) -> None:
+        """Read or make the secrets; nothing runs before ``start``.
+
+        Args:
+            settings: Its state folder is made if it is not there.
+            clock: Seconds since the epoch.
+            find_runtime: Gives a runtime by its name; by entry point unless told otherwise.
+
+        Raises:
+            SecretFileError: A file in the state folder cannot be used.
+        """
+        settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.settings = settings
+        self._clock = clock
+        secrets = Secrets(settings.state_dir)
+        self.store = Store(settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}")
+        self.broker = Broker()
+        self.store.on_change = self.broker.publish
+        self.metrics = Metrics(self._running, settings.limits.reported_topics)
+        self.catalogue = Catalogue(self.store)
+        self.access = Access(self.store, secrets, clock)
+        self.reconciler = Reconciler(
+            self.store, secrets, self.metrics, settings.timing, settings.limits, clock, self._wake_placer
+        )
+        self.sites = Sites(
+            settings.state_dir / "sites", self.store, self.reconciler.site_step, settings.timing, find_runtime
+        )
+        self.reconciler.sites = self.sites
+        self.placer = Loop("placer", self.reconciler.place_step, time.monotonic)
+        self.instances = Instances(
+            self.store, self.catalogue, self.sites, self.reconciler, self.metrics, secrets, clock, self._wake_placer
+        )
+
+    def _wake_placer(self) -> None:
+        self.placer.wake()
+
+    def start(self) -> None:
+        """Bring the database up to date, load the catalogue, adopt what runs, begin to reconcile.
+
+        Raises:
+            InvalidError: The catalogue's folder is wrong.
+        """
+        self.catalogue.load(self.settings.catalogue_dir)
+        self.store.migrate()
+        self.store.extend_leases(self._clock())
+        self.sites.start()
+        self.placer.start()
+
+    def stop(self) -> None:
+        """Stop reconciling; with ``stop_instances`` end all instances first, otherwise they run on."""
+        self.broker.close()
+        if self.settings.stop_instances:
+            self._stop_instances()
+        self.placer.stop(timeout=1.0)
+        self.sites.stop()
+        self.store.close()
+
+    def _stop_instances(self) -> None:
+        # Twice the grace: once for the services, once for what comes before and after.
+        deadline = time.monotonic() + 2 * self.settings.timing.stop_grace
+        while live := self.store.live():
+            for record in live:
+                self.instances.end(record, "the orchestrator was stopped")
+            if time.monotonic() > deadline:
+                log.error("%d instances did not end in time", len(live))
+                return
+            time.sleep(_STOP_POLL)
+
+    def not_ready(self) -> str:
+        """Why it cannot do its work now; empty: it can."""
+        try:
+            self.store.ping()
+        except Exception as error:  # whatever the database's driver raises
+            return f"the database does not answer: {error}"
+        silent = time.monotonic() - self.placer.last_pass
+        if silent > self.settings.timing.lock_up:
+            return f"the reconciler has made no pass for {silent:.0f} s"
+        return ""
+
+    def _running(self) -> list[Running]:
+        running = []
+        for record in self.store.live():
+            site = self.sites.find(record.site)
+            seen = site.observed.get(record.id) if site else None
+            running.append(Running(record, seen))
+        return running

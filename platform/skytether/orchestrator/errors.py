@@ -1,0 +1,59 @@
+"""What can be wrong with a request, in terms of the domain; ``problems`` turns it into HTTP.
+
+Each text is one sentence for the person who asked, with what to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One wrong key of a document: where, and what is wrong with it."""
+
+    key: str
+    """Path with dots, ``spec.topics.0.prority``; empty: the document itself."""
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.detail}" if self.key else self.detail
+
+
+class DomainError(Exception):
+    """Base: a request that cannot be served."""
+
+
+class NotFoundError(DomainError):
+    """There is no such thing; the text names what there is."""
+
+
+class ConflictError(DomainError):
+    """It is there, but not in a state in which this can be done."""
+
+
+class NoSiteError(ConflictError):
+    """No site could ever run this; the text holds each site's number."""
+
+    def __init__(self, text: str, refused: Sequence[dict[str, Any]]) -> None:
+        super().__init__(text)
+        self.refused = tuple(refused)
+
+
+class ForbiddenError(DomainError):
+    """The token is good, but not for this."""
+
+
+class UnauthenticatedError(DomainError):
+    """No token, or one that nobody was given."""
+
+
+class InvalidError(DomainError):
+    """A document with wrong keys."""
+
+    def __init__(self, faults: Sequence[Fault], what: str = "") -> None:
+        """``what`` names the document where the reader could not know: a file, a service's parameters."""
+        self.faults = tuple(faults)
+        super().__init__((f"{what}: " if what else "") + "; ".join(str(f) for f in self.faults))

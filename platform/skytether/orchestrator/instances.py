@@ -1,0 +1,188 @@
+"""What can be asked of instances: create, look, renew, delete. The reconciler does the rest."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import secrets
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from skytether.api.rest import Instance, InstanceCreate, Placement, Refusal, Renew, Session, State
+
+from .access import Principal
+from .catalogue import Catalogue
+from .errors import Fault, InvalidError, NoSiteError, NotFoundError
+from .metrics import Metrics
+from .reconcile import Reconciler, told
+from .records import Record
+from .security import Secrets
+from .sites import Sites
+from .store import KeyReusedError, Store
+from .validation import check_params
+
+
+def utc(seconds: float) -> datetime:
+    """Seconds since the epoch as REST tells them."""
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+class Instances:
+    """Instances as robots and operators see them."""
+
+    def __init__(
+        self,
+        store: Store,
+        catalogue: Catalogue,
+        sites: Sites,
+        reconciler: Reconciler,
+        metrics: Metrics,
+        secrets_: Secrets,
+        clock: Callable[[], float],
+        wake_placer: Callable[[], None],
+    ) -> None:
+        self._store = store
+        self._catalogue = catalogue
+        self._sites = sites
+        self._reconciler = reconciler
+        self._metrics = metrics
+        self._secrets = secrets_
+        self._clock = clock
+        self._wake_placer = wake_placer
+
+    def create(self, principal: Principal, asked: InstanceCreate, key: str | None) -> Record:
+        """Take a robot's request. With an idempotency key that came before, the instance made then is given back.
+
+        Raises:
+            ForbiddenError: Not for this token.
+            NotFoundError: No such service.
+            InvalidError: Wrong parameters.
+            NoSiteError: No site could ever run it.
+        """
+        principal.require(asked.robot, asked.service)
+        body = json.dumps(asked.model_dump(mode="json"), sort_keys=True).encode()
+        digest = hashlib.sha256(body).hexdigest()
+        try:
+            earlier = self._store.made_with(principal.owner, key, digest) if key else None
+            return earlier or self._store.add(self._new(asked), principal.owner, key, digest)
+        except KeyReusedError:
+            fault = Fault("Idempotency-Key", "came before with another body: use a new key for a new request")
+            raise InvalidError([fault]) from None
+        finally:
+            self._wake_placer()
+
+    def _new(self, asked: InstanceCreate) -> Record:
+        manifest = self._catalogue.get(asked.service)
+        check_params(asked.params, manifest.spec.params, asked.service)
+        now = self._clock()
+        record = Record(
+            id=secrets.token_hex(8),
+            robot=asked.robot,
+            service=asked.service,
+            session_id=secrets.token_hex(8),
+            manifest=manifest.model_dump(mode="json", by_alias=True),
+            created_at=now,
+            updated_at=now,
+            lease_s=asked.lease_s,
+            lease_expires_at=now + asked.lease_s,
+            params=asked.params,
+            measurements={site: m.model_dump(exclude_none=True) for site, m in asked.measurements.items()},
+        )
+        decision = self._reconciler.weigh(record)
+        if decision.hopeless:
+            self._metrics.refused(record.service, decision.refused)
+            text = f"no site can run '{record.service}': {told(decision.refused)}"
+            raise NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
+        return record
+
+    def get(self, principal: Principal, instance: str) -> Record:
+        """One instance.
+
+        Raises:
+            NotFoundError: There is none of that id, or it is another robot's (which is told nobody).
+        """
+        record = self._store.get(instance)
+        if record is None or principal.robot not in (None, record.robot):
+            raise NotFoundError(f"there is no instance '{instance}': it never was, or it ended long ago")
+        return record
+
+    def all(self, principal: Principal) -> list[Record]:
+        """Newest first; a robot's own, or all for the operator."""
+        return self._store.all(principal.robot)
+
+    def renew(self, principal: Principal, instance: str, renew: Renew) -> Record:
+        """Keep an instance's lease, and take the robot's report. One that has ended, or is ending, stays as it is.
+
+        Raises:
+            NotFoundError: As for ``get``.
+        """
+        seen = self.get(principal, instance)
+        renewed = self._store.renew(instance, self._clock(), renew.lease_s)
+        if renewed is None:
+            return self._store.get(instance) or seen
+        if renew.report is not None:
+            self._metrics.report(renewed, renew.report)
+        return renewed
+
+    def delete(self, principal: Principal, instance: str) -> None:
+        """End an instance; one that has ended, or is ending, stays as it is.
+
+        Raises:
+            NotFoundError: As for ``get``.
+        """
+        record: Record | None = None
+        while record is None:  # the reconciler may be at it too: look again, and it is one step further
+            record = self.end(self.get(principal, instance), "")
+
+    def end(self, record: Record, reason: str) -> Record | None:
+        """Let an instance end; None if somebody else changed it meanwhile."""
+        if record.state.final or record.state is State.STOPPING:
+            return record
+        now = self._clock()
+        to = State.STOPPED if record.site is None else State.STOPPING
+        ended = self._store.change(record, now, state=to, stopping_at=now, reason=reason)
+        if ended is not None:
+            site = self._sites.find(ended.site)
+            (site.loop.wake if site else self._wake_placer)()
+        return ended
+
+    def end_all(self, robot: str) -> None:
+        """End everything that a robot holds."""
+        for record in self._store.all(robot):
+            while self.end(self._store.get(record.id) or record, "the robot's token was revoked") is None:
+                pass
+
+    def logs(self, principal: Principal, instance: str, lines: int) -> str:
+        """The last lines of an instance's log; empty before it has a site."""
+        site = self._sites.find(self.get(principal, instance).site)
+        return site.runtime.logs(instance, lines) if site else ""
+
+    def show(self, record: Record, *, with_session: bool = True) -> Instance:
+        """As REST tells it."""
+        refused = tuple(Refusal.model_validate(refusal) for refusal in record.refused)
+        return Instance(
+            id=record.id,
+            robot=record.robot,
+            service=record.service,
+            state=record.state,
+            reason=record.reason,
+            params=record.params,
+            placement=Placement(site=record.site, refused=refused) if record.site else None,
+            session=self._session(record) if with_session else None,
+            restarts=record.restarts,
+            created_at=utc(record.created_at),
+            updated_at=utc(record.updated_at),
+            lease_expires_at=utc(record.lease_expires_at),
+        )
+
+    def _session(self, record: Record) -> Session:
+        spec = record.spec
+        return Session(
+            id=record.session_id,
+            key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
+            host=record.host,
+            port=record.port,
+            topics=spec.topics,
+            needs=spec.needs,
+        )

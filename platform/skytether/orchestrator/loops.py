@@ -1,0 +1,58 @@
+"""A thread that runs one step again and again, and can be woken."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+log = logging.getLogger(__name__)
+
+_AFTER_ERROR = 1.0
+"""Seconds until the next pass after one that raised."""
+
+
+class Loop:
+    """Calls ``step``, which says in how many seconds it wants to be called again; ``wake`` makes that now."""
+
+    def __init__(self, name: str, step: Callable[[], float], clock: Callable[[], float]) -> None:
+        """``clock`` is monotonic; it only dates the last pass."""
+        self._step = step
+        self._clock = clock
+        self._wake = threading.Event()
+        self._ending = False
+        self._first = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.last_pass = clock()
+        """When the last pass ended."""
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Make a pass now; safe from any thread."""
+        self._wake.set()
+
+    def wait_first(self, timeout: float) -> bool:
+        """Wait until the first pass is done."""
+        return self._first.wait(timeout)
+
+    def stop(self, timeout: float) -> None:
+        """End after the present pass; the timeout is for one that hangs in a runtime."""
+        self._ending = True
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while not self._ending:
+            self._wake.clear()  # before the step: a wake during it is not lost
+            try:
+                delay = self._step()
+            except Exception:
+                # Whatever it is, the next pass looks at everything anew; a dead loop would mend nothing.
+                log.exception("%s: pass failed, trying again", self._thread.name)
+                delay = _AFTER_ERROR
+            self.last_pass = self._clock()
+            self._first.set()
+            self._wake.wait(delay)

@@ -1,0 +1,103 @@
+"""Tables. A change here needs a migration in ``migrations/versions``; a test compares the two."""
+
+from __future__ import annotations
+
+from sqlalchemy import JSON, BigInteger, Column, Enum, Float, ForeignKey, Index, Integer, MetaData, String, Table
+
+from skytether.api.rest import State
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+services = Table(
+    "services",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("manifest", JSON, nullable=False),
+    comment="Manifests that were PUT; built-in ones and those of a folder are not here",
+)
+
+sites = Table(
+    "sites",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("tier", String(16), nullable=False),
+    Column("runtime", String(63), nullable=False),
+    Column("options", JSON, nullable=False),
+)
+
+robots = Table(
+    "robots",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("services", JSON, nullable=False),
+    Column("token_prefix", String(16), nullable=False, index=True),
+    Column("token_sha256", String(64), nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("last_seen_at", Float),
+)
+
+instances = Table(
+    "instances",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("robot", String(63), nullable=False, index=True),
+    Column("service", String(63), nullable=False),
+    Column("session_id", String(16), nullable=False, unique=True),
+    Column("manifest", JSON, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("lease_s", Float, nullable=False),
+    Column("lease_expires_at", Float, nullable=False),
+    Column("updated_at", Float, nullable=False),
+    Column("params", JSON, nullable=False),
+    Column("measurements", JSON, nullable=False),
+    Column(
+        "state",
+        Enum(
+            State, native_enum=False, create_constraint=False, length=16, values_callable=lambda s: [m.value for m in s]
+        ),
+        nullable=False,
+        index=True,
+    ),
+    Column("reason", String(1024), nullable=False),
+    Column("site", String(63)),
+    Column("refused", JSON, nullable=False),
+    Column("host", String(255)),
+    Column("port", Integer),
+    Column("attempt", Integer, nullable=False),
+    Column("failures", Integer, nullable=False),
+    Column("restarts", Integer, nullable=False),
+    Column("start_at", Float, nullable=False),
+    Column("started_at", Float),
+    Column("running_at", Float),
+    Column("stopping_at", Float),
+    Column("version", Integer, nullable=False),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True),
+    Column("instance", String(32), ForeignKey("instances.id", ondelete="CASCADE"), nullable=False),
+    Column("at", Float, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("reason", String(1024), nullable=False),
+    Index(None, "instance", "id"),
+    sqlite_autoincrement=True,  # an id that a watcher has seen must not come again after pruning
+)
+
+idempotency = Table(
+    "idempotency",
+    metadata,
+    Column("owner", String(80), primary_key=True, comment="Whose key it is: two tokens may use the same one"),
+    Column("key", String(255), primary_key=True),
+    Column("body_sha256", String(64), nullable=False),
+    Column("instance", String(32), ForeignKey("instances.id", ondelete="CASCADE"), nullable=False),
+    Column("created_at", Float, nullable=False),
+)

@@ -1,0 +1,197 @@
+"""What is to be done next, from what should be and what is: pure, and level-triggered.
+
+It makes no difference how things came to be as they are, so a crash of a service, a crash of the orchestrator and a
+call that got lost are all mended by the next look. Each run of an instance has a number (``attempt``); an observation
+of an earlier one has been dealt with and only says what is still there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from skytether.api.rest import State
+
+from .records import Record
+from .runtimes.base import Observation, Phase
+from .settings import Timing
+
+BAD_GRANT_STATUS = 2
+"""Exit status of a service that does not like its parameters or grant: another try would end the same way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Choose a site."""
+
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Begin the present run."""
+
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The service listens (again, or elsewhere)."""
+
+    record: Record
+    host: str | None
+    port: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Crash:
+    """The present run is over and was not asked to be; see :func:`after_crash`."""
+
+    record: Record
+    why: str
+    """Continues "the service ..."."""
+    for_good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Expire:
+    """The lease ran out."""
+
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Nothing of it is left: stopping becomes stopped."""
+
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Make the runtime end it."""
+
+    instance: str
+    force: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Remove:
+    """A stranger: at the site, but in no row of the store."""
+
+    instance: str
+
+
+Action = Place | Start | Ready | Crash | Expire | End | Stop | Remove
+
+
+def plan(
+    live: Iterable[Record], observed: Mapping[str, Observation], ended: Collection[str], now: float, timing: Timing
+) -> list[Action]:
+    """Every action due at one site (or, with nothing observed, for what has no site yet).
+
+    Args:
+        live: Records that have not ended.
+        observed: What the runtime reports.
+        ended: Those of the observed that the store knows as ended.
+        now: Seconds since the epoch.
+        timing: How patient to be.
+    """
+    actions: list[Action] = []
+    expected = set()
+    for record in live:
+        expected.add(record.id)
+        action = decide(record, observed.get(record.id), now, timing)
+        if action is not None:
+            actions.append(action)
+    for instance, seen in observed.items():
+        if instance in expected:
+            continue
+        if instance not in ended:
+            actions.append(Remove(instance))
+        elif seen.phase is not Phase.EXITED:
+            actions.append(Stop(instance, force=True))
+    return actions
+
+
+def decide(record: Record, seen: Observation | None, now: float, timing: Timing) -> Action | None:
+    """The next action for one instance; None: wait."""
+    there = seen is not None and seen.phase is not Phase.EXITED
+    if record.state is State.STOPPING:
+        if not there:
+            return End(record)
+        return Stop(record.id, force=now - (record.stopping_at or 0) >= timing.stop_grace)
+    if record.state.final:
+        return Stop(record.id, force=True) if there else None
+    if now >= record.lease_expires_at:
+        return Expire(record)
+    if record.state in (State.PENDING, State.PLACING):
+        return Place(record)
+    if seen is not None and seen.attempt != record.attempt:
+        if there:
+            return Stop(record.id, force=True)  # what is left of an earlier run
+        seen = None
+    if record.state is State.STARTING:
+        return _starting(record, seen, now, timing)
+    return _running(record, seen)
+
+
+def _starting(record: Record, seen: Observation | None, now: float, timing: Timing) -> Action | None:
+    if seen is None:
+        return Start(record) if now >= record.start_at else None
+    if seen.phase is Phase.RUNNING:
+        return Ready(record, seen.host, seen.port)
+    if seen.phase is Phase.EXITED:
+        return Crash(record, how_it_ended(seen), for_good=seen.exit_status == BAD_GRANT_STATUS)
+    if record.started_at is not None and now - record.started_at > timing.start_timeout:
+        return Crash(record, f"was not ready within {timing.start_timeout:g} s")
+    return None
+
+
+def _running(record: Record, seen: Observation | None) -> Action | None:
+    if seen is None:
+        return Crash(record, "is gone")
+    if seen.phase is Phase.EXITED:
+        return Crash(record, how_it_ended(seen))
+    if seen.phase is Phase.RUNNING and (seen.host, seen.port) != (record.host, record.port):
+        return Ready(record, seen.host, seen.port)
+    return None
+
+
+def how_it_ended(seen: Observation) -> str:
+    """In words that continue "the service ..."."""
+    if seen.exit_status is None:
+        text = "ended"
+    elif seen.exit_status < 0:
+        text = f"was killed by signal {-seen.exit_status}"
+    else:
+        text = f"ended with exit status {seen.exit_status}"
+    return f"{text}; its last line: {seen.last_line}" if seen.last_line else text
+
+
+def after_crash(crash: Crash, now: float, timing: Timing) -> dict[str, Any]:
+    """What a crash changes in the record: the next run and when, or failed with a reason to act on."""
+    record = crash.record
+    ran = now - record.running_at if record.running_at is not None else 0.0
+    failures = 1 if ran >= timing.stable else record.failures + 1
+    changes: dict[str, Any] = {"failures": failures, "started_at": None, "running_at": None}
+    if crash.for_good:
+        reason = f"the service {crash.why}; correct what it names and ask again"
+        return {**changes, "state": State.FAILED, "reason": reason}
+    if failures >= timing.max_failures:
+        advice = f"see `skytether instance logs {record.id}`"
+        reason = f"given up after {failures} failures in a row: the service {crash.why}; {advice}"
+        return {**changes, "state": State.FAILED, "reason": reason}
+    wait = backoff(failures, timing)
+    reason = f"the service {crash.why}; starting it again" + (f" in {wait:g} s" if wait else "")
+    again = {"attempt": record.attempt + 1, "restarts": record.restarts + 1, "start_at": now + wait}
+    return {**changes, **again, "state": State.STARTING, "reason": reason}
+
+
+def backoff(failures: int, timing: Timing) -> float:
+    """Seconds to wait after so many quick failures in a row."""
+    if failures <= 1:
+        return 0.0
+    # The exponent is bounded: a power of two beyond floating point would raise.
+    return min(timing.backoff * 2.0 ** min(failures - 2, 64), timing.backoff_max)

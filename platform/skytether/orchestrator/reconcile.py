@@ -1,0 +1,238 @@
+"""Carries out what ``plan`` decides: the placer for what has no site yet, and one pass per site for what is there."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from skytether.api.grant import Grant
+from skytether.api.rest import Measurement, Refusal, State
+
+from .metrics import Metrics
+from .placement import NOTHING, Decision, place
+from .plan import Action, Crash, End, Expire, Place, Ready, Remove, Start, Stop, after_crash, plan
+from .records import Record
+from .runtimes.base import Capacity, Launch, RuntimeFailure
+from .security import Secrets
+from .settings import Limits, Timing
+from .sites import Site, Sites
+from .store import Store
+
+log = logging.getLogger(__name__)
+
+_TIDY = 1.0
+"""Seconds between two calls of a runtime's ``tidy``."""
+_PRUNE = 60.0
+"""Seconds between two looks for what is too old to keep."""
+
+
+class Reconciler:
+    """Makes what is what should be. ``sites`` is set before the first pass: each needs the other."""
+
+    sites: Sites
+
+    def __init__(
+        self,
+        store: Store,
+        secrets: Secrets,
+        metrics: Metrics,
+        timing: Timing,
+        limits: Limits,
+        clock: Callable[[], float],
+        wake_placer: Callable[[], None],
+    ) -> None:
+        """``clock`` gives seconds since the epoch."""
+        self._store = store
+        self._secrets = secrets
+        self._metrics = metrics
+        self._timing = timing
+        self._limits = limits
+        self._clock = clock
+        self._wake_placer = wake_placer
+        self._pruned_at = 0.0
+
+    # What has no site yet
+
+    def place_step(self) -> float:
+        """One pass of the placer; returns seconds until the next."""
+        now = self._clock()
+        live = self._store.live()
+        waiting = [record for record in live if record.site is None]
+        placed = [record for record in live if record.site is not None]
+        for action in plan(waiting, {}, (), now, self._timing):
+            if isinstance(action, Place):
+                chosen = self._place(action.record, placed)
+                if chosen is not None:
+                    placed.append(chosen)
+            elif isinstance(action, Expire):
+                self._expire(action.record)
+        if now - self._pruned_at >= _PRUNE:
+            self._pruned_at = now
+            self._prune(now)
+        return self._timing.place
+
+    def weigh(self, record: Record, placed: Sequence[Record] | None = None) -> Decision:
+        """Where it would run now; looks only."""
+        others = self._store.live() if placed is None else placed
+        measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
+        used = _used(others)
+        sites = [site.candidate(record.spec, used.get(site.name, NOTHING)) for site in self.sites.all()]
+        return place(record.spec.needs, measured, sites)
+
+    def _place(self, record: Record, placed: Sequence[Record]) -> Record | None:
+        decision = self.weigh(record, placed)
+        refused = [refusal.model_dump() for refusal in decision.refused]
+        if refused != record.refused:
+            self._metrics.refused(record.service, decision.refused)
+        if decision.site is None:
+            reason = f"waiting for a site: {told(decision.refused)}"
+            if reason != record.reason or record.state is not State.PENDING:
+                self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
+            return None
+        moving = self._store.change(record, self._clock(), state=State.PLACING, reason="", refused=refused)
+        if moving is None:
+            return None
+        now = self._clock()
+        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site)
+        if chosen is not None:
+            self._metrics.phase(chosen, "placing", now - record.created_at)
+            self._wake_site(decision.site)
+        return chosen
+
+    def _prune(self, now: float) -> None:
+        limits = self._limits
+        for instance, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
+            self._metrics.forget(instance)
+            if name is not None:
+                # The site's own pass finds it as a stranger, and removes it.
+                self._wake_site(name)
+
+    def _wake_site(self, name: str) -> None:
+        site = self.sites.find(name)
+        if site is not None:
+            site.loop.wake()
+
+    # What is at a site
+
+    def site_step(self, site: Site) -> float:
+        """One pass over a site; returns seconds until the next."""
+        live = self._store.live_at(site.name)  # before the look: nothing can be observed that is not in it
+        try:
+            if site.capacity is None:
+                site.capacity = site.runtime.capacity()
+            observed = site.runtime.observe()
+        except RuntimeFailure as error:
+            if str(error) != site.failure:
+                log.warning("site %s: %s", site.name, error)
+            site.failure = str(error)
+            return self._timing.place
+        site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
+        strangers = observed.keys() - {record.id for record in live}
+        ended = self._store.known(strangers) if strangers else set()
+        actions = plan(live, observed, ended, self._clock(), self._timing)
+        for action in actions:
+            self._act(site, action)
+        if time.monotonic() - site.tidied_at >= _TIDY:
+            site.tidied_at = time.monotonic()
+            site.runtime.tidy()
+        if actions or any(r.state in (State.STARTING, State.STOPPING) for r in live):
+            return self._timing.observe_changing
+        return self._timing.observe
+
+    def _act(self, site: Site, action: Action) -> None:
+        try:
+            match action:
+                case Start(record):
+                    self._start(site, record)
+                case Ready(record, host, port):
+                    self._ready(record, host, port)
+                case Crash():
+                    self._crash(site, action)
+                case Expire(record):
+                    self._expire(record)
+                case End(record):
+                    site.runtime.stop(record.id, force=True)  # what its main process left behind
+                    if self._store.change(record, self._clock(), state=State.STOPPED):
+                        self._ended(record)
+                case Stop(instance, force):
+                    site.runtime.stop(instance, force=force)
+                case Remove(instance):
+                    log.info("site %s: removing %s, which no robot asked for", site.name, instance)
+                    site.runtime.remove(instance)
+                case Place():
+                    raise TypeError("what is at a site is placed already")
+        except RuntimeFailure as error:
+            # The next pass sees what is still to be done.
+            log.warning("site %s: %s", site.name, error)
+
+    def _start(self, site: Site, record: Record) -> None:
+        # Noted first: an orchestrator killed in between finds either nothing, and starts, or its run, and adopts.
+        noted = self._store.change(record, self._clock(), started_at=self._clock())
+        if noted is None:
+            return
+        try:
+            site.runtime.start(self._launch(noted))
+        except RuntimeFailure as error:
+            self._crash(site, Crash(noted, f"could not be started: {error}"))
+
+    def _launch(self, record: Record) -> Launch:
+        spec = record.spec
+        grant = Grant(
+            instance=record.id,
+            service=record.service,
+            robot=record.robot,
+            params=record.params,
+            session_id=record.session_id,
+            session_key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
+            topics=spec.topics,
+        )
+        return Launch(record.attempt, spec, grant)
+
+    def _ready(self, record: Record, host: str | None, port: int | None) -> None:
+        now = self._clock()
+        running_at = record.running_at if record.state is State.RUNNING else now
+        changes = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at, "reason": ""}
+        if self._store.change(record, now, **changes) and record.state is State.STARTING:
+            self._metrics.phase(record, "starting", now - (record.started_at or now))
+            if record.attempt == 1:
+                self._metrics.phase(record, "total", now - record.created_at)
+
+    def _crash(self, site: Site, crash: Crash) -> None:
+        changes = after_crash(crash, self._clock(), self._timing)
+        after = self._store.change(crash.record, self._clock(), **changes)
+        if after is None:
+            return
+        log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
+        if after.state.final:
+            site.runtime.stop(after.id, force=True)
+            self._ended(after)
+
+    def _expire(self, record: Record) -> None:
+        now = self._clock()
+        reason = f"the robot did not renew its lease of {record.lease_s:g} s"
+        to = State.STOPPED if record.site is None else State.STOPPING
+        if self._store.change(record, now, state=to, stopping_at=now, reason=reason):
+            log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)
+
+    def _ended(self, record: Record) -> None:
+        self._metrics.forget(record.id)
+        self._wake_placer()  # there is room for another
+
+
+def _used(records: Sequence[Record]) -> dict[str, Capacity]:
+    """What the instances at each site asked for."""
+    used: dict[str, Capacity] = {}
+    for record in records:
+        if record.site is not None:
+            sofar, needs = used.get(record.site, NOTHING), record.spec.needs
+            used[record.site] = Capacity(
+                sofar.cpu + needs.cpu, sofar.memory_mb + needs.memory_mb, sofar.gpu + needs.gpu
+            )
+    return used
+
+
+def told(refused: Sequence[Refusal]) -> str:
+    """All refusals in one sentence."""
+    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or "there is no site"

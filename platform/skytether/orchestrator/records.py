@@ -1,0 +1,82 @@
+"""An instance as the store keeps it, and the table of its legal moves. Times are seconds since the epoch.
+
+Wall-clock, not monotonic: leases and back-off must mean the same after a restart, on another machine too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from skytether.api.manifest import Manifest, ServiceSpec
+from skytether.api.rest import State
+
+MOVES: dict[State, frozenset[State]] = {
+    State.PENDING: frozenset({State.PLACING, State.STOPPED}),
+    State.PLACING: frozenset({State.PENDING, State.STARTING, State.STOPPED}),
+    State.STARTING: frozenset({State.RUNNING, State.STOPPING, State.FAILED}),
+    State.RUNNING: frozenset({State.STARTING, State.STOPPING, State.FAILED}),
+    State.STOPPING: frozenset({State.STOPPED}),
+    State.STOPPED: frozenset(),
+    State.FAILED: frozenset(),
+}
+"""Nothing runs before STARTING, so what is pending or placing stops without stopping."""
+
+
+class IllegalMoveError(Exception):
+    """A move that is not in the table: a mistake in this program."""
+
+
+def check_move(old: State, new: State) -> None:
+    """Refuse what is not in the table; staying is no move.
+
+    Raises:
+        IllegalMoveError: It is not there.
+    """
+    if new is not old and new not in MOVES[old]:
+        raise IllegalMoveError(f"an instance cannot go from {old} to {new}")
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One instance."""
+
+    id: str
+    robot: str
+    service: str
+    session_id: str
+    manifest: dict[str, Any]
+    """As it was when the robot asked: a later change of the catalogue does not touch what runs."""
+    created_at: float
+    lease_s: float
+    lease_expires_at: float
+    updated_at: float
+    """Of state or reason; renewals do not count."""
+    params: dict[str, Any] = field(default_factory=dict)
+    measurements: dict[str, Any] = field(default_factory=dict)
+    """By site: :class:`skytether.api.rest.Measurement` as JSON."""
+    state: State = State.PENDING
+    reason: str = ""
+    site: str | None = None
+    refused: list[dict[str, Any]] = field(default_factory=list)
+    """:class:`skytether.api.rest.Refusal` as JSON."""
+    host: str | None = None
+    port: int | None = None
+    attempt: int = 1
+    """Which run this is; what a runtime reports of an earlier one has been dealt with."""
+    failures: int = 0
+    """Quick ones in a row."""
+    restarts: int = 0
+    start_at: float = 0.0
+    """The present run is not launched before this (back-off)."""
+    started_at: float | None = None
+    """When the present run was launched."""
+    running_at: float | None = None
+    """When the present run was ready."""
+    stopping_at: float | None = None
+    version: int = 1
+    """Counts changes: who changes a record must have seen the last one."""
+
+    @property
+    def spec(self) -> ServiceSpec:
+        return Manifest.model_validate(self.manifest).spec

@@ -1,0 +1,39 @@
+"""``/catalog``: what robots can ask for."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from skytether.api.manifest import Manifest
+
+from .deps import PREFIX, Caller, Core, Operator, says
+
+router = APIRouter(prefix=f"{PREFIX}/catalog", tags=["catalogue"], responses=says(401))
+
+
+@router.get("")
+def list_services(core: Core, caller: Caller) -> list[Manifest]:
+    """All services; a robot sees those that it may ask for."""
+    return [manifest for manifest in core.catalogue.all() if caller.may_use(manifest.metadata.name)]
+
+
+@router.get("/{service}", responses=says(403, 404))
+def get_service(core: Core, caller: Caller, service: str) -> Manifest:
+    """One service's manifest."""
+    caller.require(caller.robot or "", service)
+    return core.catalogue.get(service)
+
+
+@router.put("/{service}", responses={201: {"model": Manifest, "description": "It is new"}, **says(403, 422)})
+def put_service(core: Core, _: Operator, service: str, manifest: Manifest, response: Response) -> Manifest:
+    """Add a service, or change it for instances to come."""
+    if core.catalogue.put(service, manifest):
+        response.status_code = 201
+    return manifest
+
+
+@router.delete("/{service}", status_code=204, responses=says(403, 409))
+def delete_service(core: Core, _: Operator, service: str) -> None:
+    """Remove a service that was put; its instances run on."""
+    core.catalogue.delete(service)
+    core.metrics.forget_service(service)

@@ -1,0 +1,36 @@
+"""What machines ask: is it up, can it work, what does it measure."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import PlainTextResponse
+from fastapi.security import HTTPAuthorizationCredentials
+from prometheus_client import CONTENT_TYPE_LATEST
+
+from ..problems import answer
+from .deps import Core, bearer, says
+
+router = APIRouter(tags=["health"])
+
+
+@router.get("/healthz", response_class=PlainTextResponse)
+async def healthz() -> str:
+    """The process answers."""
+    return "ok\n"
+
+
+@router.get("/readyz", response_class=PlainTextResponse, responses=says(503))
+def readyz(core: Core, request: Request) -> Response:
+    """It can do its work: the database answers, and the reconciler makes its passes."""
+    why = core.not_ready()
+    return answer(request, 503, "Not ready", why) if why else PlainTextResponse("ready\n")
+
+
+@router.get("/metrics", response_class=PlainTextResponse, responses=says(401, 403))
+def metrics(core: Core, token: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]) -> Response:
+    """Prometheus metrics; for the operator, or for all if the orchestrator was started with ``--open-metrics``."""
+    if not core.settings.open_metrics:
+        core.access.authenticate(token.credentials if token else None).require_operator()
+    return Response(core.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,102 @@
+"""``/instances``: ask for a service, keep it, watch it, end it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query
+from fastapi.responses import PlainTextResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Renew
+
+from ..core import Orchestrator
+from ..instances import utc
+from ..records import Record
+from ..store import EventRow
+from .deps import PREFIX, Caller, Core, says
+
+router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
+
+_LOOK = 1.0
+"""Seconds between two looks for events that another replica of the orchestrator may have stored."""
+
+
+@router.post("", status_code=201, responses=says(403, 404, 409, 422))
+def create(
+    core: Core,
+    caller: Caller,
+    asked: InstanceCreate,
+    idempotency_key: Annotated[str | None, Header(min_length=1, max_length=255)] = None,
+) -> Instance:
+    """Ask for a service. The same request with the same Idempotency-Key is answered with the instance made first."""
+    return core.instances.show(core.instances.create(caller, asked, idempotency_key))
+
+
+@router.get("")
+def list_instances(core: Core, caller: Caller) -> list[Instance]:
+    """Newest first, without sessions; a robot sees its own."""
+    return [core.instances.show(record, with_session=False) for record in core.instances.all(caller)]
+
+
+def _own(core: Core, caller: Caller, instance: str) -> Record:
+    return core.instances.get(caller, instance)
+
+
+Own = Annotated[Record, Depends(_own)]
+"""The instance of the address, if the caller may see it."""
+
+
+@router.get("/{instance}", responses=says(404))
+def get(core: Core, record: Own) -> Instance:
+    """One instance with its session."""
+    return core.instances.show(record)
+
+
+@router.delete("/{instance}", status_code=204, responses=says(404))
+def delete(core: Core, caller: Caller, instance: str) -> None:
+    """End an instance; may be called again."""
+    core.instances.delete(caller, instance)
+
+
+@router.post("/{instance}/renew", responses=says(404, 422))
+def renew(core: Core, caller: Caller, instance: str, asked: Renew) -> Instance:
+    """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
+    return core.instances.show(core.instances.renew(caller, instance, asked))
+
+
+@router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404))
+def logs(core: Core, caller: Caller, instance: str, tail: Annotated[int, Query(ge=1)] = 200) -> str:
+    """The last lines that the instance wrote, over all its runs."""
+    return core.instances.logs(caller, instance, min(tail, core.settings.limits.log_lines))
+
+
+@router.get("/{instance}/events", response_class=EventSourceResponse, responses=says(404))
+async def events(
+    core: Core, record: Own, last_event_id: Annotated[int, Header(ge=0)] = 0
+) -> AsyncIterator[ServerSentEvent]:
+    """All changes so far after ``Last-Event-ID``, then each as it comes; the stream ends with the instance."""
+    last = last_event_id
+    with core.broker.subscribe(record.id) as changed:
+        while not core.broker.closed:
+            changed.clear()
+            rows, ended = await asyncio.to_thread(_news, core, record.id, last)
+            for row in rows:
+                last = row.id
+                event = InstanceEvent(
+                    id=row.id, instance=row.instance, at=utc(row.at), state=row.state, reason=row.reason
+                )
+                yield ServerSentEvent(id=str(row.id), event="state", data=event)
+            if ended:
+                return
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), _LOOK)
+
+
+def _news(core: Orchestrator, instance: str, after: int) -> tuple[list[EventRow], bool]:
+    """Events after one, and whether no more will come; asked in the order that makes this true."""
+    record = core.store.get(instance)
+    return core.store.events(instance, after), record is None or record.state.final

@@ -1,0 +1,38 @@
+"""``/robots``: who may ask. For the operator only."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from skytether.api.rest import Robot, RobotCreate, RobotCreated
+
+from ..instances import utc
+from ..store import RobotRow
+from .deps import PREFIX, Core, Operator, says
+
+router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))
+
+
+def _show(row: RobotRow) -> Robot:
+    seen = utc(row.last_seen_at) if row.last_seen_at is not None else None
+    return Robot(name=row.name, services=row.services, created_at=utc(row.created_at), last_seen_at=seen)
+
+
+@router.get("")
+def list_robots(core: Core, _: Operator) -> list[Robot]:
+    """All registered robots."""
+    return [_show(row) for row in core.store.robots()]
+
+
+@router.post("", status_code=201, responses=says(409, 422))
+def add_robot(core: Core, _: Operator, asked: RobotCreate) -> RobotCreated:
+    """Register a robot. Its token is in the answer and cannot be shown again."""
+    row, token = core.access.register(asked.name, asked.services)
+    return RobotCreated(**_show(row).model_dump(), token=token)
+
+
+@router.delete("/{robot}", status_code=204)
+def delete_robot(core: Core, _: Operator, robot: str) -> None:
+    """Revoke a robot's token and end what it holds."""
+    core.access.revoke(robot)
+    core.instances.end_all(robot)

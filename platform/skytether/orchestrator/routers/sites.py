@@ -1,0 +1,61 @@
+"""``/sites``: where instances can run."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from skytether.api.rest import Site, SiteCreate
+
+from ..access import Principal
+from ..core import Orchestrator
+from ..sites import Site as LiveSite
+from .deps import PREFIX, Caller, Core, Operator, says
+
+router = APIRouter(prefix=f"{PREFIX}/sites", tags=["sites"])
+
+
+def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
+    asked, total = site.asked, site.capacity
+    return Site(
+        name=asked.name,
+        tier=asked.tier,
+        runtime=asked.runtime,
+        options=asked.options if caller.robot is None else {},  # how to reach an engine is no robot's business
+        state="unreachable" if site.unreachable else "ready",
+        reason=site.unreachable,
+        cpu=total.cpu if total else None,
+        memory_mb=total.memory_mb if total else None,
+        instances=len(core.store.live_at(asked.name)),
+    )
+
+
+@router.get("", responses=says(401))
+def list_sites(core: Core, caller: Caller) -> list[Site]:
+    """All sites; a robot does not see their options."""
+    return [_show(core, site, caller) for site in core.sites.all()]
+
+
+@router.post("", status_code=201, responses=says(401, 403, 409, 422))
+def create_site(core: Core, caller: Operator, asked: SiteCreate) -> Site:
+    """Add a site."""
+    return _show(core, core.sites.add(asked), caller)
+
+
+@router.get("/{site}", responses=says(401, 404))
+def get_site(core: Core, caller: Caller, site: str) -> Site:
+    """One site."""
+    return _show(core, core.sites.get(site), caller)
+
+
+@router.delete("/{site}", status_code=204, responses=says(401, 403, 404, 409))
+def delete_site(core: Core, _: Operator, site: str) -> None:
+    """Forget a site that has no instances."""
+    core.sites.delete(site)
+    core.metrics.forget_site(site)
+
+
+@router.get("/{site}/probe", status_code=204, responses=says(404))
+async def probe(core: Core, site: str) -> Response:
+    """Answer at once, so that a robot can measure its round trip: no token, no database, no thread, no body."""
+    core.sites.get(site)
+    return Response(status_code=204)

@@ -1,0 +1,1 @@
+"""What starts, stops and observes instances: one file for each kind of site, found by entry point."""

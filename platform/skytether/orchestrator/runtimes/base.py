@@ -1,0 +1,148 @@
+"""What a runtime is: six calls, and what each of them means.
+
+A runtime starts, stops and observes instances on one site. It decides nothing: when to start again, how long to wait
+for an end, what to do with strangers is the reconciler's. All calls come from the site's own thread, except ``logs``
+and ``refuses``, which may come from any. No call waits for a service: what takes long is begun, and ``observe`` tells
+how far it is.
+
+A runtime is found by its entry point in group ``skytether.runtimes``; ``tests/contracts`` is the suite each must
+pass.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import ClassVar
+
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec, Strict
+
+
+class Phase(StrEnum):
+    """How far a run is."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    """Ready: its end of the bridge listens."""
+    EXITED = "exited"
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One instance as the runtime finds it."""
+
+    attempt: int
+    """The run it is of, as given to ``start``."""
+    phase: Phase
+    host: str | None = None
+    """Where a robot reaches the service: the address to connect to, not the one bound. Known when RUNNING."""
+    port: int | None = None
+    exit_status: int | None = None
+    """When EXITED; negative: the signal that ended it; None: unknown (it was not our child)."""
+    last_line: str = ""
+    """When EXITED: the last line of its log."""
+    cpu_s: float | None = None
+    """Processor time of this run so far."""
+    memory_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """What to start."""
+
+    attempt: int
+    """Counts runs of one instance; a runtime reports it back with each observation."""
+    spec: ServiceSpec
+    grant: Grant
+    """Without what only the runtime knows: addresses to bind, paths."""
+
+    @property
+    def instance(self) -> str:
+        return self.grant.instance
+
+
+@dataclass(frozen=True, slots=True)
+class Capacity:
+    """What a site offers in all, used or not."""
+
+    cpu: float
+    """Cores."""
+    memory_mb: int
+    gpu: int = 0
+
+
+class RuntimeFailure(Exception):  # noqa: N818 (not an error of ours)
+    """The site did not do what it was asked, or does not answer; one sentence saying what to do."""
+
+
+class Runtime(ABC):
+    """One site's runtime."""
+
+    Options: ClassVar[type[Strict]]
+    """The site's ``options``, validated; unknown keys are refused by name before the runtime is made."""
+
+    @abstractmethod
+    def __init__(self, site: str, folder: Path, options: Strict) -> None:
+        """Take charge of what is there already, also what an earlier orchestrator started.
+
+        Args:
+            site: The site's name.
+            folder: The runtime's own, kept over restarts; it exists, with mode 0700.
+            options: Of type ``Options``.
+
+        Raises:
+            RuntimeFailure: It can never work with these options.
+        """
+
+    @abstractmethod
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        """Why this runtime cannot run the service at all (no image, no entry point); None: it can. Pure."""
+
+    @abstractmethod
+    def capacity(self) -> Capacity:
+        """What the site offers.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+
+    @abstractmethod
+    def start(self, launch: Launch) -> None:
+        """Begin a run. Nothing happens if this very attempt was begun before; what is left of earlier ones is ended.
+
+        Raises:
+            RuntimeFailure: It cannot be started; nothing of it is left running.
+        """
+
+    @abstractmethod
+    def observe(self) -> Mapping[str, Observation]:
+        """The latest run of every instance here, by id, ended ones until they are removed. Looks, never acts.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+
+    @abstractmethod
+    def stop(self, instance: str, *, force: bool) -> None:
+        """Ask a run to end, or with ``force`` end it now with all it started. May be called again and again.
+
+        An instance that is unknown or has ended is left as it is; so is an exit that is under way.
+        """
+
+    @abstractmethod
+    def remove(self, instance: str) -> None:
+        """Forget an instance and its log; end it first if it runs. May be called again. Its data stays."""
+
+    @abstractmethod
+    def logs(self, instance: str, lines: int) -> str:
+        """The last lines that all runs of the instance wrote; empty if there are none."""
+
+    def tidy(self) -> None:  # noqa: B027 (most need none)
+        """Keep what grows within bounds (logs). Called about once a second."""
+
+    def close(self) -> None:  # noqa: B027 (most need none)
+        """Let go of the site; what runs there runs on."""

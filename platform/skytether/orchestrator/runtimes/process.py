@@ -1,0 +1,299 @@
+"""Instances as processes on this machine (Linux), one folder each.
+
+The folder holds the grant (0600), the ready file that the service writes, the log, and ``run.json``: pid, start time
+and boot, by which the process is found again after the orchestrator's own restart and never mistaken for another one
+with the same pid. Each process leads a session of its own, so that it survives the orchestrator, and so that all it
+started can be ended with it. There are no limits on memory and processor here: that is what containers are for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+from typing_extensions import override
+
+from skytether.api.grant import GRANT_VARIABLE
+from skytether.api.manifest import ServiceSpec, Strict
+
+from .base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
+
+_PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
+"""Of our environment; nothing else, for there may be secrets in it."""
+_LAST_LINE = 300
+"""Characters of a log's last line that are told."""
+
+
+class ProcessOptions(Strict):
+    """Options of a process site."""
+
+    bind_host: str = "127.0.0.1"
+    """Address that services listen on."""
+    advertise_host: str | None = None
+    """Address that robots are told; None: the one bound. Needed when that is a wildcard."""
+    cpu: Annotated[float, Field(gt=0)] | None = None
+    """Cores that instances may ask for in all; None: all of the machine's."""
+    memory_mb: Annotated[int, Field(gt=0)] | None = None
+    """None: all of the machine's."""
+    python_path: tuple[str, ...] = ()
+    """Folders with services that are not installed."""
+    environment: dict[str, str] = {}
+    """More variables for the services."""
+    log_bytes: Annotated[int, Field(ge=1024)] = 4 << 20
+    """Above this a log is cut to its newer half. Looked at once a second: a flood goes over it until then."""
+
+    @model_validator(mode="after")
+    def _can_be_reached(self) -> ProcessOptions:
+        if self.advertise_host is None and self.bind_host in ("0.0.0.0", "::"):  # noqa: S104 (that is the point)
+            raise ValueError("advertise_host is needed: no robot can connect to a wildcard address")
+        return self
+
+
+@dataclass
+class _Run:
+    """The latest run of one instance."""
+
+    attempt: int
+    process: ProcessId | None
+    data: str = ""
+    """Folder for what the service produces."""
+    child: subprocess.Popen[bytes] | None = None
+    """None for one that an earlier orchestrator started."""
+    asked_to_end: bool = False
+    ended: Observation | None = field(default=None)
+
+
+class ProcessRuntime(Runtime):
+    """Runs ``python -m ENTRYPOINT`` with the same interpreter."""
+
+    Options = ProcessOptions
+
+    @override
+    def __init__(self, site: str, folder: Path, options: Strict) -> None:
+        if not isinstance(options, ProcessOptions):
+            raise TypeError("options must be ProcessOptions")
+        if not sys.platform.startswith("linux"):
+            raise RuntimeFailure("the process runtime needs Linux: use a container site")
+        self._options = options
+        self._folder = folder / "instances"
+        self._data = folder / "data"
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
+
+    def _adopt(self, folder: Path) -> _Run:
+        noted = _read_json(folder / "run.json")
+        process = None
+        if noted.get("boot") == BOOT_ID:
+            # Killed between the launch and the note of its pid: the process is known by its grant.
+            identity = noted.get("process")
+            process = (
+                ProcessId(*identity) if identity else find_by_environment(GRANT_VARIABLE, str(folder / "grant.json"))
+            )
+        return _Run(int(noted.get("attempt", 0)), process, data=str(noted.get("data", "")))
+
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return None if spec.entrypoint else "the service has no entrypoint, only an image: it needs a container site"
+
+    def capacity(self) -> Capacity:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+        return Capacity(self._options.cpu or float(os.cpu_count() or 1), self._options.memory_mb or memory)
+
+    def start(self, launch: Launch) -> None:
+        old = self._runs.get(launch.instance)
+        if old is not None:
+            if old.attempt == launch.attempt and old.process is not None:
+                return
+            _kill_all(old)
+            if old.child is not None:
+                old.child.wait()
+        folder = self._folder / launch.instance
+        data = self._data / launch.grant.robot / launch.grant.service / launch.instance
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            data.mkdir(mode=0o700, parents=True, exist_ok=True)
+            port = _read_json(folder / "ready.json").get("port") or _read_json(folder / "run.json").get("port")
+            self._prepare(launch, folder, data, port)
+            note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port}
+            _write_private(folder / "run.json", json.dumps(note))
+            child = self._spawn(launch.spec, folder, data)
+            process = ProcessId(child.pid, _start_time(child.pid))
+            _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
+        except OSError as error:
+            raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
+        self._runs[launch.instance] = _Run(launch.attempt, process, str(data), child)
+
+    def _prepare(self, launch: Launch, folder: Path, data: Path, port: Any) -> None:
+        ready = folder / "ready.json"
+        grant = launch.grant.model_copy(
+            update={
+                "bind_host": self._options.bind_host,
+                "bind_port": _free_or_zero(self._options.bind_host, port),
+                "ready_file": str(ready),
+                "data_dir": str(data),
+            }
+        )
+        ready.unlink(missing_ok=True)
+        _write_private(folder / "grant.json", grant.model_dump_json())
+
+    def _spawn(self, spec: ServiceSpec, folder: Path, data: Path) -> subprocess.Popen[bytes]:
+        environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+        environment |= {"PYTHONUNBUFFERED": "1", **self._options.environment}
+        if self._options.python_path:
+            environment["PYTHONPATH"] = os.pathsep.join(self._options.python_path)
+        environment[GRANT_VARIABLE] = str(folder / "grant.json")
+        with open(os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab") as log:
+            # -P: what a service writes into its data folder must not be importable.
+            command = [sys.executable, "-P", "-m", str(spec.entrypoint)]
+            return subprocess.Popen(
+                command,
+                env=environment,
+                cwd=data,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def observe(self) -> Mapping[str, Observation]:
+        return {instance: self._look(instance, run) for instance, run in self._runs.items()}
+
+    def _look(self, instance: str, run: _Run) -> Observation:
+        if run.ended is not None:
+            return run.ended
+        folder = self._folder / instance
+        stat = run.process and stat_of(run.process)
+        if not stat or stat.zombie:
+            status = run.child.poll() if run.child else None
+            if run.child and status is None:
+                return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
+            # Remembered, for it cannot change any more; nothing on the machine does.
+            run.ended = Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(folder / "log"))
+            return run.ended
+        port = _read_json(folder / "ready.json").get("port")
+        phase = Phase.RUNNING if port else Phase.STARTING
+        host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
+        return Observation(run.attempt, phase, host, port, cpu_s=stat.cpu_s, memory_bytes=stat.memory_bytes)
+
+    def stop(self, instance: str, *, force: bool) -> None:
+        run = self._runs.get(instance)
+        if run is None or run.process is None:
+            return
+        if force:
+            _kill_all(run)
+        elif not run.asked_to_end and stat_of(run.process):
+            # Once only: services may take a second signal for impatience.
+            run.asked_to_end = True
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(run.process.pid, signal.SIGTERM)
+
+    def remove(self, instance: str) -> None:
+        run = self._runs.pop(instance, None)
+        if run is None:
+            return
+        _kill_all(run)
+        if run.child is not None:
+            run.child.wait()
+        shutil.rmtree(self._folder / instance, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty: then it is worth keeping
+            os.removedirs(run.data)
+
+    def logs(self, instance: str, lines: int) -> str:
+        # Ids come from the store; the check keeps a mistake elsewhere from reading other folders.
+        if instance not in self._runs:
+            return ""
+        with contextlib.suppress(FileNotFoundError), (self._folder / instance / "log").open(errors="replace") as log:
+            return "".join(deque(log, maxlen=lines))
+        return ""
+
+    def close(self) -> None:
+        _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
+
+    def tidy(self) -> None:
+        for instance in self._runs:
+            log = self._folder / instance / "log"
+            with contextlib.suppress(FileNotFoundError):
+                if log.stat().st_size > self._options.log_bytes:
+                    _keep_newer_half(log, self._options.log_bytes // 2)
+
+
+_left_running: list[subprocess.Popen[bytes]] = []
+"""Children that outlive the runtime that started them: the standard library warns of one that is dropped."""
+
+
+def _kill_all(run: _Run) -> None:
+    """End a run and everything in its session."""
+    if run.process is None:
+        return
+    for pid in session_members(run.process):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _start_time(pid: int) -> int:
+    stat = ProcessStat.read(pid)
+    return stat.start_time if stat else 0
+
+
+def _keep_newer_half(log: Path, keep: int) -> None:
+    """Cut in place: the service has the file open for appending. What it writes in this very moment may be lost."""
+    with log.open("rb+") as file:
+        file.seek(-keep, os.SEEK_END)
+        file.readline()
+        newer = file.read()
+        file.truncate(0)
+    with log.open("ab") as file:
+        file.write(newer)
+
+
+def _last_line(log: Path) -> str:
+    with contextlib.suppress(FileNotFoundError), log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - 8192))
+        lines = file.read().decode(errors="replace").split("\n")
+        for line in reversed(lines):
+            readable = "".join(c for c in line if c.isprintable()).strip()
+            if readable:
+                return readable[:_LAST_LINE]
+    return ""
+
+
+def _free_or_zero(host: str, port: Any) -> int:
+    """The port of the run before, so that its robot finds the next one where it was; 0 if another has it now."""
+    if not isinstance(port, int):
+        return 0
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return 0
+    return port
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Empty if it is not there, or not (yet) such a document."""
+    try:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _write_private(path: Path, content: str) -> None:
+    """Mode 0600, complete or not at all."""
+    draft = path.with_name(path.name + ".new")
+    with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+        file.write(content)
+    draft.replace(path)

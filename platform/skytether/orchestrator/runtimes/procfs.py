@@ -1,0 +1,104 @@
+"""What the kernel tells of processes (Linux ``/proc``, see proc(5)): one small read per look, no race in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_PROC = Path("/proc")
+_TICK = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+def _boot_id() -> str:
+    try:
+        return (_PROC / "sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+BOOT_ID = _boot_id()
+"""Start times count from boot, so they tell processes apart within one boot only."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessId:
+    """A process and no other: pids come again, together with the start time they do not."""
+
+    pid: int
+    start_time: int
+    """Clock ticks since boot."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStat:
+    """The fields of ``/proc/PID/stat`` that matter here."""
+
+    pid: int
+    zombie: bool
+    """Ended, and not yet waited for."""
+    session: int
+    start_time: int
+    cpu_s: float
+    memory_bytes: int
+
+    @classmethod
+    def read(cls, pid: int) -> ProcessStat | None:
+        """None if there is no such process."""
+        try:
+            text = (_PROC / str(pid) / "stat").read_bytes()
+        except (FileNotFoundError, ProcessLookupError):
+            return None
+        # The second field is the program's name in brackets, and may hold anything; those after it are numbers.
+        fields = text[text.rindex(b")") + 2 :].split()
+        return cls(
+            pid,
+            zombie=fields[0] in (b"Z", b"X"),
+            session=int(fields[3]),
+            start_time=int(fields[19]),
+            cpu_s=(int(fields[11]) + int(fields[12])) / _TICK,
+            memory_bytes=int(fields[21]) * _PAGE,
+        )
+
+
+def stat_of(process: ProcessId) -> ProcessStat | None:
+    """A process as it is now, a zombie too; None if it is gone, whoever has its pid now."""
+    stat = ProcessStat.read(process.pid)
+    return stat if stat and stat.start_time == process.start_time else None
+
+
+def session_members(leader: ProcessId) -> list[int]:
+    """Living processes of the session that this one leads, or led: some may have outlived it.
+
+    The kernel gives no new process a pid that is still a session's id, so a stranger with the leader's pid means that
+    the session is empty.
+    """
+    stranger = ProcessStat.read(leader.pid)
+    if stranger and stranger.start_time != leader.start_time:
+        return []
+    return [s.pid for s in _all() if s.session == leader.pid and not s.zombie]
+
+
+def find_by_environment(variable: str, value: str) -> ProcessId | None:
+    """The session leader that was started with this environment variable."""
+    wanted = f"{variable}={value}".encode()
+    for stat in _all():
+        if stat.session != stat.pid or stat.zombie:
+            continue
+        try:
+            environment = (_PROC / str(stat.pid) / "environ").read_bytes()
+        except OSError:  # another user's, or gone meanwhile
+            continue
+        if wanted in environment.split(b"\0"):
+            return ProcessId(stat.pid, stat.start_time)
+    return None
+
+
+def _all() -> Iterator[ProcessStat]:
+    for entry in os.scandir(_PROC):
+        if entry.name.isdigit():
+            stat = ProcessStat.read(int(entry.name))
+            if stat:
+                yield stat

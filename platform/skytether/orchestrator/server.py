@@ -1,0 +1,152 @@
+"""One orchestrator as a program: lock, listen, serve, shut down in order."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import uvicorn
+from alembic.util import CommandError
+from sqlalchemy.exc import SQLAlchemyError
+
+from .app import create_app
+from .core import Orchestrator
+from .errors import InvalidError
+from .security import SecretFileError
+from .settings import Settings
+
+log = logging.getLogger(__name__)
+
+_DRAIN = 2
+"""Whole seconds that requests under way get at shutdown."""
+_BACKLOG = 512
+
+
+class StartError(Exception):
+    """It cannot start; one sentence saying what to do."""
+
+    def __init__(self, text: str, *, usage: bool = False) -> None:
+        """``usage``: what it was given is wrong, rather than the state of the machine."""
+        super().__init__(text)
+        self.usage = usage
+
+
+def run(settings: Settings) -> None:
+    """Serve until SIGTERM or SIGINT.
+
+    The real address is written to ``address`` in the state folder once requests are answered, and removed at the end.
+
+    Raises:
+        StartError: The state folder is in use, the port is taken, or a file is wrong.
+    """
+    try:
+        settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise StartError(f"cannot make {settings.state_dir}: {error.strerror}; give another --state-dir") from error
+    with _locked(settings.state_dir), _listening(settings.host, settings.port) as listener:
+        try:
+            core = Orchestrator(settings)
+        except SecretFileError as error:
+            raise StartError(str(error)) from error
+        _serve(core, listener)
+
+
+def _serve(core: Orchestrator, listener: socket.socket) -> None:
+    server = _Server(core, listener)
+    # Uvicorn handles signals while it serves, and raises them again when it has ended; ours are for before and after.
+    previous = {number: signal.signal(number, server.handle_exit) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        _start(core)
+        try:
+            server.run(sockets=[listener])
+        finally:
+            core.stop()
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _start(core: Orchestrator) -> None:
+    try:
+        core.start()
+    except InvalidError as error:
+        raise StartError(str(error), usage=True) from error
+    except (SQLAlchemyError, CommandError) as error:
+        text = str(getattr(error, "orig", None) or error).splitlines()[0]
+        raise StartError(f"the database cannot be used: {text}") from error
+
+
+class _Server(uvicorn.Server):
+    """Uvicorn that tells its address, and lets event streams end when it is to end."""
+
+    def __init__(self, core: Orchestrator, listener: socket.socket) -> None:
+        config = uvicorn.Config(
+            create_app(core),
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            server_header=False,
+            timeout_graceful_shutdown=_DRAIN,
+        )
+        super().__init__(config)
+        self._core = core
+        self._address = core.settings.state_dir / "address"
+        host, port = listener.getsockname()[:2]
+        self._url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        draft = self._address.with_name("address.new")
+        draft.write_text(f"{self._url}\n")
+        draft.replace(self._address)
+        log.info("listening on %s, state in %s", self._url, self._core.settings.state_dir)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._address.unlink(missing_ok=True)
+        self._core.broker.close()
+        await super().shutdown(sockets)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep a second orchestrator out; the kernel lets go of the lock however this one ends."""
+    try:
+        file = (folder / "lock").open("a+")
+    except OSError as error:
+        raise StartError(f"cannot write to {folder}: {error.strerror}; give another --state-dir") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            who = file.read().strip() or "unknown"
+            text = f"another orchestrator (pid {who}) uses {folder}: stop it, or give another folder with --state-dir"
+            raise StartError(text) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+@contextmanager
+def _listening(host: str, port: int) -> Iterator[socket.socket]:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise StartError(f"there is no address '{host}' here: {error.strerror}; give another with --host") from error
+    with listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind(address)
+            listener.listen(_BACKLOG)
+        except OSError as error:
+            text = f"cannot listen on {host} port {port}: {error.strerror}; give another with --host or --port"
+            raise StartError(text) from error
+        yield listener

@@ -1,0 +1,243 @@
+"""The sites: each has a runtime and a thread of its own, so that a slow or silent one holds up no other."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from typing_extensions import override
+
+from skytether.api.manifest import ServiceSpec, Strict
+from skytether.api.rest import SiteCreate
+
+from .errors import ConflictError, Fault, InvalidError, NotFoundError
+from .loops import Loop
+from .placement import NOTHING, Candidate
+from .runtimes.base import Capacity, Launch, Observation, Runtime, RuntimeFailure
+from .settings import Timing
+from .store import Store
+from .validation import parse
+
+log = logging.getLogger(__name__)
+
+RUNTIMES = "skytether.runtimes"
+DEFAULT_SITE = SiteCreate(name="local", tier="edge", runtime="process")
+"""Made when there is no site at all. Tier ``edge``: the orchestrator's machine is near the robot, not on it."""
+_FIRST_LOOK = 1.0
+"""Seconds a new site gets to answer before it is listed all the same."""
+_CLOSE_TIMEOUT = 5.0
+"""Seconds that a call into a hanging runtime gets at the end."""
+
+Step = Callable[["Site"], float]
+"""One reconcile pass over a site; returns seconds until the next."""
+
+
+def load_runtime(name: str) -> type[Runtime]:
+    """Find a runtime by its entry point.
+
+    Raises:
+        InvalidError: There is none, or it cannot be imported; the cause is told.
+    """
+    found = {point.name: point for point in entry_points(group=RUNTIMES)}
+    if name not in found:
+        known = ", ".join(sorted(found)) or "none"
+        raise InvalidError([Fault("runtime", f"there is no runtime '{name}'; installed are: {known}")])
+    try:
+        loaded = found[name].load()
+    except ImportError as error:
+        raise InvalidError([Fault("runtime", f"runtime '{name}' cannot be used: {error}")]) from error
+    if not (isinstance(loaded, type) and issubclass(loaded, Runtime)):
+        raise InvalidError([Fault("runtime", f"entry point '{name}' is no Runtime")])
+    return loaded
+
+
+class Unusable(Runtime):
+    """Stands in for a runtime that cannot be made (its extra was removed, say): the site is listed, with the reason."""
+
+    Options = Strict
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    @override
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return self._reason
+
+    def capacity(self) -> Capacity:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def start(self, launch: Launch) -> None:
+        raise RuntimeFailure(self._reason)
+
+    def observe(self) -> Mapping[str, Observation]:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def stop(self, instance: str, *, force: bool) -> None:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def remove(self, instance: str) -> None:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def logs(self, instance: str, lines: int) -> str:
+        raise RuntimeFailure(self._reason)
+
+
+class Site:
+    """One site: its runtime, and what is known of it now. Read from any thread, written by its own."""
+
+    def __init__(self, asked: SiteCreate, runtime: Runtime, step: Step, silent_after: float) -> None:
+        self.asked = asked
+        self.runtime = runtime
+        self.capacity: Capacity | None = None
+        self.failure = ""
+        """Why the last look failed; empty: it did not."""
+        self.observed: Mapping[str, Observation] = {}
+        self.looked_at = -math.inf
+        """Monotonic seconds of the last look that did not fail."""
+        self.tidied_at = -math.inf
+        self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
+        self._silent_after = silent_after
+
+    @property
+    def name(self) -> str:
+        return self.asked.name
+
+    @property
+    def unreachable(self) -> str:
+        """Why it cannot be used now; empty: it can."""
+        silent = time.monotonic() - self.looked_at
+        if self.failure or silent < self._silent_after:
+            return self.failure
+        return f"it has not answered for {silent:.0f} s" if self.capacity else "it has not answered yet"
+
+    def candidate(self, spec: ServiceSpec, used: Capacity) -> Candidate:
+        """As placement sees it for one service."""
+        return Candidate(
+            name=self.name,
+            tier=self.asked.tier,
+            cannot_run=self.runtime.refuses(spec),
+            unreachable=self.unreachable or None,
+            total=self.capacity or NOTHING,
+            used=used,
+        )
+
+
+class Sites:
+    """All sites, in memory and in the store."""
+
+    def __init__(
+        self, folder: Path, store: Store, step: Step, timing: Timing, find_runtime: Callable[[str], type[Runtime]]
+    ) -> None:
+        """``step`` is what each site's thread does again and again; ``find_runtime`` gives a runtime by its name."""
+        self._find_runtime = find_runtime
+        self._folder = folder
+        self._store = store
+        self._step = step
+        self._timing = timing
+        self._lock = threading.Lock()
+        self._sites: dict[str, Site] = {}
+
+    def start(self) -> None:
+        """Open every site of the store, the default one if there is none, and give them a moment to answer."""
+        asked = self._store.sites()
+        if not asked:
+            self._store.add_site(DEFAULT_SITE)
+            asked = [DEFAULT_SITE]
+        for one in asked:
+            try:
+                runtime = self._make_runtime(one)
+            except InvalidError as error:
+                log.error("site %s cannot be used: %s", one.name, error)
+                runtime = Unusable(str(error))
+            self._open(one, runtime)
+        deadline = time.monotonic() + _FIRST_LOOK
+        for site in self.all():
+            site.loop.wait_first(max(0.0, deadline - time.monotonic()))
+
+    def stop(self) -> None:
+        """Let go of all sites; what runs there runs on."""
+        for site in self.all():
+            self._close(site)
+
+    def add(self, asked: SiteCreate) -> Site:
+        """A new site.
+
+        Raises:
+            InvalidError: Runtime or options are wrong.
+            ConflictError: There is one of that name.
+        """
+        with self._lock:
+            if asked.name in self._sites:
+                raise ConflictError(
+                    f"there is a site '{asked.name}' already: choose another name, or delete that first"
+                )
+            runtime = self._make_runtime(asked)
+            self._store.add_site(asked)
+            site = self._open(asked, runtime)
+        site.loop.wait_first(_FIRST_LOOK)
+        return site
+
+    def delete(self, name: str) -> None:
+        """Forget a site.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            ConflictError: Instances are there.
+        """
+        with self._lock:
+            site = self.get(name)
+            held = [record.id for record in self._store.live_at(name)]
+            if held:
+                raise ConflictError(
+                    f"site '{name}' has {len(held)} instances: delete them first ({', '.join(held[:3])})"
+                )
+            self._store.delete_site(name)
+            del self._sites[name]
+        self._close(site)
+
+    def get(self, name: str) -> Site:
+        """One site.
+
+        Raises:
+            NotFoundError: There is none of that name; the text names those there are.
+        """
+        site = self._sites.get(name)
+        if site is None:
+            known = ", ".join(sorted(self._sites)) or "none"
+            raise NotFoundError(f"there is no site '{name}'; known are: {known}")
+        return site
+
+    def find(self, name: str | None) -> Site | None:
+        return self._sites.get(name) if name else None
+
+    def all(self) -> list[Site]:
+        return sorted(self._sites.values(), key=lambda site: site.name)
+
+    def _make_runtime(self, asked: SiteCreate) -> Runtime:
+        kind = self._find_runtime(asked.runtime)
+        options = parse(kind.Options, asked.options, prefix=("options",))
+        folder = self._folder / asked.name
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            return kind(asked.name, folder, options)
+        except RuntimeFailure as error:
+            raise InvalidError([Fault("runtime", str(error))]) from error
+
+    def _open(self, asked: SiteCreate, runtime: Runtime) -> Site:
+        site = Site(asked, runtime, self._step, self._timing.site_silent)
+        self._sites[asked.name] = site
+        site.loop.start()
+        return site
+
+    def _close(self, site: Site) -> None:
+        site.loop.stop(timeout=_CLOSE_TIMEOUT)
+        site.runtime.close()

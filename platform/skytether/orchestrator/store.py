@@ -1,0 +1,290 @@
+"""What outlives the orchestrator: all reading and writing of the database.
+
+Changes of instances are compare-and-set on the record's version: load, work outside any transaction, apply; who has not
+seen the last change gets None and looks again. Each change of state or reason leaves an event.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Row, RowMapping, delete, func, insert, select, text, update
+from sqlalchemy.exc import IntegrityError
+
+from skytether.api.rest import SiteCreate, State
+
+from .db import make_engine, migrate
+from .models import events, idempotency, instances, robots, services, sites
+from .records import Record, check_move
+from .security import TokenHash
+
+_FINAL = [state for state in State if state.final]
+_REASON_LENGTH = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class EventRow:
+    """One change of an instance."""
+
+    id: int
+    instance: str
+    at: float
+    state: State
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotRow:
+    """A registered robot."""
+
+    name: str
+    services: tuple[str, ...]
+    token: TokenHash
+    created_at: float
+    last_seen_at: float | None = None
+
+
+class KeyReusedError(Exception):
+    """An idempotency key came again with another body."""
+
+
+class Store:
+    """The database. Safe from any thread."""
+
+    def __init__(self, url: str) -> None:
+        self._engine = make_engine(url)
+        self._writer = self._engine.execution_options(immediate=True)
+        self.on_change: Callable[[str], None] = lambda _: None
+        """Called with an instance's id after each of its events is stored; must return at once."""
+
+    def migrate(self) -> None:
+        migrate(self._engine)
+
+    def close(self) -> None:
+        self._engine.dispose()
+
+    def ping(self) -> None:
+        """Raise what the database raises, if it does not answer."""
+        with self._engine.connect() as connection:
+            connection.execute(text("SELECT 1"))
+
+    # Instances
+
+    def add(self, record: Record, owner: str, key: str | None, body_sha256: str) -> Record:
+        """Store a new instance; if another request with the same idempotency key was quicker, give back its one.
+
+        Raises:
+            KeyReusedError: The key was used with another body.
+        """
+        try:
+            with self._writer.begin() as connection:
+                connection.execute(insert(instances).values(**_values(record)))
+                if key is not None:
+                    row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": record.id}
+                    connection.execute(insert(idempotency).values(created_at=record.created_at, **row))
+                _add_event(connection, record)
+        except IntegrityError:
+            earlier = self.made_with(owner, key, body_sha256) if key is not None else None
+            if earlier is None:
+                raise
+            return earlier
+        self.on_change(record.id)
+        return record
+
+    def made_with(self, owner: str, key: str, body_sha256: str) -> Record | None:
+        """The instance that was made with an idempotency key; None if the key is new.
+
+        Raises:
+            KeyReusedError: The key was used with another body.
+        """
+        mine = (idempotency.c.owner == owner) & (idempotency.c.key == key)
+        query = select(instances, idempotency.c.body_sha256).join(idempotency).where(mine)
+        with self._engine.connect() as connection:
+            row = connection.execute(query).mappings().one_or_none()
+        if row is None:
+            return None
+        if row["body_sha256"] != body_sha256:
+            raise KeyReusedError
+        return _record(row)
+
+    def get(self, instance: str) -> Record | None:
+        with self._engine.connect() as connection:
+            row = connection.execute(select(instances).where(instances.c.id == instance)).mappings().one_or_none()
+        return None if row is None else _record(row)
+
+    def all(self, robot: str | None = None) -> list[Record]:
+        """Newest first; of one robot, or of all."""
+        query = select(instances).order_by(instances.c.created_at.desc(), instances.c.id)
+        if robot is not None:
+            query = query.where(instances.c.robot == robot)
+        return self._records(query)
+
+    def live(self) -> list[Record]:
+        """All that has not ended, oldest first."""
+        query = select(instances).where(instances.c.state.not_in(_FINAL))
+        return self._records(query.order_by(instances.c.created_at, instances.c.id))
+
+    def live_at(self, site: str) -> list[Record]:
+        """All at one site that has not ended."""
+        return self._records(select(instances).where(instances.c.state.not_in(_FINAL), instances.c.site == site))
+
+    def known(self, ids: Iterable[str]) -> set[str]:
+        """Those that the store has a row of, ended or not."""
+        with self._engine.connect() as connection:
+            return set(connection.scalars(select(instances.c.id).where(instances.c.id.in_(list(ids)))))
+
+    def change(self, record: Record, now: float, **changes: Any) -> Record | None:
+        """Change an instance if it is still as it was seen.
+
+        Returns:
+            The record as it is now; None if somebody else changed it meanwhile.
+
+        Raises:
+            IllegalMoveError: The move of state is not in the table.
+        """
+        new = dataclasses.replace(record, version=record.version + 1, **changes)
+        check_move(record.state, new.state)
+        new = dataclasses.replace(new, reason=new.reason[:_REASON_LENGTH])
+        told = new.state is not record.state or new.reason != record.reason
+        if told:
+            new = dataclasses.replace(new, updated_at=now)
+        seen = (instances.c.id == record.id) & (instances.c.version == record.version)
+        with self._writer.begin() as connection:
+            if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
+                return None
+            if told:
+                _add_event(connection, new)
+        if told:
+            self.on_change(new.id)
+        return new
+
+    def renew(self, instance: str, now: float, lease_s: float | None) -> Record | None:
+        """Keep an instance's lease; None if it has ended or ends."""
+        alive = instances.c.state.not_in([*_FINAL, State.STOPPING])
+        length = instances.c.lease_s if lease_s is None else lease_s
+        statement = update(instances).where(instances.c.id == instance, alive)
+        # The version counts up, so that whoever is about to end it for its old lease has to look again.
+        statement = statement.values(lease_s=length, lease_expires_at=now + length, version=instances.c.version + 1)
+        with self._writer.begin() as connection:
+            row = connection.execute(statement.returning(instances)).mappings().one_or_none()
+        return None if row is None else _record(row)
+
+    def extend_leases(self, now: float) -> None:
+        """Give every live instance its whole lease from now: nobody could renew while the orchestrator was down."""
+        full = now + instances.c.lease_s
+        statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.lease_expires_at < full)
+        with self._writer.begin() as connection:
+            connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))
+
+    def events(self, instance: str, after: int) -> list[EventRow]:
+        """An instance's events with higher ids, in order."""
+        query = select(events).where(events.c.instance == instance, events.c.id > after).order_by(events.c.id)
+        with self._engine.connect() as connection:
+            rows = connection.execute(query).all()
+        return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason) for row in rows]
+
+    def prune(self, now: float, ended_age: float, ended_count: int, events_count: int) -> list[tuple[str, str | None]]:
+        """Forget ended instances that are too old or too many, their events and keys, and the oldest events.
+
+        Returns:
+            Forgotten instances with their sites.
+        """
+        ended = select(instances.c.id, instances.c.site, instances.c.updated_at).where(instances.c.state.in_(_FINAL))
+        with self._writer.begin() as connection:
+            rows = connection.execute(ended.order_by(instances.c.updated_at.desc())).all()
+            gone = [(r.id, r.site) for i, r in enumerate(rows) if i >= ended_count or r.updated_at < now - ended_age]
+            connection.execute(delete(instances).where(instances.c.id.in_([i for i, _ in gone])))
+            newest = connection.scalar(select(func.max(events.c.id))) or 0
+            connection.execute(delete(events).where(events.c.id <= newest - events_count))
+        return gone
+
+    def _records(self, query: Any) -> list[Record]:
+        with self._engine.connect() as connection:
+            return [_record(row) for row in connection.execute(query).mappings()]
+
+    # Catalogue
+
+    def services(self) -> dict[str, dict[str, Any]]:
+        """Manifests that were put, by name."""
+        with self._engine.connect() as connection:
+            return {row.name: row.manifest for row in connection.execute(select(services))}
+
+    def put_service(self, name: str, manifest: dict[str, Any]) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(delete(services).where(services.c.name == name))
+            connection.execute(insert(services).values(name=name, manifest=manifest))
+
+    def delete_service(self, name: str) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(delete(services).where(services.c.name == name))
+
+    # Sites
+
+    def sites(self) -> list[SiteCreate]:
+        with self._engine.connect() as connection:
+            rows = connection.execute(select(sites).order_by(sites.c.name)).mappings()
+            return [SiteCreate.model_validate(dict(row)) for row in rows]
+
+    def add_site(self, site: SiteCreate) -> bool:
+        """False if there is one of that name."""
+        return self._insert(sites, site.model_dump())
+
+    def delete_site(self, name: str) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(delete(sites).where(sites.c.name == name))
+
+    # Robots
+
+    def robots(self) -> list[RobotRow]:
+        with self._engine.connect() as connection:
+            return [_robot(row) for row in connection.execute(select(robots).order_by(robots.c.name))]
+
+    def robots_by_prefix(self, prefix: str) -> Sequence[RobotRow]:
+        """Those whose token begins so; at most one but for a freak of chance."""
+        with self._engine.connect() as connection:
+            return [_robot(r) for r in connection.execute(select(robots).where(robots.c.token_prefix == prefix))]
+
+    def add_robot(self, robot: RobotRow) -> bool:
+        """False if there is one of that name."""
+        row = {"name": robot.name, "services": list(robot.services), "created_at": robot.created_at}
+        return self._insert(robots, {**row, "token_prefix": robot.token.prefix, "token_sha256": robot.token.digest})
+
+    def delete_robot(self, name: str) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(delete(robots).where(robots.c.name == name))
+
+    def seen(self, robot: str, now: float) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
+
+    def _insert(self, table: Any, values: dict[str, Any]) -> bool:
+        try:
+            with self._writer.begin() as connection:
+                connection.execute(insert(table).values(**values))
+        except IntegrityError:
+            return False
+        return True
+
+
+def _values(record: Record) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+
+
+_COLUMNS = [field.name for field in dataclasses.fields(Record)]
+
+
+def _record(row: RowMapping) -> Record:
+    return Record(**{name: row[name] for name in _COLUMNS})
+
+
+def _robot(row: Row[Any]) -> RobotRow:
+    token = TokenHash(row.token_prefix, row.token_sha256)
+    return RobotRow(row.name, tuple(row.services), token, row.created_at, row.last_seen_at)
+
+
+def _add_event(connection: Connection, record: Record) -> None:
+    row = {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}
+    connection.execute(insert(events).values(**row))

@@ -1,0 +1,158 @@
+"""Runtimes that run nothing, named by how they fail: for tests of what stands above a runtime.
+
+They keep the contract of :mod:`skytether.orchestrator.runtimes.base`, which ``tests/contracts`` checks; so they also
+show the least that a runtime of one's own has to do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from typing_extensions import override
+
+from skytether.api.manifest import ServiceSpec, Strict
+from skytether.orchestrator.runtimes.base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+
+
+class FakeOptions(Strict):
+    """Options of all fakes."""
+
+    cpu: Annotated[float, Field(gt=0)] = 64
+    memory_mb: Annotated[int, Field(gt=0)] = 65_536
+
+
+@dataclass
+class FakeRun:
+    """One run as the made-up machine has it."""
+
+    launch: Launch
+    port: int
+    looks: int = 0
+    """How often it was observed."""
+    ended: bool = False
+    exit_status: int | None = None
+    last_line: str = ""
+    log: str = ""
+
+
+class FakeRuntime(Runtime):
+    """Every service is ready at once, runs until it is stopped, and ends when it is asked to."""
+
+    Options = FakeOptions
+    looks_until_ready: float = 0
+    """How often a run must have been observed before it listens."""
+    obedient = True
+    """Whether a run ends when it is asked to."""
+
+    @override
+    def __init__(self, site: str, folder: Path, options: Strict, world: dict[str, FakeRun] | None = None) -> None:
+        """``world``: the runs of an earlier runtime, to be adopted."""
+        if not isinstance(options, FakeOptions):
+            raise TypeError("options must be FakeOptions")
+        self.site = site
+        self.world = {} if world is None else world
+        self.silent = False
+        """Set it, and the site answers no more."""
+        self.started: list[tuple[str, int]] = []
+        """Instance and attempt of every run that was begun here."""
+        self._options = options
+        self._ports = count(40_000)
+
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return None if spec.entrypoint else "the service has no entrypoint"
+
+    def capacity(self) -> Capacity:
+        self._answer()
+        return Capacity(self._options.cpu, self._options.memory_mb)
+
+    def start(self, launch: Launch) -> None:
+        self._answer()
+        old = self.world.get(launch.instance)
+        if old is not None and old.launch.attempt == launch.attempt:
+            return
+        log = f"{old.log if old else ''}run {launch.attempt} of {launch.grant.service}\n"
+        self.world[launch.instance] = FakeRun(launch, old.port if old else next(self._ports), log=log)
+        self.started.append((launch.instance, launch.attempt))
+
+    def observe(self) -> Mapping[str, Observation]:
+        self._answer()
+        for run in self.world.values():
+            run.looks += 1
+        return {instance: self._look(run) for instance, run in self.world.items()}
+
+    def _look(self, run: FakeRun) -> Observation:
+        attempt = run.launch.attempt
+        if run.ended:
+            return Observation(attempt, Phase.EXITED, exit_status=run.exit_status, last_line=run.last_line)
+        if run.looks < self.looks_until_ready:
+            return Observation(attempt, Phase.STARTING)
+        return Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
+
+    def stop(self, instance: str, *, force: bool) -> None:
+        self._answer()
+        run = self.world.get(instance)
+        if run is not None and not run.ended and (force or self.obedient):
+            run.ended, run.exit_status = True, -9 if force else 0
+
+    def remove(self, instance: str) -> None:
+        self._answer()
+        self.world.pop(instance, None)
+
+    def logs(self, instance: str, lines: int) -> str:
+        run = self.world.get(instance)
+        return "".join(run.log.splitlines(keepends=True)[-lines:]) if run else ""
+
+    def crash(self, instance: str, exit_status: int = 1, last_line: str = "") -> None:
+        """Let a run end by itself."""
+        run = self.world[instance]
+        run.ended, run.exit_status, run.last_line = True, exit_status, last_line
+        run.log += f"{last_line}\n" if last_line else ""
+
+    def _answer(self) -> None:
+        if self.silent:
+            raise RuntimeFailure(f"site {self.site} does not answer")
+
+
+class SlowRuntime(FakeRuntime):
+    """Services are ready only when they were looked at a few times."""
+
+    looks_until_ready = 3
+
+
+class NeverReadyRuntime(FakeRuntime):
+    """Services start and never listen."""
+
+    looks_until_ready = math.inf
+
+
+class StubbornRuntime(FakeRuntime):
+    """Services end only when they are forced to."""
+
+    obedient = False
+
+
+class CrashingRuntime(FakeRuntime):
+    """Services end at once, with a last line that says why."""
+
+    exit_status = 1
+    last_line = "boom"
+
+    def start(self, launch: Launch) -> None:
+        old = self.world.get(launch.instance)
+        super().start(launch)
+        if self.world[launch.instance] is not old:
+            self.crash(launch.instance, self.exit_status, self.last_line)
+
+
+class RefusingRuntime(FakeRuntime):
+    """Nothing can be started."""
+
+    @override
+    def start(self, launch: Launch) -> None:
+        raise RuntimeFailure("no space left on the site")

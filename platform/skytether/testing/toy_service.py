@@ -1,0 +1,67 @@
+"""The smallest thing that a runtime can run: ``python -m skytether.testing.toy_service``.
+
+It takes a UDP port, says that it is ready, and waits to be ended; its parameters (:class:`Behaviour`) make it fail in a
+chosen way. It speaks no protocol and imports the standard library only, so it is up in some tens of milliseconds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What it does; times in seconds."""
+
+    say: str = "toy service"
+    """Its first line of log."""
+    exit_status: int | None = None
+    """Ends at once with this, before it is ready."""
+    ignore_sigterm: bool = False
+    never_ready: bool = False
+    child: bool = False
+    """Starts a process of its own, and says ``child PID``."""
+    environment: bool = False
+    """Says the names of all its environment variables."""
+    flood: int = 0
+    """Says this many lines."""
+
+
+def main() -> int:
+    """Run until SIGTERM; returns the exit status."""
+    grant = json.loads(Path(os.environ["SKYTETHER_GRANT"]).read_text())
+    wanted = Behaviour(**grant["params"])
+    print(wanted.say)  # noqa: T201 (a service's log is its standard output)
+    if wanted.exit_status is not None:
+        return wanted.exit_status
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: None if wanted.ignore_sigterm else ended.set())
+    if wanted.environment:
+        print("environment " + " ".join(sorted(os.environ)))  # noqa: T201
+    if wanted.child:
+        program = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)"
+        child = subprocess.Popen([sys.executable, "-c", program])
+        print(f"child {child.pid}")  # noqa: T201
+    for number in range(wanted.flood):
+        print(f"line {number}")  # noqa: T201
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind((grant["bind_host"], grant["bind_port"]))
+        if not wanted.never_ready:
+            ready = Path(grant["ready_file"])
+            draft = ready.with_suffix(".new")
+            draft.write_text(json.dumps({"port": bound.getsockname()[1], "pid": os.getpid()}))
+            draft.replace(ready)
+        ended.wait()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
