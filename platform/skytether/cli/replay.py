@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-from collections.abc import Iterator
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .connection import TokenFile, connected
 from .output import console, fail, print_json
 
 if TYPE_CHECKING:
@@ -25,9 +24,10 @@ def replay(
     topic: Annotated[list[str] | None, typer.Option(help="Send this topic only; may be given again.")] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot that is played.")] = "replay",
     url: Annotated[
-        str | None, typer.Option(help="Of the orchestrator; without it one is started for the replay.")
+        str | None,
+        typer.Option(envvar="SKYTETHER_URL", help="Of the orchestrator; without it one is started for the replay."),
     ] = None,
-    token_file: Annotated[Path | None, typer.Option(help="File with the robot's token; needed with --url.")] = None,
+    token_file: TokenFile = None,
     output: Annotated[
         Path, typer.Option(help="Folder for what the service writes, if the orchestrator was started for the replay.")
     ] = Path("replay-output"),
@@ -47,7 +47,7 @@ def replay(
         if url is None:
             result, files = _with_own_orchestrator(config, output)
         else:
-            with _client(url, token_file) as client:
+            with connected(url, token_file) as client:
                 result, files = _stream(config, client), []
     except (ApiError, BagError, EmbeddedError, OSError, ReplayError, Unreachable) as error:
         fail(str(error))
@@ -64,16 +64,13 @@ def replay(
 def _with_own_orchestrator(config: ReplayConfig, output: Path) -> tuple[ReplayResult, list[Path]]:
     """Start an orchestrator, replay, and keep what the service wrote."""
     from skytether.api.client import Client
-    from skytether.api.rest import RobotCreate
     from skytether.lab.embedded import EmbeddedOrchestrator
     from skytether.robot.bag import Bag
 
     Bag(config.bag).close()  # what is wrong with the recording is told before anything is started
     output.mkdir(parents=True, exist_ok=True)
     with EmbeddedOrchestrator() as orchestrator:
-        with Client(orchestrator.url, orchestrator.operator_token) as operator:
-            token = operator.create_robot(RobotCreate(name=config.robot)).token
-        with Client(orchestrator.url, token) as client:
+        with Client(orchestrator.url, orchestrator.operator_token) as client:
             result = _stream(config, client)
         written = [path for path in orchestrator.state_dir.rglob(f"data/*/*/{result.instance}/*") if path.is_file()]
         return result, [Path(shutil.move(path, _free(output / path.name))) for path in sorted(written)]
@@ -87,20 +84,6 @@ def _free(path: Path) -> Path:
         number += 1
         candidate = path.with_stem(f"{path.stem}-{number}")
     return candidate
-
-
-@contextlib.contextmanager
-def _client(url: str, token_file: Path | None) -> Iterator[Client]:
-    from skytether.api.client import Client
-
-    if token_file is None:
-        fail("--url needs --token-file: a file with the token that the robot got when it was registered", 2)
-    try:
-        token = token_file.read_text().strip()
-    except (OSError, UnicodeDecodeError) as error:
-        fail(f"the token file {token_file} cannot be read: {error}", 2)
-    with Client(url, token) as client:
-        yield client
 
 
 def _stream(config: ReplayConfig, client: Client) -> ReplayResult:
