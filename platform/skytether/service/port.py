@@ -47,10 +47,10 @@ class ServicePort:
     def notify(self, event: Event) -> None:
         match event:
             case Connected(topics):
-                self._log.info("robot connected; topics: %s", ", ".join(topic.name for topic in topics))
+                self._log.info("connected; topics: %s", ", ".join(topic.name for topic in topics))
                 self._agree(topics)
             case Disconnected(reason):
-                self._log.info("robot disconnected: %s", reason)
+                self._log.info("disconnected: %s", reason)
                 self._agree(())
             case PeerMoved(address):
                 self._log.info("robot now speaks from %s", address)
