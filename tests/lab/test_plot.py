@@ -3,6 +3,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from matplotlib.image import imread
 
 from skytether.lab.measures import Sample
 from skytether.lab.plot import plot_walk
@@ -10,12 +11,10 @@ from skytether.lab.trail import Trail
 from skytether.robot.command import Source
 
 
-def colours(file: Path) -> set[tuple[int, ...]]:
-    """Every colour in a PNG that matplotlib can read back."""
-    from matplotlib.image import imread
-
-    pixels = (np.asarray(imread(file))[..., :3] * 255).round().astype(int).reshape(-1, 3)
-    return set(map(tuple, np.unique(pixels, axis=0).tolist()))
+def colours(file: Path) -> set[int]:
+    """Every colour of a PNG, as 0xRRGGBB."""
+    pixels = (np.asarray(imread(file))[..., :3] * 255).round().astype(int)
+    return set(np.unique(pixels @ (1 << 16, 1 << 8, 1)).tolist())
 
 
 def test_draws_each_source_in_its_colour(tmp_path: Path) -> None:
@@ -30,10 +29,10 @@ def test_draws_each_source_in_its_colour(tmp_path: Path) -> None:
     assert (width, zlib.crc32(data[12:29])) == (1500, struct.unpack(">I", data[29:33])[0])
     assert height > 300
     found = colours(file)
-    assert {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00), (0x11, 0x11, 0x11)} <= found
+    assert {0x0072B2, 0xD55E00, 0x111111} <= found
 
     plot_walk([s._replace(source=Source.CLOUD) for s in samples], trail, file, title="Walk")
-    assert (0xD5, 0x5E, 0x00) not in colours(file)
+    assert 0xD55E00 not in colours(file)
 
 
 def test_draws_a_walk_of_one_sample(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ class Remote:
         return self._sent[-1] if self._sent else None  # type: ignore[return-value]
 
 
-def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 60.0) -> tuple[World, Measures]:
+def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 50.0) -> tuple[World, Measures]:
     world = World(TRAIL, seed=seed)
     samples = simulate(world, Remote(), rtt=rtt, loss=loss, duration=duration, random=np.random.default_rng(seed))
     return world, measure(samples, TRAIL)
@@ -40,7 +40,7 @@ def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 60.0
 
 @pytest.mark.parametrize(
     ("rtt", "loss", "kte"),
-    [(0.0, 0.0, 0.03), (0.1, 0.0, 0.03), (0.3, 0.0, 0.03), (0.5, 0.0, 0.03), (0.1, 0.05, 0.03), (0.5, 0.3, 0.04)],
+    [(0.0, 0.0, 0.03), (0.1, 0.05, 0.03), (0.3, 0.0, 0.03), (0.5, 0.0, 0.03), (0.5, 0.3, 0.04)],
 )
 def test_guides_along_the_trail(rtt: float, loss: float, kte: float) -> None:
     world, result = walk(rtt=rtt, loss=loss)
@@ -63,7 +63,7 @@ def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
             return super().step(now)
 
     world = World(TRAIL, seed=2)
-    result = measure(simulate(world, Restarting(), rtt=0.1, duration=60.0), TRAIL)
+    result = measure(simulate(world, Restarting(), rtt=0.1, duration=50.0), TRAIL)
     assert result.completed
     assert result.kte_m < 0.03
 
@@ -71,7 +71,7 @@ def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
 def test_finds_back_from_beside_the_trail() -> None:
     world = World(TRAIL, seed=3)
     world.walker.pose = world.walker.odometry = world.pose._replace(y=0.4, heading=0.3)
-    samples = simulate(world, Remote(), rtt=0.5, duration=60.0)
+    samples = simulate(world, Remote(), rtt=0.5, duration=50.0)
     late = [sample for sample in samples if sample.time > 20.0]
     assert measure(samples, TRAIL).completed
     offsets = [abs(TRAIL.locate(sample.x, sample.y).offset) for sample in late[::50]]
