@@ -63,9 +63,11 @@ class Config:
             raise ValueError(f"burst must be at least the mtu ({self.mtu} bytes), not {self.burst}")
         if not 0 < self.max_message <= 2**30:
             raise ValueError(f"max_message must be 1 to {2**30} bytes, not {self.max_message}")
-        for name in ("reassembly_limit", "queue_limit"):
-            if getattr(self, name) < 1.5 * self.max_message:  # the largest message and the book-keeping of its shards
-                raise ValueError(f"{name} must be at least 1.5 times max_message ({self.max_message} bytes)")
+        if self.queue_limit < self.max_message:
+            raise ValueError(f"queue_limit must be at least max_message ({self.max_message} bytes)")
+        needed = self.max_message * 3 // 2 + 4096  # with the book-keeping of its shards, however small they are
+        if self.reassembly_limit < needed:
+            raise ValueError(f"reassembly_limit must be at least 1.5 times max_message plus 4 KiB ({needed} bytes)")
         positive = ("rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence")
         for name in (*positive, "hello_retry", "hello_retry_max"):
             if not getattr(self, name) > 0:

@@ -111,6 +111,9 @@ class Session:
 
         self._door = Doorkeeper(session_id, key, self._table, entropy) if role is Role.SERVICE else None
         self._peer: Hashable | None = None
+        """Where the robot's end looks for the service."""
+        self._moving = False
+        """Told to speak to another address, from which no answer has come yet: answers from elsewhere do not count."""
         self._hello: Hello | None = None
         self._hello_at = math.inf
         self._hello_wait = self._config.hello_retry
@@ -153,9 +156,10 @@ class Session:
         self._peer = address
         self._path.address = address
         if self.role is Role.ROBOT and not self._closed:
+            self._moving = self._epoch is not None
             self._hello = None
             self._hello_wait = self._config.hello_retry
-            self._hello_at = 0.0 if self._epoch is None else self._hello_at
+            self._hello_at = 0.0
 
     def close(self, now: float) -> None:
         """Say goodbye. Call `transmit` once more to send it; then the session is over."""
@@ -244,7 +248,8 @@ class Session:
     def _seek(self, now: float) -> None:
         """The robot's end: ask for the service, or whether it still knows us."""
         config, epoch = self._config, self._epoch
-        if epoch is not None and self._hello is None and self._last_heard + config.probe_after > now:
+        heard_lately = self._last_heard + config.probe_after > now
+        if epoch is not None and self._hello is None and heard_lately and not self._moving:
             self._hello_at = self._last_heard + config.probe_after
             return
         if self._hello is None or self._hello.made_at + HELLO_LIFE < now:
@@ -346,6 +351,7 @@ class Session:
 
     def _stop_seeking(self, now: float) -> None:
         self._hello = None
+        self._moving = False
         self._hello_wait = self._config.hello_retry
         if self.role is Role.ROBOT:
             self._hello_at = now + self._config.probe_after
@@ -402,7 +408,7 @@ class Session:
             if self._door is not None:
                 self._door.confirm()
             self._start_epoch(epoch, address, now)
-        if epoch is self._epoch:
+        if epoch is self._epoch and not (self._moving and address != self._peer):
             self._last_heard = now
             if newest and address != self._path.address:
                 self._path.address = address
