@@ -141,7 +141,7 @@ def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) 
     table = Table(title=f"{config.bag.name} to {config.service}, {result.seconds:.1f} s")
     table.add_column("topic")
     table.add_column("type")
-    for name in ("messages", "sent", "delivered", "lost", "delay p50 ms", "delay p99 ms"):
+    for name in ("messages", "sent", "delivered", "lost", "p50 ms", "p99 ms"):
         table.add_column(name, justify="right")
     for topic in result.topics:
         counts = (topic.messages, topic.sent, topic.delivered, topic.lost)
