@@ -166,7 +166,7 @@ class Agent:
             request,
             on_instance=self._follow,
             report=self.report,
-            healthy=lambda: self._driver.status().source is Source.CLOUD,
+            healthy=lambda: self._driver.source is Source.CLOUD,
             renew_s=config.renew_s,
             random=random,
         )
@@ -208,6 +208,11 @@ class Agent:
     def tick(self, now: float) -> None:
         """One turn of the control loop; called by its thread, or by a test with made-up time."""
         self._driver.tick(now)
+
+    @property
+    def source(self) -> Source:
+        """Who drives now; from any thread."""
+        return self._driver.source
 
     def status(self) -> AgentStatus:
         """What is known now; from any thread."""

@@ -128,6 +128,11 @@ class Driver:
         self._read: Counter[str] = Counter()
         self._first_command_at: float | None = None
 
+    @property
+    def source(self) -> Source:
+        """Who drives now."""
+        return self._choice.source
+
     def set_needs(self, max_rtt_s: float | None, max_loss: float | None) -> None:
         """Take over what the service's manifest needs of the link."""
         self._needs = replace(self._needs, max_rtt_s=max_rtt_s, max_loss=max_loss)
