@@ -3,3 +3,19 @@
 Here is what touches the system. Rules of the protocol belong into `skytether.wire`; graphs of ROS into
 `skytether.ros`.
 """
+
+from .endpoint import Bridge, BridgeError
+from .local import GraphPort, LocalGraph
+from .port import Port, Publisher
+from .spec import SessionSpec, topic_from_api
+
+__all__ = [
+    "Bridge",
+    "BridgeError",
+    "GraphPort",
+    "LocalGraph",
+    "Port",
+    "Publisher",
+    "SessionSpec",
+    "topic_from_api",
+]

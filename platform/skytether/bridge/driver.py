@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 from skytether.wire import Session
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived
@@ -136,7 +136,7 @@ class Driver:
             batches = self._session.transmit(time.monotonic())
             if not batches:
                 return
-            self._unsent.extend((memoryview(b.data), b.address, b.segment) for b in batches)
+            self._unsent.extend((memoryview(b.data), cast(Address, b.address), b.segment) for b in batches)
 
     def _set_timer(self) -> None:
         due = self._session.next_timer()

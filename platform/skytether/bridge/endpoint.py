@@ -25,8 +25,6 @@ from .driver import Driver
 from .port import Port
 from .spec import SessionSpec
 
-_HANDOVER_BYTES = 32 * 1024 * 1024
-"""What publishers may have handed over before the bridge's thread gets to run: two of the largest messages."""
 _STATS_TIMEOUT = 2.0
 
 
@@ -123,7 +121,7 @@ class Bridge:
             # The caller may use its buffer again, so anything but bytes is copied.
             self._handover.append((topic, bytes(payload), time.monotonic()))
             self._handover_bytes += size
-            while self._handover_bytes > _HANDOVER_BYTES:
+            while self._handover_bytes > self._config.queue_limit:
                 oldest, dropped, _ = self._handover.popleft()
                 self._handover_bytes -= len(dropped)
                 self._overrun[oldest] += 1

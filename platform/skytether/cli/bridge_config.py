@@ -1,0 +1,198 @@
+"""The YAML of ``skytether bridge``: schema, key file, and what is said of a mistake in either."""
+
+from __future__ import annotations
+
+import base64
+import difflib
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from skytether.api.manifest import ANY_TOPIC, Strict, TopicSpec
+from skytether.bridge.spec import KEY_BYTES, parse_key
+from skytether.wire.topic import Direction, Role
+
+MAX_CONFIG_BYTES = 1024 * 1024
+
+
+class ConfigError(Exception):
+    """A mistake in the configuration; the text names the key and what it may be."""
+
+
+class Endpoint(Strict):
+    """A UDP endpoint."""
+
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    """Name or address, IPv4 or IPv6; to bind to: ``0.0.0.0`` or ``::`` for every interface."""
+    port: Annotated[int, Field(ge=0, le=65_535)] = 0
+    """To bind to: 0 takes any free one."""
+
+
+class Source(Strict):
+    """A synthetic publisher."""
+
+    topic: str
+    size: Annotated[int, Field(ge=0, le=16 * 1024 * 1024)]
+    """Bytes of each message."""
+    rate_hz: Annotated[float, Field(gt=0, le=100_000)]
+
+
+class LinkConfig(Strict):
+    """One direction of an emulated link."""
+
+    delay_ms: Annotated[float, Field(ge=0, le=60_000)] = 0
+    jitter_ms: Annotated[float, Field(ge=0, le=60_000)] = 0
+    loss: Annotated[float, Field(ge=0, le=1)] = 0
+    burst: Annotated[float, Field(ge=1)] | None = None
+    """Mean length of a run of lost packets; null: independent losses."""
+    rate_mbps: Annotated[float, Field(gt=0)] | None = None
+    seed: int = 0
+
+
+class Link(Strict):
+    """An emulated link between both ends."""
+
+    up: LinkConfig = LinkConfig()
+    """From the robot to the service."""
+    down: LinkConfig = LinkConfig()
+
+
+class BridgeConfig(Strict):
+    """One end of a bridge, or both in one process."""
+
+    role: Literal["robot", "service", "both"]
+    id: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$", description="16 hexadecimal digits")]
+    key_file: Path
+    """Made by ``skytether bridge --new-key``; relative to the configuration's folder; the same at both ends."""
+    bind: Endpoint = Endpoint()
+    peer: Endpoint | None = None
+    """Where the service's end listens; for role ``robot``."""
+    topics: Annotated[tuple[TopicSpec, ...], Field(min_length=1)]
+    sources: tuple[Source, ...] = ()
+    """Publishers of made-up messages, on topics that this end sends."""
+    rate_mbps: Annotated[float, Field(gt=0)] | None = None
+    """What this end may send; null: the protocol's default."""
+    link: Link | None = None
+    """Between the two ends of role ``both``."""
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        """The ends that run here."""
+        return (Role.SERVICE, Role.ROBOT) if self.role == "both" else (Role(self.role),)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> BridgeConfig:
+        names = [t.name for t in self.topics]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"topics: '{name}' is listed twice")
+        if self.role == "robot" and (self.peer is None or not self.peer.port):
+            raise ValueError("peer: role 'robot' needs the host and port where the service's end listens")
+        if self.role != "robot" and self.peer is not None:
+            raise ValueError("peer: only role 'robot' has one; the service's end learns where its robot is")
+        if self.role != "both" and self.link is not None:
+            raise ValueError("link: only role 'both' can have one; across machines the network is what it is")
+        sent = [t.name for t in self.topics if Direction(t.direction).sender in self.roles and t.name != ANY_TOPIC]
+        for i, source in enumerate(self.sources):
+            if source.topic not in sent:
+                raise ValueError(
+                    f"sources.{i}.topic: '{source.topic}' is not sent by role '{self.role}'; it may be one of:"
+                    f" {', '.join(sent) or '(none)'}"
+                )
+        return self
+
+
+def load_config(path: Path) -> BridgeConfig:
+    """Read and check a configuration.
+
+    Raises:
+        ConfigError: It cannot be read, is no YAML, or a key is wrong.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_CONFIG_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if len(text) > MAX_CONFIG_BYTES:
+        raise ConfigError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; that is no configuration")
+    try:
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{path} is no YAML{where}: {getattr(error, 'problem', None) or 'unreadable'}") from error
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path} must hold keys: {', '.join(BridgeConfig.model_fields)}")
+    try:
+        return BridgeConfig.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_explain(error)}") from error
+
+
+def load_key(path: Path) -> bytes:
+    """Read a key file that nobody else may read.
+
+    Raises:
+        ConfigError: It is missing, open to others, or holds no key.
+    """
+    try:
+        with path.open("rb") as file:
+            others = os.fstat(file.fileno()).st_mode & 0o077
+            text = file.read(256)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read key_file {path}: {error.strerror}; make one with: skytether bridge --new-key {path}"
+        ) from error
+    if others:
+        raise ConfigError(f"key_file {path} is open to other users; close it with: chmod 600 {path}")
+    try:
+        return parse_key(text.decode("ascii", errors="replace").strip())
+    except ValueError as error:
+        raise ConfigError(
+            f"key_file {path} holds no key of {KEY_BYTES} bytes in base64;"
+            " make one with: skytether bridge --new-key FILE"
+        ) from error
+
+
+def write_new_key(path: Path) -> None:
+    """Make a key file with mode 0600.
+
+    Raises:
+        ConfigError: It exists already, or cannot be written.
+    """
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(base64.b64encode(os.urandom(KEY_BYTES)) + b"\n")
+    except FileExistsError as error:
+        raise ConfigError(f"{path} exists already and is not overwritten; name another file") from error
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _explain(error: ValidationError) -> str:
+    """The first mistake, by its key."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    key = ".".join(str(step) for step in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(first["loc"][:-1])
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        return f"{key}: unknown key{f', did you mean {near[0]!r}?' if near else ''}; allowed are {', '.join(known)}"
+    if first["type"] == "missing":
+        return f"{key}: is missing"
+    says = str(first["msg"]).removeprefix("Value error, ")
+    return f"{key}: {says[:1].lower()}{says[1:]}" if key else says
+
+
+def _known_keys(place: tuple[int | str, ...]) -> list[str]:
+    """Keys that the schema has at one place of the document."""
+    schema: dict[str, Any] = BridgeConfig.model_json_schema()
+    here = schema
+    for step in place:
+        here = here["items"] if isinstance(step, int) else here["properties"][step]
+        here = next((a for a in here.get("anyOf", ()) if a.get("type") != "null"), here)
+        if "$ref" in here:
+            here = schema["$defs"][here["$ref"].rsplit("/", 1)[1]]
+    return list(here["properties"])

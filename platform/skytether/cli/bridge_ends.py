@@ -1,0 +1,124 @@
+"""The ends that ``skytether bridge`` runs in its process: graphs, bridges, synthetic sources, an emulated link."""
+
+from __future__ import annotations
+
+import heapq
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from types import TracebackType
+
+from skytether.bridge.endpoint import Bridge
+from skytether.bridge.local import GraphPort, LocalGraph
+from skytether.bridge.spec import SessionSpec, parse_id, topic_from_api
+from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.wire import Config
+from skytether.wire.events import Connected, Event, Refused
+from skytether.wire.topic import Role
+
+from .bridge_config import BridgeConfig, LinkConfig, Source
+
+
+class End:
+    """One end: a graph, its bridge, and what became of the session.
+
+    Attributes:
+        was_connected: A session came up at some time.
+        refusal: Why the peer's topic table cannot be joined; empty if it can.
+    """
+
+    def __init__(self, settings: BridgeConfig, key: bytes, role: Role, peer: tuple[str, int] | None) -> None:
+        """Prepare.
+
+        Raises:
+            ValueError: A topic cannot be.
+        """
+        topics = tuple(map(topic_from_api, settings.topics))
+        self.role = role
+        self.graph = LocalGraph()
+        self.was_connected = False
+        self.refusal = ""
+        # Of two ends in one process the service's has the port that the configuration names.
+        bind = (settings.bind.host, settings.bind.port if role.value in (settings.role, "service") else 0)
+        config = Config() if settings.rate_mbps is None else Config(rate_bps=settings.rate_mbps * 1e6)
+        spec = SessionSpec(parse_id(settings.id), key, role, topics)
+        port = GraphPort(self.graph, topics, role, on_event=self._on_event)
+        self.bridge = Bridge(spec, port, bind=bind, peer=peer, config=config)
+        sent = {t.name for t in topics if t.direction.sender is role}
+        self.sources = tuple(s for s in settings.sources if s.topic in sent)
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event, Connected):
+            self.was_connected, self.refusal = True, ""
+        elif isinstance(event, Refused):
+            self.refusal = event.reason
+
+
+class Sources:
+    """Publishes made-up messages at their rates, in one thread, until closed."""
+
+    def __init__(self, graph: LocalGraph, sources: Sequence[Source]) -> None:
+        self._graph = graph
+        self._sources = sources
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sources", daemon=True)
+
+    def __enter__(self) -> Sources:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        payloads = [bytes(s.size) for s in self._sources]
+        start = time.monotonic()
+        due = [(start, i) for i in range(len(payloads))]
+        while due:
+            at, i = due[0]
+            if self._closing.wait(max(0.0, at - time.monotonic())):
+                return
+            self._graph.publish(self._sources[i].topic, payloads[i])
+            heapq.heapreplace(due, (at + 1 / self._sources[i].rate_hz, i))
+
+
+def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack) -> list[End]:
+    """Start what the configuration names; the stack ends it again.
+
+    Raises:
+        BridgeError: A port is taken, or an address cannot be used.
+        ValueError: A topic cannot be.
+    """
+    peer = (settings.peer.host, settings.peer.port) if settings.peer else None
+    ends: list[End] = []
+    for role in settings.roles:
+        if ends:  # the robot of two ends in one process
+            peer = ends[0].bridge.address
+            if settings.link is not None:
+                up, down = conditions(settings.link.up), conditions(settings.link.down)
+                peer = stack.enter_context(LinkEmulator(peer, up=up, down=down)).address
+        end = End(settings, key, role, peer)
+        stack.enter_context(end.bridge)
+        stack.enter_context(Sources(end.graph, end.sources))
+        ends.append(end)
+    return ends
+
+
+def conditions(link: LinkConfig) -> LinkConditions:
+    """Units of the configuration to those of the emulator.
+
+    Raises:
+        ValueError: The values exclude each other.
+    """
+    return LinkConditions(
+        delay=link.delay_ms / 1000,
+        jitter=link.jitter_ms / 1000,
+        loss=link.loss,
+        burst=link.burst,
+        rate=None if link.rate_mbps is None else link.rate_mbps * 1e6,
+        seed=link.seed,
+    )

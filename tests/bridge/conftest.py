@@ -1,0 +1,106 @@
+"""Two ends of a session on the loopback interface, with ports that write down what they are told."""
+
+import threading
+import time
+
+import pytest
+
+from skytether.bridge import Bridge, SessionSpec
+from skytether.wire.events import Connected
+from skytether.wire.topic import Direction, Role, Topic
+
+KEY = bytes(range(32))
+TOPICS = (
+    Topic("force", "t/msg/F", Direction.IN, priority=120, depth=10_000, lifespan=5.0, delivery=0.999),
+    Topic("camera", "t/msg/C", Direction.IN, priority=10, depth=10_000, lifespan=5.0, delivery=0.99),
+    Topic("cmd_vel", "t/msg/V", Direction.OUT, priority=127, depth=10_000, lifespan=5.0, delivery=0.9999),
+)
+
+
+class RecordingPort:
+    """Keeps messages and events; `wait` returns when something has come."""
+
+    def __init__(self):
+        self.messages = []
+        self.events = []
+        self.changed = threading.Condition()
+        self.publisher = None
+
+    def attach(self, publisher):
+        self.publisher = publisher
+
+    def deliver(self, message):
+        with self.changed:
+            self.messages.append((message.topic, bytes(message.payload)))
+            self.changed.notify_all()
+
+    def notify(self, event):
+        with self.changed:
+            self.events.append(event)
+            self.changed.notify_all()
+
+    def wait(self, condition, seconds=5):
+        """Wait until condition(self) holds; says what there was if it never does."""
+        with self.changed:
+            assert self.changed.wait_for(lambda: condition(self), seconds), (
+                f"waited in vain; {len(self.messages)} messages, events {self.events}"
+            )
+
+    def count(self, kind):
+        return sum(isinstance(e, kind) for e in self.events)
+
+    def wait_connected(self, times=1):
+        self.wait(lambda port: port.count(Connected) >= times)
+
+    def wait_messages(self, count):
+        self.wait(lambda port: len(port.messages) >= count)
+
+
+class Ends:
+    """Makes ends and stops what it made."""
+
+    def __init__(self):
+        self.made = []
+
+    def make(self, role, port=None, *, topics=TOPICS, key=KEY, **options):
+        """A bridge that is not started yet; its port is its attribute `graph`."""
+        port = port or RecordingPort()
+        bridge = Bridge(SessionSpec(7, key, role, topics), port, **options)
+        bridge.graph = port
+        self.made.append(bridge)
+        return bridge
+
+    def start(self, role, port=None, **options):
+        bridge = self.make(role, port, **options)
+        bridge.start()
+        return bridge
+
+    def pair(self, *, link=None, **options):
+        """Service and robot, connected; `link` makes something in between from the service's address."""
+        service = self.start(Role.SERVICE, **options)
+        peer = link(service.address) if link else service.address
+        robot = self.start(Role.ROBOT, peer=peer, **options)
+        robot.graph.wait_connected()
+        service.graph.wait_connected()
+        return service, robot
+
+
+@pytest.fixture
+def ends():
+    made = Ends()
+    yield made
+    for bridge in made.made:
+        bridge.stop()
+
+
+@pytest.fixture
+def wait_for():
+    """Polls what cannot be waited for."""
+
+    def wait(condition, seconds=5):
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.002)
+
+    return wait
