@@ -141,8 +141,8 @@ class Harness(Generic[S]):
         self._port.settle()
         self.service.step(self.now)
 
-    def newest(self, topic: str) -> Message | None:
-        """The last message published on a topic."""
+    def newest(self, topic: str) -> Any:
+        """The last message published on a topic, or None."""
         return self.outputs[topic][-1] if self.outputs[topic] else None
 
     def stop(self) -> None:
