@@ -85,6 +85,6 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate) -> tuple[Refus
             return no(reason, f"needs {needed:g} {unit}, the site has {total:g}")
     for reason, unit, needed, total, used in amounts:
         if needed > total - used + 1e-9:  # cores are fractions; ten times 0.1 must fit into 1
-            free = f"{max(total - used, 0.0):.3g} of {total:g} are free"
+            free = f"{round(max(total - used, 0.0), 2):g} of {total:g} are free"
             return no(reason, f"needs {needed:g} {unit}, {free}", for_good=False)
     return None

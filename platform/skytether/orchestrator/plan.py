@@ -167,7 +167,7 @@ def how_it_ended(seen: Observation) -> str:
         text = f"was killed by signal {-seen.exit_status}"
     else:
         text = f"ended with exit status {seen.exit_status}"
-    return f"{text}; its last line: {seen.last_line}" if seen.last_line else text
+    return f'{text}; its last line: "{seen.last_line}"' if seen.last_line else text
 
 
 def after_crash(crash: Crash, now: float, timing: Timing) -> dict[str, Any]:

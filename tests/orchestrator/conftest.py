@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import dataclasses
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from skytether.api.client import Client
+from skytether.api.rest import RobotCreate, SiteCreate
+from skytether.orchestrator.app import create_app
+from skytether.orchestrator.core import Orchestrator
+from skytether.orchestrator.records import Record
+from skytether.orchestrator.settings import Settings, Timing
+from skytether.orchestrator.sites import load_runtime
+from skytether.orchestrator.store import Store
+from skytether.testing import runtimes
+from skytether.testing.runtimes import FakeRuntime
+
+QUICK = Timing(observe=0.02, observe_changing=0.005, place=0.05, stop_grace=0.1, backoff=0.01, backoff_max=0.02)
+
+
+class Clock:
+    """Made-up wall clock."""
+
+    def __init__(self, now: float = 1_700_000_000.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+    def forward(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def document(name: str = "toy", **spec: Any) -> dict[str, Any]:
+    """A manifest as one writes it."""
+    spec = {"entrypoint": "skytether.testing.toy_service", **spec}
+    return {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": name}, "spec": spec}
+
+
+@pytest.fixture
+def manifest() -> Callable[..., dict[str, Any]]:
+    return document
+
+
+@pytest.fixture
+def new_record(clock: Clock) -> Callable[..., Record]:
+    def make(name: str = "i1", **changes: Any) -> Record:
+        now = clock()
+        base = Record(
+            id=name,
+            robot="walker",
+            service="toy",
+            session_id=name.rjust(16, "0"),
+            manifest=document(needs={"cpu": 1}),
+            created_at=now,
+            updated_at=now,
+            lease_s=15,
+            lease_expires_at=now + 15,
+        )
+        return dataclasses.replace(base, **changes)
+
+    return make
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = Store(f"sqlite:///{tmp_path}/state.db")
+    store.migrate()
+    yield store
+    store.close()
+
+
+@dataclass
+class Fleet:
+    """Finds fake runtimes by name (``fake``, ``slow``, ...), and remembers those that were made, by site."""
+
+    made: dict[str, FakeRuntime] = field(default_factory=dict)
+
+    def __call__(self, name: str) -> type[Any]:
+        kind = getattr(runtimes, f"{name.capitalize()}Runtime", None)
+        if kind is None:
+            return load_runtime(name)
+        fleet = self
+
+        class Remembered(kind):
+            def __init__(self, site: str, *rest: Any) -> None:
+                super().__init__(site, *rest)
+                fleet.made[site] = self
+
+        return Remembered
+
+
+@dataclass
+class Served:
+    """An orchestrator behind a real server on loopback, with fakes for runtimes."""
+
+    core: Orchestrator
+    url: str
+    fleet: Fleet
+    token: str
+    clients: list[Client] = field(default_factory=list)
+
+    def client(self, token: str | None) -> Client:
+        client = Client(self.url, token)
+        self.clients.append(client)
+        return client
+
+    @property
+    def operator(self) -> Client:
+        return self.client(self.token)
+
+    def robot(self, name: str = "walker", services: tuple[str, ...] = ("*",)) -> Client:
+        return self.client(self.operator.create_robot(RobotCreate(name=name, services=services)).token)
+
+    def site(self, name: str = "lab", runtime: str = "fake", **options: Any) -> FakeRuntime:
+        self.operator.create_site(SiteCreate(name=name, tier="edge", runtime=runtime, options=options))
+        return self.fleet.made[name]
+
+
+def serve(core: Orchestrator) -> Iterator[str]:
+    """Serve in a thread; yields the address."""
+    config = uvicorn.Config(create_app(core), log_config=None, lifespan="off", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            core.broker.close()
+            server.should_exit = True
+            thread.join()
+
+
+def served_in(folder: Path, **settings: Any) -> Iterator[Served]:
+    fleet = Fleet()
+    core = Orchestrator(Settings(state_dir=folder, **{"timing": QUICK, **settings}), find_runtime=fleet)
+    core.start()
+    core.sites.delete("local")
+    for url in serve(core):
+        served = Served(core, url, fleet, (folder / "operator.token").read_text().strip())
+        served.operator.put_service("toy", document(params={"properties": {"mass": {"type": "number", "minimum": 0}}}))
+        yield served
+        for client in served.clients:
+            client.close()
+    core.stop()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    yield from served_in(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """One for tests that leave it as they found it."""
+    yield from served_in(tmp_path_factory.mktemp("shared"))

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from skytether.orchestrator.security import SecretFileError, Secrets, TokenHash, new_token, secret_file
+
+
+def test_a_token_has_256_random_bits() -> None:
+    tokens = {new_token() for _ in range(100)}
+    assert len(tokens) == 100
+    assert all(re.fullmatch(r"sky-[0-9a-f]{64}", token) for token in tokens)
+
+
+def test_what_is_kept_of_a_token_recognises_it_and_does_not_hold_it() -> None:
+    token = new_token()
+    kept = TokenHash.of(token)
+    assert kept.matches(token)
+    assert not kept.matches(new_token())
+    assert not kept.matches(token[:-1])
+    assert token.startswith(kept.prefix)
+    assert token[len(kept.prefix) :] not in repr(kept)
+
+
+def test_a_secret_file_is_made_once_and_for_its_owner_only(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    made = secret_file(path, lambda: b"first")
+    assert made == b"first"
+    assert secret_file(path, lambda: b"second") == b"first"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_secret_file_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(b"seen")
+    path.chmod(0o640)
+    with pytest.raises(SecretFileError, match="chmod 600"):
+        secret_file(path, lambda: b"new")
+
+
+def test_an_empty_secret_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.touch(mode=0o600)
+    with pytest.raises(SecretFileError, match="is empty: delete it"):
+        secret_file(path, lambda: b"new")
+
+
+def test_session_keys_are_the_same_after_a_restart_and_differ_by_session_and_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    key = Secrets(tmp_path / "a").session_key("0011223344556677")
+    assert len(key) == 32
+    assert Secrets(tmp_path / "a").session_key("0011223344556677") == key
+    assert Secrets(tmp_path / "a").session_key("0011223344556678") != key
+    assert Secrets(tmp_path / "b").session_key("0011223344556677") != key
+
+
+def test_the_operators_token_is_in_its_file(tmp_path: Path) -> None:
+    secrets = Secrets(tmp_path)
+    token = (tmp_path / "operator.token").read_text().strip()
+    assert secrets.is_operator(token)
+    assert not secrets.is_operator(new_token())
+    assert token not in repr(vars(secrets))

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+
+from skytether.api.rest import SiteCreate, State
+from skytether.orchestrator.db import make_engine, migrate
+from skytether.orchestrator.models import metadata
+from skytether.orchestrator.records import IllegalMoveError, Record
+from skytether.orchestrator.security import TokenHash
+from skytether.orchestrator.store import KeyReusedError, RobotRow, Store
+
+NewRecord = Callable[..., Record]
+NOW = 1_700_000_000.0
+
+
+def test_the_migrations_make_the_tables_of_the_models_and_may_run_again(tmp_path: Path) -> None:
+    engine = make_engine(f"sqlite:///{tmp_path}/db")
+    migrate(engine)
+    migrate(engine)
+    with engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+    engine.dispose()
+
+
+def test_an_instance_comes_back_as_it_was(store: Store, new_record: NewRecord) -> None:
+    record = new_record(
+        params={"a": [1, {"b": None}]}, measurements={"lab": {"rtt_ms": 3.5}}, refused=[{"site": "x"}], site="lab"
+    )
+    assert store.add(record, "operator", None, "") == record
+    assert store.get("i1") == record
+    assert store.get("i2") is None
+
+
+def test_lists_are_by_robot_by_site_and_without_the_ended(store: Store, new_record: NewRecord) -> None:
+    for record in (
+        new_record("a", site="lab", created_at=NOW),
+        new_record("b", robot="other", created_at=NOW + 1),
+        new_record("c", site="lab", state=State.FAILED, created_at=NOW + 2),
+    ):
+        store.add(record, "operator", None, "")
+    assert [r.id for r in store.all()] == ["c", "b", "a"]
+    assert [r.id for r in store.all("other")] == ["b"]
+    assert [r.id for r in store.live()] == ["a", "b"]
+    assert [r.id for r in store.live_at("lab")] == ["a"]
+    assert store.known(["a", "c", "nobody"]) == {"a", "c"}
+
+
+def test_a_change_needs_to_have_seen_the_last_one(store: Store, new_record: NewRecord) -> None:
+    first = store.add(new_record(), "operator", None, "")
+    second = store.change(first, NOW + 1, state=State.PLACING)
+    assert second is not None
+    assert second.updated_at == NOW + 1
+    assert store.change(first, NOW + 2, state=State.STOPPED) is None
+    assert store.get("i1") == second
+
+
+def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_record: NewRecord) -> None:
+    told: list[str] = []
+    store.on_change = told.append
+    record = store.add(new_record(), "operator", None, "")
+    quiet = store.change(record, NOW + 1, refused=[{"site": "x"}])
+    assert quiet is not None
+    assert quiet.updated_at == NOW
+    loud = store.change(quiet, NOW + 2, reason="r" * 5000)
+    assert loud is not None
+    assert len(loud.reason) == 1024
+    assert [e.reason[:1] for e in store.events("i1", 0)] == ["", "r"]
+    assert told == ["i1", "i1"]
+
+
+def test_an_illegal_move_changes_nothing(store: Store, new_record: NewRecord) -> None:
+    record = store.add(new_record(), "operator", None, "")
+    with pytest.raises(IllegalMoveError, match="cannot go from pending to running"):
+        store.change(record, NOW, state=State.RUNNING)
+    assert store.get("i1") == record
+
+
+def test_an_idempotency_key_gives_the_same_instance_to_its_owner_only(store: Store, new_record: NewRecord) -> None:
+    first = store.add(new_record("a"), "robot:r", "key", "body")
+    assert store.add(new_record("b"), "robot:r", "key", "body") == first
+    assert store.get("b") is None
+    with pytest.raises(KeyReusedError):
+        store.add(new_record("c"), "robot:r", "key", "another body")
+    assert store.get("c") is None
+    assert store.add(new_record("d"), "robot:s", "key", "body").id == "d"
+    assert store.made_with("robot:r", "new", "body") is None
+
+
+def test_of_many_requests_with_one_key_at_once_one_makes_an_instance(store: Store, new_record: NewRecord) -> None:
+    found: list[str] = []
+    barrier = threading.Barrier(8)
+
+    def ask(number: int) -> None:
+        barrier.wait()
+        found.append(store.add(new_record(f"i{number}"), "robot:r", "key", "body").id)
+
+    threads = [threading.Thread(target=ask, args=(n,)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8
+    assert len(set(found)) == 1
+    assert len(store.all()) == 1
+
+
+def test_of_many_changes_at_once_one_is_made(store: Store, new_record: NewRecord) -> None:
+    record = store.add(new_record(), "operator", None, "")
+    made: list[Record | None] = []
+    barrier = threading.Barrier(8)
+
+    def change(number: int) -> None:
+        barrier.wait()
+        made.append(store.change(record, NOW, reason=str(number)))
+
+    threads = [threading.Thread(target=change, args=(n,)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sum(one is not None for one in made) == 1
+
+
+def test_a_renewal_beats_who_was_about_to_end_it(store: Store, new_record: NewRecord) -> None:
+    record = store.add(new_record(site="lab", state=State.RUNNING), "operator", None, "")
+    renewed = store.renew("i1", NOW + 14, None)
+    assert renewed is not None
+    assert renewed.lease_expires_at == NOW + 29
+    assert store.change(record, NOW + 15, state=State.STOPPING) is None
+    longer = store.renew("i1", NOW + 20, 60)
+    assert longer is not None
+    assert (longer.lease_s, longer.lease_expires_at) == (60, NOW + 80)
+
+
+def test_what_ends_is_not_renewed(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("a", state=State.STOPPING), "operator", None, "")
+    store.add(new_record("b", state=State.FAILED), "operator", None, "")
+    assert [store.renew(i, NOW, None) for i in ("a", "b", "nobody")] == [None] * 3
+
+
+def test_leases_are_whole_again_after_a_time_without_orchestrator(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("short", lease_s=10, lease_expires_at=NOW + 1), "operator", None, "")
+    store.add(new_record("long", lease_s=10, lease_expires_at=NOW + 5000), "operator", None, "")
+    store.extend_leases(NOW + 1000)
+    assert {r.id: r.lease_expires_at for r in store.all()} == {"short": NOW + 1010, "long": NOW + 5000}
+
+
+def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_record: NewRecord) -> None:
+    live = store.add(new_record("live"), "operator", "key", "")
+    for age, name in ((5, "new"), (6, "third"), (7, "many"), (1000, "old")):
+        store.add(new_record(name, state=State.STOPPED, updated_at=NOW - age, site="lab"), "operator", name, "")
+    gone = store.prune(NOW, ended_age=100, ended_count=2, events_count=1000)
+    assert sorted(gone) == [("many", "lab"), ("old", "lab")]
+    assert store.made_with("operator", "old", "") is None
+    assert store.events("old", 0) == []
+    assert store.made_with("operator", "key", "") == live
+    for number in range(10):
+        live = store.change(live, NOW, reason=str(number)) or live
+    store.prune(NOW, ended_age=100, ended_count=2, events_count=3)
+    assert [e.reason for e in store.events("live", 0)] == ["7", "8", "9"]
+
+
+def test_event_ids_never_come_again(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("a", state=State.STOPPED, updated_at=0), "operator", None, "")
+    last = store.events("a", 0)[-1].id
+    store.prune(NOW, ended_age=1, ended_count=0, events_count=0)
+    store.add(new_record("b"), "operator", None, "")
+    assert store.events("b", 0)[0].id > last
+
+
+def test_robots_sites_and_services(store: Store) -> None:
+    token = TokenHash("sky-12345678", "0" * 64)
+    robot = RobotRow("r", ("a", "b"), token, NOW)
+    assert store.add_robot(robot)
+    assert not store.add_robot(robot)
+    store.seen("r", NOW + 1)
+    found = store.robots_by_prefix("sky-12345678")[0]
+    assert (found.services, found.token, found.last_seen_at) == (("a", "b"), token, NOW + 1)
+    store.delete_robot("r")
+    store.delete_robot("r")
+    assert store.robots() == []
+
+    site = SiteCreate(name="lab", tier="cloud", runtime="process", options={"cpu": 1})
+    assert store.add_site(site)
+    assert not store.add_site(site)
+    assert store.sites() == [site]
+    store.delete_site("lab")
+    assert store.sites() == []
+
+    store.put_service("s", {"v": 1})
+    store.put_service("s", {"v": 2})
+    assert store.services() == {"s": {"v": 2}}
+    store.delete_service("s")
+    assert store.services() == {}

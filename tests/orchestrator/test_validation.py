@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from skytether.api.manifest import Manifest
+from skytether.orchestrator.errors import InvalidError
+from skytether.orchestrator.validation import check_params, check_schema, parse
+
+SCHEMA = {
+    "type": "object",
+    "required": ["trail"],
+    "properties": {
+        "mass": {"type": "number", "exclusiveMinimum": 0},
+        "trail": {
+            "type": "array",
+            "items": {"type": "object", "properties": {"length": {}, "radius": {}}, "additionalProperties": False},
+        },
+    },
+}
+
+
+def told(model: Any, document: Any, **more: Any) -> str:
+    with pytest.raises(InvalidError) as caught:
+        parse(model, document, **more)
+    return str(caught.value)
+
+
+def test_a_typo_deep_in_a_manifest_names_the_key_and_the_nearest(manifest: Any) -> None:
+    document = manifest(topics=[{"name": "a", "type": "b", "direction": "in", "prority": 3}])
+    assert told(Manifest, document) == "spec.topics.0.prority: unknown key, did you mean 'priority'?"
+
+
+def test_an_unknown_key_far_from_all_names_all(manifest: Any) -> None:
+    text = told(Manifest, manifest(needs={"zzz": 1}))
+    assert text == "spec.needs.zzz: unknown key; known are cpu, gpu, max_loss, max_rtt_ms, memory_mb, tiers"
+
+
+def test_an_unknown_key_at_the_top_and_a_missing_one(manifest: Any) -> None:
+    document = manifest()
+    del document["metadata"]
+    document["spce"] = {}
+    text = told(Manifest, document, what="my.yaml")
+    assert text == "my.yaml: metadata: is missing; spce: unknown key, did you mean 'spec'?"
+
+
+def test_a_wrong_value_and_a_models_own_check(manifest: Any) -> None:
+    assert told(Manifest, manifest(needs={"cpu": -1})) == "spec.needs.cpu: input should be greater than 0"
+    assert "topic 'a' is listed twice" in told(
+        Manifest, manifest(topics=[{"name": "a", "type": "b", "direction": "in"}] * 2)
+    )
+    assert told(Manifest, 7).startswith("input should be")
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ({}, "params.trail: is missing"),
+        ({"trail": [], "mas": 1}, "params.mas: unknown key, did you mean 'mass'?"),
+        ({"trail": [], "mass": 0}, "params.mass: 0 is less than or equal to the minimum of 0"),
+        ({"trail": [], "mass": "8"}, "params.mass: '8' is not of type 'number'"),
+        ({"trail": [{"lenght": 1}]}, "params.trail.0.lenght: unknown key, did you mean 'length'?"),
+    ],
+)
+def test_wrong_parameters_name_the_key(params: dict[str, Any], text: str) -> None:
+    with pytest.raises(InvalidError) as caught:
+        check_params(params, SCHEMA, "virtual-trail")
+    assert str(caught.value) == f"service 'virtual-trail': {text}"
+    assert len(caught.value.faults) == 1
+
+
+def test_right_parameters_pass_and_a_schema_may_allow_unknown_ones() -> None:
+    check_params({"trail": [{"length": 2}], "mass": 3}, SCHEMA, "s")
+    check_params({"anything": 1}, {"additionalProperties": True}, "s")
+    with pytest.raises(InvalidError, match="there are none"):
+        check_params({"anything": 1}, {}, "s")
+
+
+def test_keys_that_match_a_pattern_are_known() -> None:
+    schema = {"patternProperties": {"^x": {}}, "additionalProperties": False}
+    check_params({"xyz": 1}, schema, "s")
+    with pytest.raises(InvalidError, match=r"params: .*'abc'"):
+        check_params({"abc": 1, "xyz": 1}, schema, "s")
+
+
+def test_a_reference_to_somewhere_else_is_not_fetched() -> None:
+    with pytest.raises(InvalidError, match=r"cannot resolve the reference http://127\.0\.0\.1:1/s\.json"):
+        check_params({"a": 1}, {"properties": {"a": {"$ref": "http://127.0.0.1:1/s.json"}}}, "s")
+
+
+def test_a_schema_that_is_none_names_the_key() -> None:
+    with pytest.raises(InvalidError) as caught:
+        check_schema({"properties": {"mass": {"type": "nmber"}}}, "spec.params")
+    assert caught.value.faults[0].key == "spec.params.properties.mass.type"
