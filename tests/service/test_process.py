@@ -38,6 +38,8 @@ def write_module(folder: Path, step: str) -> None:
         "    cmd_vel = Output(Twist)\n"
         "    def step(self, now):\n"
         f"        {step}\n"
+        "    def stop(self):\n"
+        "        self.log.info('closing what is open')\n"
         "run(UnderTest)\n"
     )
 
@@ -79,6 +81,7 @@ def test_an_exception_in_step_ends_the_process_with_its_traceback(grant, robot, 
     assert child.returncode == 1
     assert "ZeroDivisionError: in step" in stderr
     assert "Traceback" in stderr
+    assert "closing what is open" in stderr
     robot.wait_for(lambda: robot.heard(Disconnected))
 
 
@@ -93,8 +96,9 @@ def test_a_slow_step_does_not_delay_the_bridge(grant, robot, spawn, tmp_path) ->
         robot.bridge.publish("scan", SCAN)
         time.sleep(0.02)
     child.terminate()
-    child.communicate(timeout=10)
+    _, stderr = child.communicate(timeout=10)
     assert child.returncode == 0
+    assert "closing what is open" in stderr
 
 
 def test_wrong_params_end_with_one_sentence_and_status_2(grant, spawn) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import resource
+import runpy
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -262,3 +264,13 @@ def test_manifest_says_what_the_code_does() -> None:
     (topic,) = manifest.spec.topics
     (declared,) = Recorder.declared
     assert (topic.name, topic.type, topic.direction) == (declared.topic, declared.type_name, declared.direction)
+
+
+def test_without_its_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith(("mcap", "skytether_services.recorder."))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    with pytest.raises(
+        SystemExit, match=r"needs the library mcap; install it with: pip install 'skytether\[recorder\]'"
+    ):
+        runpy.run_module("skytether_services.recorder", run_name="__main__")
