@@ -16,6 +16,8 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
+_CHILD = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(600)"
+
 
 @dataclass(frozen=True)
 class Behaviour:
@@ -28,7 +30,7 @@ class Behaviour:
     ignore_sigterm: bool = False
     never_ready: bool = False
     child: bool = False
-    """Starts a process of its own, and says ``child PID``."""
+    """Starts a process of its own that ignores SIGTERM, and says ``child PID``."""
     environment: bool = False
     """Says the names of all its environment variables."""
     flood: int = 0
@@ -47,8 +49,9 @@ def main() -> int:
     if wanted.environment:
         print("environment " + " ".join(sorted(os.environ)))  # noqa: T201
     if wanted.child:
-        program = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)"
-        child = subprocess.Popen([sys.executable, "-c", program])
+        child = subprocess.Popen([sys.executable, "-uc", _CHILD], stdout=subprocess.PIPE)
+        if child.stdout:
+            child.stdout.readline()
         print(f"child {child.pid}")  # noqa: T201
     for number in range(wanted.flood):
         print(f"line {number}")  # noqa: T201

@@ -97,8 +97,8 @@ def find_by_environment(variable: str, value: str) -> ProcessId | None:
 
 
 def _all() -> Iterator[ProcessStat]:
-    for entry in os.scandir(_PROC):
-        if entry.name.isdigit():
-            stat = ProcessStat.read(int(entry.name))
+    for name in os.listdir(_PROC):
+        if name.isdigit():
+            stat = ProcessStat.read(int(name))
             if stat:
                 yield stat

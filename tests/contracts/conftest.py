@@ -1,0 +1,107 @@
+"""What each runtime brings to the contract's suite. A new runtime adds a kit, and nothing else."""
+
+from __future__ import annotations
+
+import base64
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec
+from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, Runtime
+from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
+from skytether.testing.runtimes import CrashingRuntime, FakeOptions, FakeRun, FakeRuntime, SlowRuntime, StubbornRuntime
+
+TOY = "skytether.testing.toy_service"
+
+
+class Kit(ABC):
+    """One kind of runtime, and how to get services of it that behave in a certain way."""
+
+    patience = 10.0
+    """Seconds that a run may take to become what it should."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.runtimes: list[Runtime] = []
+
+    @abstractmethod
+    def open(self, behaviour: str = "good") -> Runtime:
+        """A runtime over the same site each time; ``good``, ``stubborn`` or ``crashing`` services."""
+
+    def launch(self, instance: str = "i1", attempt: int = 1, behaviour: str = "good") -> Launch:
+        params: dict[str, Any] = {
+            "good": {"say": f"run {attempt}"},
+            "stubborn": {"ignore_sigterm": True},
+            "crashing": {"exit_status": 1, "say": "boom"},
+        }[behaviour]
+        grant = Grant(
+            instance=instance,
+            service="toy",
+            robot="walker",
+            params=params,
+            session_id="00112233445566aa",
+            session_key=base64.b64encode(bytes(range(32))).decode(),
+            topics=(),
+        )
+        return Launch(attempt, ServiceSpec(entrypoint=TOY, image="toy"), grant)
+
+    def until(self, runtime: Runtime, phase: Phase | None, instance: str = "i1") -> Observation | None:
+        """Look until the instance is in this phase; None: until it is not there."""
+        deadline = time.monotonic() + self.patience
+        while True:
+            seen = runtime.observe().get(instance)
+            if (seen and seen.phase) == phase:
+                return seen
+            assert time.monotonic() < deadline, f"{instance} is {seen}, not {phase}"
+            time.sleep(0.005)
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        for runtime in self.runtimes:
+            for instance in list(runtime.observe()):
+                runtime.remove(instance)
+            runtime.close()
+
+
+class ProcessKit(Kit):
+    def open(self, behaviour: str = "good") -> Runtime:
+        runtime = ProcessRuntime("lab", self.folder, ProcessOptions())
+        self.runtimes.append(runtime)
+        return runtime
+
+
+class FakeKit(Kit):
+    kind: type[FakeRuntime] = FakeRuntime
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.world: dict[str, FakeRun] = {}
+
+    def open(self, behaviour: str = "good") -> Runtime:
+        kind = {"good": self.kind, "stubborn": StubbornRuntime, "crashing": CrashingRuntime}[behaviour]
+        runtime = kind("lab", self.folder, FakeOptions(), self.world)
+        self.runtimes.append(runtime)
+        return runtime
+
+
+class SlowKit(FakeKit):
+    kind = SlowRuntime
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(ProcessKit, id="process", marks=pytest.mark.slow),
+        pytest.param(FakeKit, id="fake"),
+        pytest.param(SlowKit, id="slow"),
+    ]
+)
+def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kit]:
+    kit = request.param(tmp_path)
+    yield kit
+    kit.close()
