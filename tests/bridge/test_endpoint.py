@@ -3,6 +3,7 @@ import os
 import queue
 import resource
 import socket
+import sys
 import threading
 import time
 
@@ -195,7 +196,7 @@ def test_the_peer_may_be_named_after_the_start(ends):
     robot.graph.wait_connected()
 
 
-def test_a_robot_whose_address_changes_stays_in_its_session(ends, wait_for):
+def test_a_robot_whose_address_changes_stays_in_its_session(ends):
     made = []
 
     def link(address):
@@ -207,8 +208,7 @@ def test_a_robot_whose_address_changes_stays_in_its_session(ends, wait_for):
         robot.publish("force", b"1")
         service.graph.wait_messages(1)
         made[0].rebind()
-        wait_for(lambda: not made[0]._clients or robot.publish("force", b"2"))
-        service.graph.wait(lambda port: port.count(PeerMoved))
+        service.graph.wait(lambda port: port.count(PeerMoved))  # the next ping tells
         service.publish("cmd_vel", b"back")
         robot.graph.wait_messages(1)
         assert robot.graph.count(Connected) == 1
@@ -238,6 +238,7 @@ def test_topic_tables_that_do_not_fit_are_refused_with_the_reason(ends):
 
 def test_a_busy_application_does_not_stop_the_bridge(ends):
     """Half a second of pure Python in one go: the worst that a service's step can do."""
+    sys.setswitchinterval(0.005)  # the interpreter's default
     service, robot = ends.pair()
     started, over = threading.Event(), threading.Event()
 
@@ -259,7 +260,8 @@ def test_a_busy_application_does_not_stop_the_bridge(ends):
         robot.graph.wait_messages(echoed + 1)
         echoed += not over.is_set()
     thread.join()
-    assert echoed >= 3
+    # Each round trip hands the interpreter over some ten times: 0.5 ms each, or 5 ms without the bridge's care.
+    assert echoed >= 40
 
 
 class FailingPort:

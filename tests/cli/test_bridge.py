@@ -2,6 +2,7 @@ import base64
 import json
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -67,6 +68,7 @@ def test_people_get_a_table(run):
     assert not result.stdout
 
 
+@pytest.mark.slow
 def test_two_processes_join_and_end_on_a_signal(tmp_path):
     key = tmp_path / "bridge.key"
     ends = {
@@ -179,8 +181,6 @@ def test_a_key_file_without_a_key_is_refused_and_not_shown(run, tmp_path):
 
 
 def test_a_taken_port_is_one_sentence(run):
-    import socket
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]

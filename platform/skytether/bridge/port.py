@@ -28,10 +28,10 @@ class Publisher(Protocol):
 
 
 class Port(Protocol):
-    """A graph as the bridge sees it. All calls come from the bridge's thread and must return at once."""
+    """A graph as the bridge sees it. Messages and events come in the bridge's thread; calls must return at once."""
 
     def attach(self, publisher: Publisher) -> None:
-        """Called once, before the first message."""
+        """Called once, by `Bridge.start` in its caller's thread, before the first message."""
         ...
 
     def deliver(self, message: MessageReceived) -> None:
