@@ -87,6 +87,10 @@ def test_what_the_service_does_not_need_does_not_count():
         now = i * TICK
         choice = choose(needs, choice, replace(GOOD, command_at=now, rtt=3.0, loss=0.9), now)
     assert choice.source is Source.CLOUD
+    for i in range(200, 260):
+        now = i * TICK
+        choice = choose(needs, choice, replace(GOOD, command_at=now, loss=1.0), now)
+    assert choice.reason is Reason.LOSS, "but a way on which nothing arrives is no way"
 
 
 def test_what_was_not_measured_yet_does_not_count():

@@ -41,7 +41,7 @@ class Needs:
 
     Attributes:
         max_rtt_s: From the manifest [s]; None: any.
-        max_loss: From the manifest, share of messages; None: any.
+        max_loss: From the manifest, share of messages; None: any but all.
         max_clock_error_s: Largest bound of the clock offset's error [s].
         command_timeout_s: Without a valid command for this long the robot is on its own [s].
         bad_s: How long round trip, loss or clock must be bad in one piece [s].
@@ -144,7 +144,7 @@ def _trouble(needs: Needs, link: Link, now: float) -> Reason | None:
         return Reason.NO_COMMAND
     if needs.max_rtt_s is not None and link.rtt > needs.max_rtt_s:
         return Reason.RTT
-    if needs.max_loss is not None and link.loss > needs.max_loss:
+    if link.loss >= 1 or (needs.max_loss is not None and link.loss > needs.max_loss):
         return Reason.LOSS
     if not link.clock_error <= needs.max_clock_error_s:
         return Reason.CLOCK

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from math import isfinite, nan
 
 from skytether.wire.stats import SessionStats, TopicStats
+from skytether.wire.topic import Direction
 
-_ARRIVED_AND_LOST = tuple[int, int]
+
+@dataclass(frozen=True, slots=True)
+class _Count:
+    sent: int = 0
+    arrived: int = 0
+    lost: int = 0
 
 
 class LinkMonitor:
     """Loss of messages over a window, and the best path's round trip.
+
+    A topic that the robot sends and that nothing at all is reported of for a whole window is lost altogether: when only
+    the way to the service is broken, its answers still come, and no gap tells it that something is missing.
 
     Args:
         window_s: How far back the loss looks [s].
@@ -21,7 +31,7 @@ class LinkMonitor:
     def __init__(self, window_s: float = 2.0, least: int = 20) -> None:
         self._window_s = window_s
         self._least = least
-        self._samples: deque[tuple[float, dict[tuple[str, str], _ARRIVED_AND_LOST]]] = deque()
+        self._samples: deque[tuple[float, dict[tuple[str, str], _Count]]] = deque()
 
     def sample(self, stats: SessionStats, now: float) -> tuple[float, float]:
         """Take in a snapshot; meant for several calls in each window.
@@ -33,17 +43,21 @@ class LinkMonitor:
         self._samples.append((now, counts))
         while len(self._samples) > 1 and self._samples[1][0] <= now - self._window_s:
             self._samples.popleft()
-        before = self._samples[0][1]
-        losses = [self._loss(before.get(key, (0, 0)), count) for key, count in counts.items()]
+        began, before = self._samples[0]
+        whole = now - began >= self._window_s
+        losses = [self._loss(before.get(key, _Count()), count, whole, key[1]) for key, count in counts.items()]
         rtts = [path.rtt for path in stats.paths if isfinite(path.rtt)]
         return min(rtts, default=nan), max((loss for loss in losses if isfinite(loss)), default=nan)
 
-    def _loss(self, before: _ARRIVED_AND_LOST, after: _ARRIVED_AND_LOST) -> float:
-        arrived = max(0, after[0] - before[0])
-        lost = max(0, after[1] - before[1])  # a late arrival takes back a loss that was counted before the window
+    def _loss(self, before: _Count, after: _Count, whole: bool, direction: str) -> float:
+        arrived = max(0, after.arrived - before.arrived)
+        lost = max(0, after.lost - before.lost)  # a late arrival takes back a loss that was counted before the window
         total = arrived + lost
-        return lost / total if total >= self._least else nan
+        if total >= self._least:
+            return lost / total
+        silent = total == 0 and after.sent - before.sent >= self._least
+        return 1.0 if silent and whole and direction == Direction.IN else nan
 
 
-def _count(topic: TopicStats) -> _ARRIVED_AND_LOST:
-    return topic.delivered + topic.superseded, topic.lost
+def _count(topic: TopicStats) -> _Count:
+    return _Count(topic.sent, topic.delivered + topic.superseded, topic.lost)
