@@ -321,7 +321,7 @@ def test_what_waits_for_a_stalled_thread_is_bounded_and_counted(ends):
     robot.publish("force", b"x")
     port.entered.wait(5)
     for i in range(30):
-        assert service.publish("cmd_vel", bytes([i]) * 1000)
+        assert service.publish("cmd_vel", bytes([i]) * 800)  # and 200 for each entry
     port.release.set()
     robot.graph.wait(lambda graph: graph.messages and graph.messages[-1][1][0] == 29)
     assert [m[1][0] for m in robot.graph.messages] == list(range(20, 30))
@@ -412,6 +412,13 @@ def test_stop_ends_the_thread_frees_the_port_and_may_be_called_again(ends):
     service.stop()
     assert name not in {t.name for t in threading.enumerate()}
     ends.start(Role.SERVICE, bind=service.address)
+
+
+def test_a_graph_that_cannot_be_attached_fails_the_start_and_leaves_nothing_open(ends):
+    port = FailingPort()
+    port.attach = lambda publisher: publisher.no_such_method()
+    with pytest.raises(AttributeError, match="no_such_method"):
+        ends.start(Role.SERVICE, port)  # an open socket or loop would fail this test with a ResourceWarning
 
 
 def test_a_bridge_that_was_never_started_can_be_stopped_and_one_starts_once(ends):

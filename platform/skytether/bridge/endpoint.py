@@ -15,6 +15,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
 
@@ -27,6 +28,8 @@ from .port import Port
 from .spec import SessionSpec
 
 _STATS_TIMEOUT = 2.0
+_ENTRY_BYTES = 200
+"""What a message costs beside its payload while it waits for the bridge's thread."""
 _SWITCH_INTERVAL = 0.0005
 """Seconds that the interpreter lets a thread of pure Python run on while the bridge's waits. With the usual 5 ms each
 system call of the bridge may cost as much, and a round trip past a busy service takes 5 to 20 ms instead of 2."""
@@ -96,7 +99,8 @@ class Bridge:
             self._socket = DatagramSocket(self.address)
         except OSError as error:
             raise BridgeError(f"cannot listen on UDP {host}:{port}: {error.strerror or error}") from error
-        try:
+        with ExitStack() as undo:
+            undo.callback(self._socket.close)
             self.address = self._socket.address
             spec = self._spec
             session = Session(
@@ -105,11 +109,10 @@ class Bridge:
             if self._peer is not None:
                 session.set_peer(self._resolve(*self._peer))
             self._loop = _new_loop(self._socket)
-        except BaseException:
-            self._socket.close()
-            raise
-        self._driver = Driver(session, self._socket, self._port, self._loop)
-        self._port.attach(self)
+            undo.callback(self._loop.close)
+            self._driver = Driver(session, self._socket, self._port, self._loop)
+            self._port.attach(self)
+            undo.pop_all()
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_INTERVAL))
         self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
         self._thread.start()
@@ -127,10 +130,10 @@ class Bridge:
         with self._lock:
             # The caller may use its buffer again, so anything but bytes is copied.
             self._handover.append((topic, bytes(payload), time.monotonic()))
-            self._handover_bytes += size
-            while self._handover_bytes > self._config.queue_limit:
+            self._handover_bytes += size + _ENTRY_BYTES
+            while self._handover_bytes > self._config.queue_limit and len(self._handover) > 1:
                 oldest, dropped, _ = self._handover.popleft()
-                self._handover_bytes -= len(dropped)
+                self._handover_bytes -= len(dropped) + _ENTRY_BYTES
                 self._overrun[oldest] += 1
             first = len(self._handover) == 1
         return not first or self._soon(self._on_handover)
