@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isnan
 from pathlib import Path
 
@@ -36,6 +36,8 @@ _CATCH_UP = 20
 """Steps that the simulation makes at most at once after the control loop was held up: more would be a jump."""
 _LOOK_S = 0.05
 """Between looks at the walk."""
+_SETTLE_S = 1.0
+"""After the walk, beyond the round trip: time for the last messages and reports to arrive."""
 
 
 class DemoError(Exception):
@@ -82,7 +84,7 @@ class DemoResult:
     Attributes:
         measures: Of the walk, from the first command of the service.
         start_s: From the request to the arrival of the service's first valid command [s].
-        status: The agent's last snapshot.
+        status: The agent's snapshot at the end of the walk, with the bridge's counters after it had settled.
         plot: The picture.
     """
 
@@ -145,12 +147,16 @@ class WalkerBase:
         self.source: Callable[[], Source] = lambda: Source.STOP
         """Who drives now; given by the owner once there is an agent."""
         self.walking = threading.Event()
+        self.ended = threading.Event()
+        """Set by the owner: the walker has been parked and measures nothing more."""
         self._command = Twist()
         self._began: float | None = None
         self._steps = 0
 
     def read(self, now: float) -> Iterable[tuple[str, Message]]:
         """Advance the simulation to now."""
+        if self.ended.is_set():
+            return ()
         if self._began is None:
             self._began = now
         due = round((now - self._began) / STEP) + 1  # rounded, so that a tick that is a little off is still one step
@@ -236,7 +242,20 @@ class Demo:
             seen = len(samples)
             on_progress(judge.s, self.agent.status())
             time.sleep(_LOOK_S)
-        return self._result(judge.result())
+        walk = self.agent.status()
+        self.base.ended.set()
+        self._settle()
+        return self._result(judge.result(), walk)
+
+    def _settle(self) -> None:
+        """Wait until both ends agree on what was sent and what arrived."""
+        deadline = time.monotonic() + self.settings.rtt_s + _SETTLE_S
+        while time.monotonic() < deadline:
+            session = self.agent.status().session
+            sent_here = [topic for topic in session.topics if topic.direction == "in"] if session else []
+            if sent_here and all(topic.sent <= topic.delivered + topic.superseded + topic.lost for topic in sent_here):
+                return
+            time.sleep(_LOOK_S)
 
     def _wait_for_start(self) -> None:
         limit = self.settings.start_limit_s
@@ -249,8 +268,8 @@ class Demo:
         self.network.set_target(host, port)
         return self.network.address
 
-    def _result(self, measures: Measures) -> DemoResult:
-        status = self.agent.status()
+    def _result(self, measures: Measures, walk: AgentStatus) -> DemoResult:
+        status = replace(walk, session=self.agent.status().session)
         first, asked = status.driver.first_command_at, status.asked_at
         start_s = first - asked if first is not None and asked is not None else float("nan")
         settings = self.settings

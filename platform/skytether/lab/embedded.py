@@ -72,15 +72,17 @@ class EmbeddedOrchestrator:
         self._port = int(address.read_text().strip().rsplit(":", 1)[1])
 
     def stop(self) -> None:
-        """End it and every instance that it started."""
-        if self._process is None:
-            return
+        """End it and every instance that it started, also those that outlived a crash of it."""
+        if self._process is None or self._process.poll() is not None:
+            if not self._port:
+                return
+            self.start()  # to adopt and end what still runs
         self._process.terminate()
         try:
             self._process.wait(_STOP_TIMEOUT)
         except subprocess.TimeoutExpired:
             self.kill()
-        self._process = None
+        self._process, self._port = None, 0
 
     def kill(self) -> None:
         """Kill the orchestrator alone, as a crash would; its instances go on."""
