@@ -32,9 +32,10 @@ class ClockOffset:
     def exchange(self, t1: float, t2: float, t3: float, t4: float) -> None:
         """Take one exchange: t1, t4 on our clock, t2, t3 on the peer's."""
         age = max(0.0, t4 - self._updated) * MAX_DRIFT
-        low, high = max(self._low - age, t3 - t4), min(self._high + age, t2 - t1)
+        newest_low, newest_high = t3 - t4, t2 - t1 + (t4 - t1) * MAX_DRIFT
+        low, high = max(self._low - age, newest_low), min(self._high + age, newest_high)
         if low > high:  # a clock jumped (a suspended machine): only the newest exchange counts
-            low, high = t3 - t4, t2 - t1
+            low, high = newest_low, newest_high
         if low > high:  # no clock runs like that: a peer that makes up time stamps
             return
         self._low, self._high, self._updated = low, high, t4

@@ -10,6 +10,9 @@ BUCKET_TIME = 0.003
 QUANTUM_TIME = 0.0005
 """Seconds of sending worth waking up for in the midst of a large message."""
 
+ROUNDING = 1e-6
+"""Seconds added to a time of waiting, so that rounding never makes it end too early to send anything."""
+
 
 class Pacer:
     """Sending is allowed while tokens are positive; the last packet may overdraw them by its size."""
@@ -40,4 +43,4 @@ class Pacer:
     def ready_at(self, need: float) -> float:
         """When ``need`` bytes may be sent, as of the last `budget`."""
         missing = min(need, self.capacity) - self._tokens
-        return self._updated if missing <= 0 else self._updated + missing / self.rate
+        return self._updated if missing <= 0 else self._updated + missing / self.rate + ROUNDING

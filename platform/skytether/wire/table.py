@@ -134,7 +134,7 @@ def _pull(data: bytes) -> list[Any]:
         inflate = zlib.decompressobj()
         text = inflate.decompress(data, MAX_TEXT)
         rows = json.loads(text)
-    except (zlib.error, UnicodeDecodeError, RecursionError) as error:
+    except (zlib.error, ValueError, RecursionError) as error:
         raise ValueError("not a topic table") from error
     if not inflate.eof or not isinstance(rows, list):
         raise ValueError("not a topic table")

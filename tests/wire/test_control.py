@@ -1,0 +1,54 @@
+"""Control messages."""
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.wire.control import (
+    Goodbye,
+    Ping,
+    ReceiverRow,
+    Report,
+    SenderRow,
+    pull_control,
+    push_goodbye,
+    push_ping,
+    push_reports,
+)
+
+counter = st.integers(0, 2**64 - 1)
+seconds = st.floats(0, 1e6, width=32) | st.just(math.inf)
+senders = st.builds(SenderRow, st.integers(0, 65_535), st.integers(0, 2**32 - 1), *[counter] * 5)
+receivers = st.builds(ReceiverRow, st.integers(0, 65_535), *[counter] * 7, *[seconds] * 8)
+
+
+@given(st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**32 - 1))
+def test_pings_travel(echo, hold):
+    assert pull_control(push_ping(Ping(echo, hold))) == Ping(echo, hold)
+
+
+def test_a_hold_beyond_all_bounds_is_cut():
+    assert pull_control(push_ping(Ping(1, 2**40))) == Ping(1, 2**32 - 1)
+
+
+def test_goodbye_travels():
+    assert pull_control(push_goodbye()) == Goodbye()
+
+
+@given(seconds, seconds, st.lists(senders, max_size=60), st.lists(receivers, max_size=60))
+def test_reports_travel_in_packets(loss, burst, sent, received):
+    messages = list(push_reports(loss, burst, sent, received))
+    assert all(len(m) < 1024 for m in messages)
+    reports = [pull_control(m) for m in messages]
+    assert all(isinstance(r, Report) for r in reports)
+    assert [row for r in reports for row in r.senders] == sent
+    assert [row for r in reports for row in r.receivers] == received
+    assert reports[0].loss == loss or math.isnan(reports[0].loss)
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_read_or_refused(data):
+    assert pull_control(data) is None or data[0] in (1, 2, 3)
+    for kind in (1, 2, 3):
+        pull_control(bytes([kind]) + data)

@@ -1,0 +1,130 @@
+"""Shards of a message, against reassembly, and against a slow Reed-Solomon code."""
+
+from itertools import combinations
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.wire import fragment, packet
+from skytether.wire.fragment import BLOCK_SHARDS, Shape, Shards, shape_for
+from skytether.wire.reassembly import Reassembly
+
+ROOM = 1170
+COMMON = packet.push_common(packet.DATA, 1, 2, 3, 4, 5)
+
+
+@given(st.integers(ROOM + 1, 20 * 2**20), st.integers(482, 9000))
+def test_a_shape_holds_the_message_with_the_fewest_equal_shards(length, room):
+    shape = shape_for(length, room)
+    if shape.shards == 1:
+        return
+    assert shape.valid
+    assert shape.size <= room
+    assert shape.shards == -(-length // room)
+    assert 0 <= shape.shards * shape.size - length < shape.shards
+    sizes = [shape.block_k(b) for b in range(shape.blocks)]
+    assert sum(sizes) == shape.shards
+    assert max(sizes) <= BLOCK_SHARDS
+    assert max(sizes) - min(sizes) <= 1
+    assert [shape.block_start(b) for b in range(shape.blocks)] == [sum(sizes[:b]) for b in range(shape.blocks)]
+
+
+@given(st.integers(1, 2**32), st.integers(1, 65_507))
+def test_any_claim_is_judged(length, size):
+    shape = Shape(length, size)
+    if shape.valid:
+        assert shape.size == -(-shape.length // shape.shards)
+
+
+def test_parity_rows_do_not_depend_on_how_many_there_are():
+    zfec = pytest.importorskip("zfec")
+    data = [Random(1).randbytes(300) for _ in range(10)]
+    for total in (11, 20, 256):
+        assert zfec.Encoder(10, total).encode(data, (10,)) == fragment.encode(tuple(map(memoryview, data)), (10,))
+
+
+def gf_multiply(a, b):
+    """GF(256) with zfec's polynomial, x^8 + x^4 + x^3 + x^2 + 1."""
+    product = 0
+    while b:
+        product ^= a * (b & 1)
+        a = a << 1 ^ (0x11D if a & 0x80 else 0)
+        b >>= 1
+    return product
+
+
+def test_one_data_shard_of_a_block_of_two_can_be_solved_by_hand():
+    # A parity byte is p = c0 d0 + c1 d1 in GF(256), with constants of the row: find them from unit vectors.
+    one, zero = memoryview(b"\x01"), memoryview(b"\x00")
+    c0 = fragment.encode((one, zero), (2,))[0][0]
+    c1 = fragment.encode((zero, one), (2,))[0][0]
+    data = (memoryview(b"\x57"), memoryview(b"\x83"))
+    parity = fragment.encode(data, (2,))
+    assert parity[0][0] == gf_multiply(c0, 0x57) ^ gf_multiply(c1, 0x83)
+    assert [bytes(d) for d in fragment.decode((data[0], parity[0]), (0, 2))] == [b"\x57", b"\x83"]
+
+
+def test_any_k_of_a_block_will_do():
+    data = [bytes([i]) * 4 for i in range(1, 5)]
+    views = tuple(map(memoryview, data))
+    shards = [*data, *fragment.encode(views, (4, 5, 6))]
+    for chosen in combinations(range(7), 4):
+        indices = [i if i in chosen else None for i in range(4)]
+        parity = iter(i for i in chosen if i >= 4)
+        numbers = tuple(i if i is not None else next(parity) for i in indices)
+        decoded = fragment.decode(tuple(shards[i] for i in numbers), numbers)
+        assert [bytes(d) for d in decoded] == data
+
+
+def cut(message, room, parity):
+    shape = shape_for(len(message), room)
+    padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
+    return shape, Shards(packet.push_common(packet.DATA, 1, 2, 3, 4, len(message)), padded, shape, parity)
+
+
+@given(st.integers(ROOM + 1, 400_000), st.integers(0, 12), st.integers(0, 2**32))
+def test_any_loss_up_to_the_parity_is_made_good_in_any_order(length, parity, seed):
+    random = Random(seed)
+    message = random.randbytes(length)
+    shape, shards = cut(message, ROOM, parity)
+    total, number, packets = shards.remaining, 7, []
+    assert total == shape.shards + parity * shape.blocks
+    while shards.remaining:
+        count = random.randint(1, min(64, shards.remaining))
+        data = shards.take(count, 0, number)
+        assert len(data) == count * shards.packet_size
+        packets += [data[i : i + shards.packet_size] for i in range(0, len(data), shards.packet_size)]
+        number += count
+    headers = [packet.pull_header(p) for p in packets]
+    assert [h[9] for h in headers] == list(range(7, 7 + total))
+    assert len({h[6:8] for h in headers}) == total
+    lost = set()
+    for block in range(shape.blocks):
+        mine = [i for i, h in enumerate(headers) if h[6] == block]
+        lost.update(random.sample(mine, parity))
+    arriving = [p for i, p in enumerate(packets) if i not in lost]
+    random.shuffle(arriving)
+    reassembly = Reassembly(64 * 2**20, lambda topic: None)
+    whole = None
+    for i, p in enumerate(arriving):
+        h = packet.pull_header(p)
+        assert whole is None
+        entry = reassembly.entry(bytes(p[:22]), shape.size, length, 4, h[6], 1.0, 0.0)
+        whole = reassembly.add(entry, h[6], h[7], p[packet.HEADER_SIZE :])
+        assert whole is None or i == len(arriving) - 1 or parity
+        if whole is not None:
+            break
+    assert whole == message
+    assert reassembly.used == 0
+
+
+def test_parity_goes_last_and_in_turn_over_the_blocks():
+    shape, shards = cut(bytes(250 * ROOM), ROOM, 3)
+    data = shards.take(shards.remaining, 0, 0)
+    headers = [packet.pull_header(data[i : i + shards.packet_size]) for i in range(0, len(data), shards.packet_size)]
+    order = [(h[6], h[7]) for h in headers]
+    assert shape.blocks == 3
+    assert order[:250] == [(b, i) for b in range(3) for i in range(shape.block_k(b))]
+    assert order[250:] == [(b, shape.block_k(b) + j) for j in range(3) for b in range(3)]
