@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import Annotated
 
 import typer
@@ -45,5 +46,6 @@ def _version(wanted: bool) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line. A request to end is an interrupt, so that what was started is ended in order."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()

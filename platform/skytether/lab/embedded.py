@@ -46,8 +46,8 @@ class EmbeddedOrchestrator:
         """What the orchestrator wrote so far."""
         return (self.state_dir / "orchestrator.log").read_text(errors="replace")
 
-    def start(self) -> None:
-        """Start, and return once it answers.
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start, and return its process once it answers.
 
         Raises:
             EmbeddedError: It ended or did not answer in time.
@@ -57,29 +57,38 @@ class EmbeddedOrchestrator:
         command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--stop-instances"]
         command += ["--state-dir", str(self.state_dir), "--port", str(self._port)]
         with (self.state_dir / "orchestrator.log").open("ab") as log:
-            self._process = subprocess.Popen(
+            process = self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
             )
+        try:
+            self._port = self._wait_for(address, process)
+        except BaseException:
+            self.kill()
+            raise
+        return process
+
+    def _wait_for(self, address: Path, process: subprocess.Popen[bytes]) -> int:
+        """The port, once the file that tells it is there."""
         deadline = time.monotonic() + _START_TIMEOUT
         while not address.exists():
-            if self._process.poll() is not None:
+            if process.poll() is not None:
                 lines = self.log.strip().splitlines()
                 raise EmbeddedError(f"the orchestrator did not start: {lines[-1] if lines else 'no output'}")
             if time.monotonic() > deadline:
-                self.kill()
                 raise EmbeddedError(f"the orchestrator did not answer within {_START_TIMEOUT:.0f} s")
             time.sleep(0.01)
-        self._port = int(address.read_text().strip().rsplit(":", 1)[1])
+        return int(address.read_text().strip().rsplit(":", 1)[1])
 
     def stop(self) -> None:
         """End it and every instance that it started, also those that outlived a crash of it."""
-        if self._process is None or self._process.poll() is not None:
-            if not self._port:
-                return
-            self.start()  # to adopt and end what still runs
-        self._process.terminate()
+        if not self._port:
+            return
+        process = self._process
+        if process is None or process.poll() is not None:
+            process = self.start()  # to adopt and end what still runs
+        process.terminate()
         try:
-            self._process.wait(_STOP_TIMEOUT)
+            process.wait(_STOP_TIMEOUT)
         except subprocess.TimeoutExpired:
             self.kill()
         self._process, self._port = None, 0

@@ -100,10 +100,11 @@ class Guide:
             self._odometry.anchor(stamp, pose)
 
     def step(self, now: float) -> Velocity | None:
-        """The velocity to command now.
+        """The velocity to command now; None while there is nothing to go by.
 
         Without a new force the last one keeps acting, which repeats the last command in effect (thesis section 2.5.1),
-        until it or the wheels are older than ``input_timeout``; then the walker stops.
+        until it or the wheels are older than ``input_timeout``. Then it says nothing, rather than zero: the robot
+        notices silence at once and helps itself, while a stream of zeros would hold the person still.
         """
         dt = min(now - self._stepped_at, _LONGEST_STEP) if self._stepped_at is not None else 0.0
         self._stepped_at = now
@@ -115,7 +116,7 @@ class Guide:
         if now - min(force_at, self._wheels_at) > p.input_timeout:
             self._filter.reset()
             self._velocity = STANDSTILL
-            return STANDSTILL
+            return None
         s = self._locate(pose)
         linear = linear_step(self._admittance, self._velocity.linear, self._filter.step(force, dt), dt)
         linear = min(linear, end_limit(self._path.length - s, rate=p.end_rate, creep=p.end_creep))

@@ -59,7 +59,7 @@ class Params:
     force_cutoff: float = param(3.0, unit="Hz", gt=0, doc="cut-off frequency of the force filter")
     wheel_radius: float = param(0.1, unit="m", gt=0, doc="of the driven wheels")
     wheel_track: float = param(0.55, unit="m", gt=0, doc="distance between the driven wheels")
-    input_timeout: float = param(0.5, unit="s", gt=0, doc="forces or wheels older than this: the walker stops")
+    input_timeout: float = param(0.1, unit="s", gt=0, doc="no commands are given from forces or wheels older than this")
     end_rate: float = param(0.8, unit="1/s", gt=0, doc="speed per way left, near the end of the trail")
     end_creep: float = param(0.03, unit="m/s", gt=0, doc="speed with which the end is reached")
     max_linear: float = param(0.25, unit="m/s", gt=0, le=1.5, doc="largest forward speed; never backwards")
