@@ -3,9 +3,14 @@
 from random import Random
 
 import pytest
+from hypothesis import settings
 
 from skytether.testing.link import LossyLink
 from skytether.wire import Config, Direction, Role, Session, Topic
+
+# How long an example takes says nothing on a machine that others use too.
+settings.register_profile("wire", deadline=None)
+settings.load_profile("wire")
 
 KEY = bytes(range(32))
 SESSION_ID = 0x1122334455667788
@@ -47,12 +52,12 @@ def world():
     return World()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_world():
     return World
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def topics():
     return TOPICS
 

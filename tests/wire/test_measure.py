@@ -69,7 +69,7 @@ def test_jitter_with_and_without_reordering():
     inbound = Inbound()
     # Sequence 0, 2, 1, 3 with delays 10, 10, 30, 12 ms: by arrival |0| + |20| + |18| over 3; in order |0| + |2| over 2.
     for now, delay, in_order in ((0.0, 0.01, True), (0.1, 0.01, True), (0.11, 0.03, False), (0.2, 0.012, True)):
-        inbound.arrived(delay, in_order, now)
+        inbound.arrived(delay, 0.001, in_order, now)
     assert math.isclose(inbound.jitter.value, 0.038 / 3)
     assert math.isclose(inbound.jitter_in_order.value, 0.001)
     assert math.isclose(inbound.period.quantile(0.5), 0.09, rel_tol=0.011)
@@ -77,7 +77,8 @@ def test_jitter_with_and_without_reordering():
 
 def test_without_a_clock_offset_no_delay_is_made_up():
     inbound = Inbound()
-    inbound.arrived(math.nan, True, 0.0)
-    inbound.arrived(math.nan, True, 0.5)
+    inbound.arrived(math.nan, math.inf, True, 0.0)
+    inbound.arrived(math.nan, math.inf, True, 0.5)
     assert inbound.delay.total == 0
+    assert math.isnan(inbound.delay_error)
     assert inbound.period.total == 1

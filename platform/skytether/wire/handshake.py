@@ -104,6 +104,8 @@ class Hello:
         self._key = key
         self._topics = topics
         self.made_at = now
+        self.sent = 0
+        """How many times it was sent."""
         offer = push_offer(topics)
         plaintext = _HELLO.pack(crypto.public_of(self._private), held, epoch, _micros(now), len(offer)) + offer
         plaintext = plaintext.ljust(max(MIN_HELLO, ROW_HELLO * len(topics)), b"\0")

@@ -45,13 +45,13 @@ class Ledger:
         self._peer_out.clear()
         self._peer_in.clear()
 
-    def rows(self, epoch: Epoch, clock_error: float, now: float) -> tuple[list[SenderRow], list[ReceiverRow]]:
+    def rows(self, epoch: Epoch, now: float) -> tuple[list[SenderRow], list[ReceiverRow]]:
         """What to report to the peer."""
         senders, receivers = list(epoch.send.values()), list(epoch.receive.values())
         self._turn += 1
         return (
             [self._sender_row(t) for t in _in_turn(senders, self._turn)],
-            [self._receiver_row(t, clock_error, now) for t in _in_turn(receivers, self._turn)],
+            [self._receiver_row(t, now) for t in _in_turn(receivers, self._turn)],
         )
 
     def take(self, report: Report, epoch: Epoch, now: float) -> None:
@@ -67,9 +67,9 @@ class Ledger:
             if receiver_row.topic in names:
                 self._peer_in[names[receiver_row.topic]] = receiver_row
 
-    def stats(self, table: Mapping[str, Topic], clock_error: float) -> tuple[TopicStats, ...]:
+    def stats(self, table: Mapping[str, Topic]) -> tuple[TopicStats, ...]:
         """One row for each topic of a table."""
-        return tuple(self._stats(topic, clock_error) for topic in table.values())
+        return tuple(self._stats(topic) for topic in table.values())
 
     def overhead(self) -> float:
         """Bytes sent beyond payload, as a share of payload; NaN if nothing was sent."""
@@ -82,16 +82,16 @@ class Ledger:
         return SenderRow(topic.index, topic.sequence, c.offered, c.sent, c.expired, c.replaced, c.bytes_sent)
 
     @staticmethod
-    def _receiver_row(topic: ReceiveTopic, clock_error: float, now: float) -> ReceiverRow:
+    def _receiver_row(topic: ReceiveTopic, now: float) -> ReceiverRow:
         topic.settle(now)
         c = topic.counters
         return ReceiverRow(
             topic.index, max(c.delivered, 0), max(c.lost, 0), c.late, c.expired, c.superseded, c.duplicate,
-            c.bytes_delivered, c.delay.quantile(0.5), c.delay.quantile(0.99), c.delay.maximum, clock_error,
+            c.bytes_delivered, c.delay.quantile(0.5), c.delay.quantile(0.99), c.delay.maximum, c.delay_error,
             c.jitter.value, c.jitter_in_order.value, c.period.quantile(0.5), c.period.quantile(0.99),
         )  # fmt: skip
 
-    def _stats(self, topic: Topic, clock_error: float) -> TopicStats:
+    def _stats(self, topic: Topic) -> TopicStats:
         base = TopicStats(topic.name, topic.direction.value, topic.priority)
         if topic.direction.sender is self._role:
             out = self._out.get(topic.name, Outbound())
@@ -113,7 +113,7 @@ class Ledger:
         base = replace(
             base, delivered=c.delivered, lost=c.lost, late=c.late, expired=c.expired, superseded=c.superseded,
             duplicate=c.duplicate, bytes_delivered=c.bytes_delivered, delay_p50=c.delay.quantile(0.5),
-            delay_p99=c.delay.quantile(0.99), delay_max=c.delay.maximum, delay_error=clock_error,
+            delay_p99=c.delay.quantile(0.99), delay_max=c.delay.maximum, delay_error=c.delay_error,
             jitter=c.jitter.value, jitter_in_order=c.jitter_in_order.value, period_p50=c.period.quantile(0.5),
             period_p99=c.period.quantile(0.99),
         )  # fmt: skip

@@ -131,14 +131,16 @@ class Inbound:
     """Counters of a topic at its receiver, since the session object was made; names as in `stats.TopicStats`."""
 
     __slots__ = (
-        "_arrival", "_delay", "_delay_in_order", "bytes_delivered", "delay", "delivered", "duplicate", "expired",
-        "jitter", "jitter_in_order", "late", "lost", "period", "superseded",
+        "_arrival", "_delay", "_delay_in_order", "bytes_delivered", "delay", "delay_error", "delivered", "duplicate",
+        "expired", "jitter", "jitter_in_order", "late", "lost", "period", "superseded",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.delivered = self.lost = self.late = self.expired = self.superseded = self.duplicate = 0
         self.bytes_delivered = 0
         self.delay = Histogram()
+        self.delay_error = math.nan
+        """Largest error of the clock offset behind any of the delays."""
         self.period = Histogram()
         self.jitter = Mean()
         self.jitter_in_order = Mean()
@@ -146,7 +148,7 @@ class Inbound:
         self._delay = math.nan
         self._delay_in_order = math.nan
 
-    def arrived(self, delay: float, in_order: bool, now: float) -> None:
+    def arrived(self, delay: float, error: float, in_order: bool, now: float) -> None:
         """Take the times of one authentic message; ``delay`` is NaN while the clock offset is unknown."""
         if self._arrival == self._arrival:
             self.period.add(now - self._arrival)
@@ -154,6 +156,8 @@ class Inbound:
         if delay != delay:
             return
         self.delay.add(delay)
+        if not error <= self.delay_error:
+            self.delay_error = error
         if self._delay == self._delay:
             self.jitter.add(abs(delay - self._delay))
         self._delay = delay

@@ -191,7 +191,7 @@ class Session:
             path.bytes_received, path.pacer.rate * 8, self._ledger.overhead(),
         )  # fmt: skip
         return SessionStats(
-            self._connected, self._ledger.stats(table, clock.error), (paths,), dict(rejected), clock.offset,
+            self._connected, self._ledger.stats(table), (paths,), dict(rejected), clock.offset,
             clock.error, self._handshakes, now - self._last_heard,
         )  # fmt: skip
 
@@ -259,6 +259,7 @@ class Session:
                 self.session_id, self._key, list(self._table.values()), self._proposal, held, self._entropy, now
             )
         self._send_raw(self._hello.common, self._hello.message, self._peer)
+        self._hello.sent += 1
         if epoch is None:
             wait = self._hello_wait
             self._hello_wait = min(2 * wait, config.hello_retry_max)
@@ -303,10 +304,11 @@ class Session:
                 self._refuse(welcome.reason)
             self._hello_at = now + self._config.hello_retry_max
             return
-        t1, t2, t3 = welcome.times
         self._start_epoch(self._make_epoch(welcome.outcome), address, now)
-        self._clock.exchange(t1, t2, t3, now)
-        self._echo = t3, now
+        if hello.sent == 1:  # else nobody knows which one was answered, and the first ping will tell more
+            t1, t2, t3 = welcome.times
+            self._clock.exchange(t1, t2, t3, now)
+            self._echo = t3, now
         self._ping(now)
 
     def _refuse(self, reason: str) -> None:
@@ -428,7 +430,7 @@ class Session:
         known = clock.known
         sent_at = micros / 1e6 - clock.offset if known else now
         in_order = sequence > topic.newest
-        counters.arrived(now - sent_at if known else math.nan, in_order, now)
+        counters.arrived(now - sent_at if known else math.nan, clock.error, in_order, now)
         if in_order:
             topic.newest = sequence
         if topic.newest_only and (not in_order or self._outdated(epoch, index)):
@@ -462,8 +464,11 @@ class Session:
             self._end_epoch(now)
 
     def _on_ping(self, ping: Ping, sent_at: float, now: float) -> None:
+        first = self._echo is None
         if self._echo is None or sent_at > self._echo[0]:
             self._echo = sent_at, now
+        if first and now >= self._pinged_at + PING_SPACING:
+            self._ping(now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
             return
         t1, hold = ping.echo / 1e6, ping.hold / 1e6
@@ -493,7 +498,7 @@ class Session:
         if self._epoch is None:
             return
         meter = self._path.arrivals
-        rows = self._ledger.rows(self._epoch, self._clock.error, now)
+        rows = self._ledger.rows(self._epoch, now)
         for message in control.push_reports(meter.loss, meter.burst, *rows):
             self._say(message, now)
 
