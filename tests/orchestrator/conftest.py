@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.records import Record
+from skytether.orchestrator.server import listening
 from skytether.orchestrator.settings import Settings, Timing
 from skytether.orchestrator.sites import load_runtime
 from skytether.orchestrator.store import Store
@@ -129,43 +129,58 @@ class Served:
         return self.fleet.made[name]
 
 
-def serve(core: Orchestrator) -> Iterator[str]:
-    """Serve in a thread; yields the address."""
-    config = uvicorn.Config(create_app(core), log_config=None, lifespan="off", timeout_graceful_shutdown=1)
-    server = uvicorn.Server(config)
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen()
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-        finally:
-            core.broker.close()
+class Server:
+    """A real server on loopback, in a thread, whose app can be changed: stopping one takes a fifth of a second."""
+
+    def __init__(self) -> None:
+        self.app: Any = None
+        self.url = ""
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        await self.app(scope, receive, send)
+
+    def run(self) -> Iterator[Server]:
+        config = uvicorn.Config(self, interface="asgi3", log_config=None, lifespan="off", timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
+        with listening("127.0.0.1", 0) as listener:
+            self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+            thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+            thread.start()
+            yield self
             server.should_exit = True
             thread.join()
 
 
-def served_in(folder: Path, **settings: Any) -> Iterator[Served]:
+def served_in(folder: Path, server: Server, **settings: Any) -> Iterator[Served]:
     fleet = Fleet()
     core = Orchestrator(Settings(state_dir=folder, **{"timing": QUICK, **settings}), find_runtime=fleet)
     core.start()
     core.sites.delete("local")
-    for url in serve(core):
-        served = Served(core, url, fleet, (folder / "operator.token").read_text().strip())
-        served.operator.put_service("toy", document(params={"properties": {"mass": {"type": "number", "minimum": 0}}}))
-        yield served
-        for client in served.clients:
-            client.close()
+    server.app = create_app(core)
+    served = Served(core, server.url, fleet, (folder / "operator.token").read_text().strip())
+    served.operator.put_service("toy", document(params={"properties": {"mass": {"type": "number", "minimum": 0}}}))
+    yield served
+    for client in served.clients:
+        client.close()
     core.stop()
 
 
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    yield from Server().run()
+
+
+@pytest.fixture(scope="session")
+def shared_server() -> Iterator[Server]:
+    yield from Server().run()
+
+
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
-    yield from served_in(tmp_path)
+def served(tmp_path: Path, server: Server) -> Iterator[Served]:
+    yield from served_in(tmp_path, server)
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def shared(tmp_path_factory: pytest.TempPathFactory, shared_server: Server) -> Iterator[Served]:
     """One for tests that leave it as they found it."""
-    yield from served_in(tmp_path_factory.mktemp("shared"))
+    yield from served_in(tmp_path_factory.mktemp("shared"), shared_server)

@@ -56,11 +56,23 @@ class Client:
     """
 
     def __init__(self, base_url: str, token: str | None = None, *, timeout: float = 10.0) -> None:
-        """``timeout``: seconds for each step of a request: connect, send, receive."""
+        """``timeout``: seconds for each step of a request: connect, send, receive.
+
+        Raises:
+            ApiError: The token holds characters that no token has.
+        """
         self._url = base_url.rstrip("/")
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
-        # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
-        self._http = httpx.Client(base_url=self._url, headers=headers, timeout=timeout, trust_env=False)
+        if token and not (token.isascii() and token.isprintable()):
+            raise ApiError(Problem(title="No valid token", status=401, detail="what was given as token is none"))
+        self._http = httpx.Client(
+            base_url=self._url,
+            headers={"Authorization": f"Bearer {token}"} if token else {},
+            timeout=timeout,
+            # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
+            verify=not self._url.startswith("http://"),
+            # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
+            trust_env=False,
+        )
 
     def close(self) -> None:
         """Let go of the connections."""

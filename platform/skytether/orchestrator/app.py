@@ -13,15 +13,13 @@ from .routers import catalog, health, instances, robots, sites
 
 def create_app(core: Orchestrator) -> FastAPI:
     """An ASGI app over an orchestrator; whoever serves it starts and stops the orchestrator."""
-    limit = core.settings.limits.body_bytes
     app = FastAPI(
         title="Skytether",
         version=skytether.__version__,
         description="Ask for services for robots; see what runs where, and how well.",
-        max_body_size=limit,
     )
     app.state.core = core
-    problems.install(app, limit)
+    problems.install(app, core.settings.limits.body_bytes)
     for router in (catalog.router, sites.router, instances.router, robots.router, health.router):
         app.include_router(router)
     return app

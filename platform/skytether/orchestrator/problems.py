@@ -8,7 +8,9 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skytether.api.rest import Problem
 
@@ -78,6 +80,36 @@ def install(app: FastAPI, body_limit: int) -> None:
     app.add_exception_handler(RequestValidationError, on_invalid)
     app.add_exception_handler(HTTPException, on_http)
     app.add_exception_handler(Exception, on_anything)
+    app.add_middleware(BodyLimit, limit=body_limit)
+
+
+class BodyLimit:
+    """ASGI middleware: a request that is too large, or says that it is, is answered with 413 once somebody reads it."""
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        """``limit`` in bytes."""
+        self._app = app
+        self._limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+        declared = Headers(scope=scope).get("content-length", "")
+        largest = int(declared) if declared.isdigit() else 0
+        received = 0
+
+        async def limited() -> Message:
+            nonlocal received
+            if largest > self._limit:
+                raise HTTPException(413)
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > self._limit:
+                raise HTTPException(413)
+            return message
+
+        return await self._app(scope, limited, send)
 
 
 def answer(

@@ -49,7 +49,7 @@ def run(settings: Settings) -> None:
         settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise StartError(f"cannot make {settings.state_dir}: {error.strerror}; give another --state-dir") from error
-    with _locked(settings.state_dir), _listening(settings.host, settings.port) as listener:
+    with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
         try:
             core = Orchestrator(settings)
         except SecretFileError as error:
@@ -135,8 +135,14 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _listening(host: str, port: int) -> Iterator[socket.socket]:
+def listening(host: str, port: int) -> Iterator[socket.socket]:
+    """A socket that listens.
+
+    Raises:
+        StartError: There is no such address, or the port is taken.
+    """
     try:
+        # The protocol is named: asyncio turns Nagle's delay (40 ms an answer) off only for sockets that say TCP.
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
     except OSError as error:

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+from skytether.api.rest import Refusal, Report, TopicReport
+from skytether.orchestrator.metrics import Metrics, Running
+from skytether.orchestrator.records import Record
+from skytether.orchestrator.runtimes.base import Observation, Phase
+
+NewRecord = Callable[..., Record]
+ALLOWED = {"robot", "service", "topic", "priority", "site", "direction", "outcome", "source", "reason", "phase"}
+STANDARD = {"le", "quantile"}
+"""Prometheus' own, of histograms and summaries."""
+
+
+def record_with(new_record: NewRecord, manifest: Any, *topics: str, **changes: Any) -> Record:
+    rows = [{"name": t, "type": "*" if t == "*" else "a/msg/B", "direction": "in"} for t in topics]
+    return new_record(manifest=manifest(topics=rows), site="lab", **changes)
+
+
+def topic(name: str = "scan", **more: Any) -> TopicReport:
+    return TopicReport(topic=name, direction="in", priority=100, **more)
+
+
+def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord, manifest: Any) -> None:
+    record = record_with(new_record, manifest, "scan")
+    running = [Running(record, Observation(1, Phase.RUNNING, cpu_s=1.5, memory_bytes=1000))]
+    metrics = Metrics(lambda: running, 64)
+    metrics.phase(record, "total", 0.4)
+    metrics.refused("toy", [Refusal(site="far", reason="rtt", detail="")])
+    metrics.report(
+        record,
+        Report(
+            rtt_s=0.1,
+            control_source="fallback",
+            fallback_transitions={"delay": 2},
+            topics=(
+                topic(sent=9, delivered=7, lost=2, bytes_sent=900, delay_p50_s=0.05, delay_p99_s=0.2, jitter_s=0.01),
+            ),
+        ),
+    )
+    text = metrics.text().decode()
+    names = set(re.findall(r"^# TYPE skytether_(\w+) ", text, re.MULTILINE)) - {"instance_start_seconds_created"}
+    assert names - {"placement_refusals_created"} == {
+        "topic_one_way_delay_seconds",
+        "path_rtt_seconds",
+        "topic_messages_total",
+        "topic_bytes_total",
+        "topic_jitter_seconds",
+        "control_source",
+        "fallback_transitions_total",
+        "instance_start_seconds",
+        "instance_cpu_seconds_total",
+        "instance_memory_bytes",
+        "placement_refusals_total",
+    }
+    labels = set(re.findall(r"(\w+)=\"", text))
+    assert labels <= ALLOWED | STANDARD
+    one = 'direction="in",outcome="lost",priority="100",robot="walker",service="toy",topic="scan"'
+    assert sample(text, "topic_messages_total", one) == 2
+    assert sample(text, "control_source", 'robot="walker",service="toy",source="fallback"') == 1
+    assert sample(text, "control_source", 'robot="walker",service="toy",source="cloud"') == 0
+    assert sample(text, "instance_cpu_seconds_total", 'robot="walker",service="toy",site="lab"') == 1.5
+    where = 'direction="in",priority="100",quantile="0.99",robot="walker",service="toy",topic="scan"'
+    assert sample(text, "topic_one_way_delay_seconds", where) == 0.2
+
+
+def sample(text: str, name: str, labels: str) -> float | None:
+    """A sample's value; labels in any order."""
+    wanted = set(labels.split(","))
+    for found, value in re.findall(rf"^skytether_{name}{{(.*)}} (\S+)$", text, re.MULTILINE):
+        if set(found.split(",")) == wanted:
+            return float(value)
+    return None
+
+
+def test_series_vanish_with_the_instance(new_record: NewRecord, manifest: Any) -> None:
+    record = record_with(new_record, manifest, "scan")
+    running = [Running(record, None)]
+    metrics = Metrics(lambda: running, 64)
+    metrics.report(record, Report(rtt_s=0.1, topics=(topic(sent=1),), control_source="cloud"))
+    assert 'robot="walker"' in metrics.text().decode()
+    running.clear()
+    assert 'robot="walker"' not in metrics.text().decode()
+
+
+def test_series_vanish_with_the_site_and_the_service(new_record: NewRecord) -> None:
+    metrics = Metrics(list, 64)
+    metrics.phase(new_record(site="lab"), "total", 1)
+    metrics.refused("toy", [Refusal(site="lab", reason="cpu", detail="")])
+    metrics.forget_site("lab")
+    assert 'site="lab"' not in metrics.text().decode()
+    metrics.phase(new_record(site="lab"), "total", 1)
+    metrics.refused("toy", [Refusal(site="lab", reason="cpu", detail="")])
+    metrics.forget_service("toy")
+    assert 'service="toy"' not in metrics.text().decode()
+
+
+def test_two_instances_of_one_robot_add_up(new_record: NewRecord, manifest: Any) -> None:
+    records = [record_with(new_record, manifest, "scan", name=name) for name in ("a", "b")]
+    metrics = Metrics(lambda: [Running(r, Observation(1, Phase.RUNNING, memory_bytes=10)) for r in records], 64)
+    for record in records:
+        metrics.report(record, Report(topics=(topic(sent=3, jitter_s=0.5),), rtt_s=0.2))
+    text = metrics.text().decode()
+    one = 'direction="in",outcome="sent",priority="100",robot="walker",service="toy",topic="scan"'
+    assert sample(text, "topic_messages_total", one) == 6
+    assert sample(text, "instance_memory_bytes", 'robot="walker",service="toy",site="lab"') == 20
+    assert sample(text, "path_rtt_seconds", 'robot="walker",service="toy",site="lab"') == 0.2
+
+
+def test_no_robot_can_blow_up_the_number_of_series(new_record: NewRecord, manifest: Any) -> None:
+    fixed = record_with(new_record, manifest, "scan", name="a")
+    wild = record_with(new_record, manifest, "*", name="b", robot="other")
+    metrics = Metrics(lambda: [Running(fixed, None), Running(wild, None)], max_topics=5)
+    many = tuple(topic(f"t{n}") for n in range(1000))
+    reasons = {f"reason_{n}": 1 for n in range(1000)} | {'evil"\n': 1}
+    for record in (fixed, wild):
+        metrics.report(record, Report(topics=many, fallback_transitions=reasons, control_source="x" * 1000))
+    text = metrics.text().decode()
+    assert 'robot="walker",service="toy",topic=' not in text
+    assert len(set(re.findall(r'topic="(t\d+)"', text))) == 5
+    assert len(re.findall(r"^skytether_fallback_transitions_total", text, re.MULTILINE)) == 64
+    assert "evil" not in text
+    assert "xxx" not in text

@@ -1,0 +1,349 @@
+"""The acting part, step by step, with made-up time, a real store and runtimes that run nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skytether.api.rest import SiteCreate, State
+from skytether.orchestrator.metrics import Metrics
+from skytether.orchestrator.reconcile import Reconciler
+from skytether.orchestrator.records import Record
+from skytether.orchestrator.runtimes.base import Phase
+from skytether.orchestrator.security import Secrets
+from skytether.orchestrator.settings import Limits, Timing
+from skytether.orchestrator.sites import Site
+from skytether.orchestrator.store import Store
+from skytether.testing.runtimes import (
+    CrashingRuntime,
+    FakeOptions,
+    FakeRuntime,
+    NeverReadyRuntime,
+    RefusingRuntime,
+    SlowRuntime,
+    StubbornRuntime,
+)
+
+NewRecord = Callable[..., Record]
+
+
+class FixedSites:
+    """Sites whose threads never run: the test makes the steps."""
+
+    def __init__(self, *sites: Site) -> None:
+        self._sites = {site.name: site for site in sites}
+
+    def all(self) -> list[Site]:
+        return list(self._sites.values())
+
+    def find(self, name: str | None) -> Site | None:
+        return self._sites.get(name or "")
+
+
+class Bench:
+    """A reconciler over one site, ``lab``."""
+
+    def __init__(self, folder: Path, store: Store, clock: Any, kind: type[FakeRuntime] = FakeRuntime, **options: Any):
+        self.store, self.clock = store, clock
+        self.woken = 0
+        self.metrics = Metrics(list, 64)
+        self.reconciler = self._reconciler(folder)
+        self.runtime = kind("lab", folder, FakeOptions(**options))
+        self.site = self._site()
+
+    def _reconciler(self, folder: Path) -> Reconciler:
+        return Reconciler(
+            self.store, Secrets(folder), self.metrics, Timing(), Limits(ended_count=1), self.clock, self._wake
+        )
+
+    def _site(self) -> Site:
+        asked = SiteCreate(name="lab", tier="edge", runtime="fake")
+        site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
+        self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
+        return site
+
+    def _wake(self) -> None:
+        self.woken += 1
+
+    def restart(self, folder: Path) -> None:
+        """The orchestrator is killed and comes back; what runs runs on."""
+        self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
+        self.reconciler = self._reconciler(folder)
+        self.site = self._site()
+
+    def step(self, times: int = 1) -> float:
+        for _ in range(times):
+            self.reconciler.place_step()
+            delay = self.reconciler.site_step(self.site)
+        return delay
+
+    def record(self, name: str = "i1") -> Record:
+        found = self.store.get(name)
+        assert found is not None
+        return found
+
+    def reasons(self, name: str = "i1") -> list[tuple[str, str]]:
+        return [(e.state.value, e.reason) for e in self.store.events(name, 0)]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, store: Store, clock: Any) -> Callable[..., Bench]:
+    def make(kind: type[FakeRuntime] = FakeRuntime, **options: Any) -> Bench:
+        bench = Bench(tmp_path, store, clock, kind, **options)
+        bench.reconciler.site_step(bench.site)
+        return bench
+
+    return make
+
+
+def add(bench: Bench, record: Record) -> None:
+    bench.store.add(record, "operator", None, "")
+
+
+def test_a_request_becomes_a_running_instance(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    record = b.record()
+    assert (record.state, record.site, record.host, record.port) == (State.RUNNING, "lab", "127.0.0.1", 40_000)
+    assert [state for state, _ in b.reasons()] == ["pending", "placing", "starting", "running"]
+    launch = b.runtime.world["i1"].launch
+    assert launch.grant.session_id == record.session_id
+    assert len(launch.grant.session_key) == 44
+    assert launch.grant.session_key not in repr(launch)
+
+
+def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, new_record: NewRecord) -> None:
+    b = bench(SlowRuntime)
+    add(b, new_record())
+    timing = Timing()
+    assert b.step() == timing.observe_changing
+    while b.record().state is not State.RUNNING:
+        assert b.step() == timing.observe_changing
+    assert b.step() == timing.observe
+
+
+def test_a_full_site_makes_it_wait_with_the_number_and_an_end_makes_room(bench: Any, new_record: NewRecord) -> None:
+    b = bench(cpu=1)
+    add(b, new_record("i1"))
+    b.clock.forward(0.1)
+    add(b, new_record("i2"))
+    b.step(2)
+    waiting = b.record("i2")
+    assert waiting.state is State.PENDING
+    assert waiting.reason == "waiting for a site: lab: needs 1 cores, 0 of 1 are free"
+    b.step(3)
+    assert len(b.reasons("i2")) == 2, "the same reason is told once"
+    woken = b.woken
+    b.store.change(b.record("i1"), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.step(4)
+    assert b.woken > woken
+    assert b.record("i2").state is State.RUNNING
+
+
+def test_a_crash_is_mended_at_once_with_the_same_port_and_told(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    port = b.record().port
+    b.clock.forward(1)
+    b.runtime.crash("i1", -9)
+    b.step(3)
+    record = b.record()
+    assert (record.state, record.restarts, record.port, record.reason) == (State.RUNNING, 1, port, "")
+    assert ("starting", "the service was killed by signal 9; starting it again") in b.reasons()
+    assert b.runtime.started == [("i1", 1), ("i1", 2)]
+
+
+def test_a_service_that_ends_at_once_is_given_up_with_its_last_line(bench: Any, new_record: NewRecord) -> None:
+    b = bench(CrashingRuntime)
+    add(b, new_record(lease_expires_at=b.clock() + 100))
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    record = b.record()
+    assert record.state is State.FAILED
+    assert record.reason.startswith(
+        'given up after 5 failures in a row: the service ended with exit status 1; its last line: "boom"; see '
+    )
+    assert b.runtime.started == [("i1", n) for n in range(1, 6)]
+    assert b.runtime.observe()["i1"].phase is Phase.EXITED
+
+
+def test_a_service_that_never_gets_ready_is_ended_and_tried_again(bench: Any, new_record: NewRecord) -> None:
+    b = bench(NeverReadyRuntime)
+    add(b, new_record(lease_s=1000, lease_expires_at=b.clock() + 1000))
+    b.step()
+    b.clock.forward(31)
+    b.step(2)
+    assert b.record().reason == "the service was not ready within 30 s; starting it again"
+    assert b.runtime.observe()["i1"].exit_status == -9
+    b.step()
+    assert b.runtime.started == [("i1", 1), ("i1", 2)]
+
+
+def test_a_site_that_cannot_start_it_fails_it_in_words(bench: Any, new_record: NewRecord) -> None:
+    b = bench(RefusingRuntime)
+    add(b, new_record(lease_expires_at=b.clock() + 100))
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    assert b.record().state is State.FAILED
+    assert "could not be started: no space left on the site" in b.record().reason
+
+
+def test_a_robot_that_vanishes_frees_what_it_held(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    b.clock.forward(15)
+    b.step(3)
+    assert (b.record().state, b.record().reason) == (State.STOPPED, "the robot did not renew its lease of 15 s")
+    assert b.runtime.observe()["i1"].phase is Phase.EXITED
+
+
+def test_a_robot_that_vanishes_before_there_was_a_site(bench: Any, new_record: NewRecord) -> None:
+    b = bench(cpu=0.5)
+    add(b, new_record())
+    b.step()
+    b.clock.forward(15)
+    b.step()
+    assert b.record().state is State.STOPPED
+
+
+def test_a_stubborn_service_is_ended_by_force_after_the_grace(bench: Any, new_record: NewRecord) -> None:
+    b = bench(StubbornRuntime)
+    add(b, new_record())
+    b.step(2)
+    b.store.change(b.record(), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.clock.forward(4.9)
+    b.step()
+    assert b.record().state is State.STOPPING
+    assert b.runtime.observe()["i1"].phase is Phase.RUNNING
+    b.clock.forward(0.2)
+    b.step(2)
+    assert b.record().state is State.STOPPED
+
+
+def test_a_silent_site_is_unreachable_and_what_runs_there_is_believed_to_run(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    b.runtime.silent = True
+    b.step()
+    add(b, new_record("i2"))
+    b.step()
+    assert b.site.unreachable == "site lab does not answer"
+    assert b.record("i1").state is State.RUNNING
+    assert b.record("i2").reason == "waiting for a site: lab: site lab does not answer"
+    b.runtime.silent = False
+    b.step(3)
+    assert b.site.unreachable == ""
+    assert b.record("i2").state is State.RUNNING
+
+
+def test_a_restarted_orchestrator_adopts_what_runs(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    before = b.record()
+    b.restart(tmp_path)
+    b.step(3)
+    assert b.record() == before
+    assert b.runtime.started == []
+
+
+def test_one_killed_right_after_a_launch_neither_starts_twice_nor_loses_it(
+    bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench()
+    add(b, new_record())
+    real, done = b.runtime.start, []
+
+    def start_and_die(launch: Any) -> None:
+        real(launch)
+        done.append(launch)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(b.runtime, "start", start_and_die)
+    with pytest.raises(KeyboardInterrupt):
+        b.step()
+    b.restart(tmp_path)
+    b.step(2)
+    assert len(done) == 1
+    assert b.runtime.started == []
+    assert b.record().state is State.RUNNING
+
+
+def test_what_died_while_the_orchestrator_was_down_is_started_again(
+    bench: Any, new_record: NewRecord, tmp_path: Path
+) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    b.runtime.crash("i1", 1)
+    b.restart(tmp_path)
+    b.step(3)
+    assert b.record().state is State.RUNNING
+    assert b.runtime.started == [("i1", 2)]
+
+
+def test_what_nobody_asked_for_is_removed_and_the_ended_is_kept_for_its_log(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    add(b, new_record())
+    b.step(2)
+    b.runtime.world["stranger"] = b.runtime.world["i1"]
+    b.store.change(b.record(), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.step(4)
+    assert list(b.runtime.observe()) == ["i1"]
+    assert b.runtime.logs("i1", 5)
+
+
+def test_too_many_ended_ones_are_forgotten_with_what_is_left_of_them(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    for name in ("i1", "i2"):
+        add(b, new_record(name))
+        b.step(2)
+        b.clock.forward(1)
+        b.store.change(b.record(name), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+        b.step(3)
+    b.clock.forward(61)
+    b.step(2)
+    assert [r.id for r in b.store.all()] == ["i2"]
+    assert list(b.runtime.observe()) == ["i2"]
+
+
+def test_a_change_by_somebody_else_in_between_wins(bench: Any, new_record: NewRecord, store: Store) -> None:
+    b = bench()
+    add(b, new_record())
+    real = b.runtime.observe
+
+    def deleted_meanwhile() -> Any:
+        record = b.record()
+        if record.state is State.STARTING:
+            store.change(record, b.clock(), state=State.STOPPING, stopping_at=b.clock())
+        return real()
+
+    b.runtime.observe = deleted_meanwhile
+    b.step(3)
+    assert b.record().state is State.STOPPED
+    assert b.runtime.started == []
+
+
+def test_starts_and_refusals_are_measured(bench: Any, new_record: NewRecord) -> None:
+    b = bench(cpu=1)
+    add(b, new_record())
+    b.clock.forward(0.2)
+    b.step()
+    b.clock.forward(0.3)
+    b.step()
+    add(b, new_record("i2"))
+    b.step(5)
+    text = b.metrics.text().decode()
+    labels = '{phase="total",service="toy",site="lab"}'
+    assert f"skytether_instance_start_seconds_count{labels} 1.0" in text
+    assert f"skytether_instance_start_seconds_sum{labels} 0.5" in text
+    assert 'skytether_placement_refusals_total{reason="cpu",service="toy",site="lab"} 1.0' in text
