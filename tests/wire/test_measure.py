@@ -77,8 +77,8 @@ def test_jitter_with_and_without_reordering():
 
 def test_without_a_clock_offset_no_delay_is_made_up():
     inbound = Inbound()
-    inbound.arrived(math.nan, math.inf, True, 0.0)
-    inbound.arrived(math.nan, math.inf, True, 0.5)
+    inbound.arrived(0.0, math.inf, True, 0.0)
+    inbound.arrived(0.0, math.inf, True, 0.5)
     assert inbound.delay.total == 0
     assert math.isnan(inbound.delay_error)
     assert inbound.period.total == 1

@@ -34,7 +34,7 @@ class Config:
     """The robot's end asks whether the service still knows the session after this much silence. One lost ping is
     enough for that, and costs one packet; a restarted service is found within one more ``probe_interval``."""
     probe_interval: float = 0.1
-    """Time between such probes at first; it grows to 2 % of the silence, at most ``hello_retry_max``."""
+    """Time between attempts to reach a silent peer at first; 2 % of the silence later, at most ``hello_retry_max``."""
     silence: float = 1.0
     """A peer not heard for this long is reported as disconnected; its keys stay valid."""
     hello_retry: float = 0.05

@@ -54,11 +54,38 @@ class ReceiveTopic:
         self.lifespan = topic.lifespan
         self.newest_only = topic.depth == 1
         self.newest = -1
-        """Highest sequence delivered."""
+        """Highest sequence that arrived."""
         self.tracker = SequenceTracker(topic.lifespan)
         self.settled = 0
         """Losses of the tracker that are in the counters."""
         self.counters = counters
+
+    def arrived(self, sequence: int, size: int, delay: float, error: float, outdated: bool, now: float) -> bool:
+        """Take an authentic message, once.
+
+        Args:
+            sequence: Its topic sequence.
+            size: Bytes of payload.
+            delay: Seconds on its way; meaningless if ``error`` is inf.
+            error: Bound of the delay's error.
+            outdated: A newer one of a later epoch was here before.
+            now: Time of arrival.
+
+        Returns:
+            Whether to deliver it; else it is superseded.
+        """
+        counters = self.counters
+        counters.late += self.tracker.observe(sequence, now)
+        in_order = sequence > self.newest
+        if in_order:
+            self.newest = sequence
+        counters.arrived(delay, error, in_order, now)
+        if self.newest_only and (outdated or not in_order):
+            counters.superseded += 1
+            return False
+        counters.delivered += 1
+        counters.bytes_delivered += size
+        return True
 
     def settle(self, now: float) -> None:
         """Bring the counters' losses up to date."""

@@ -29,10 +29,12 @@ class MessageReceived:
 
     topic: str
     payload: bytes | memoryview
+    """Read-only; a view into memory of its own for large messages."""
     sequence: int
     """Per topic and handshake, from 0, without gaps at the sender."""
     sent_at: float
-    """When the peer's application published it, in this end's monotonic seconds; see ``sent_at_error``."""
+    """When the peer's application published it, in this end's monotonic seconds; see ``sent_at_error``.
+    ``received_at`` while the clock offset is unknown."""
     sent_at_error: float
     """Bound of the clock offset's error in seconds (half the best round trip seen); inf before the first."""
     received_at: float

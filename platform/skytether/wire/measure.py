@@ -149,11 +149,11 @@ class Inbound:
         self._delay_in_order = math.nan
 
     def arrived(self, delay: float, error: float, in_order: bool, now: float) -> None:
-        """Take the times of one authentic message; ``delay`` is NaN while the clock offset is unknown."""
+        """Take the times of one authentic message; ``error`` is inf while the clock offset is unknown."""
         if self._arrival == self._arrival:
             self.period.add(now - self._arrival)
         self._arrival = now
-        if delay != delay:
+        if error == math.inf:
             return
         self.delay.add(delay)
         if not error <= self.delay_error:

@@ -188,13 +188,6 @@ class Reassembly:
         for topic in list(self._topics):
             self.expire(topic, now)
 
-    def clear(self) -> None:
-        """Drop everything."""
-        self._entries.clear()
-        self._topics.clear()
-        self._costs.clear()
-        self.used = 0
-
     def _block(self, entry: Entry, number: int) -> _Block:
         block = entry.blocks.get(number)
         if block is None:

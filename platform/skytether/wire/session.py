@@ -20,19 +20,16 @@ from .packet import HEADER_SIZE, HELLO, WELCOME
 from .path import LossMeter, Path, Transmit
 from .receiver import Receiver
 from .redundancy import FixedRedundancy
+from .seeker import Seeker, patience
 from .sender import INNER, Sender
 from .stats import PathStats, SessionStats
 from .table import ANY, index_topics
 from .topic import Role, Topic
 
-HELLO_LIFE = 5.0
-"""Seconds before an unanswered HELLO is replaced by a new one: less than the service remembers it."""
 PING_SPACING = 0.02
 """Least time between pings sent as answers, so that replayed packets cannot ask for many."""
 GOODBYES = 3
 """Nobody asks for a lost goodbye."""
-PROBE_SHARE = 0.02
-"""Time between probes as a share of the silence: who was away for 5 s is found within 0.1 s."""
 COPY_BELOW = 4096
 """Payloads up to this size are handed over as bytes, larger ones as a view that saves the copy."""
 MAX_RAW = 8
@@ -77,10 +74,8 @@ class Session:
             raise ValueError(f"session key must have {KEY_SIZE} bytes, not {len(key)}")
         self.role = role
         self.session_id = session_id
-        self._key = key
         self._table = index_topics(topics)
         self._config = config or Config()
-        self._entropy = entropy
         self._events: deque[Event] = deque()
         self._path = Path(0, self._config, now)
         self._redundancy = FixedRedundancy(self._config)
@@ -110,15 +105,7 @@ class Session:
         self._control = SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
 
         self._door = Doorkeeper(session_id, key, self._table, entropy) if role is Role.SERVICE else None
-        self._peer: Hashable | None = None
-        """Where the robot's end looks for the service."""
-        self._moving = False
-        """Told to speak to another address, from which no answer has come yet: answers from elsewhere do not count."""
-        self._hello: Hello | None = None
-        self._hello_at = math.inf
-        self._hello_wait = self._config.hello_retry
-        self._proposal = entropy(1)[0]
-        """Epoch that the next HELLO proposes, less one: not the one in use."""
+        self._seeker = Seeker(session_id, key, topics, self._config, entropy)
         self._refusal = ""
         """Latest reason told, so that it is told once."""
 
@@ -153,13 +140,9 @@ class Session:
 
     def set_peer(self, address: Hashable) -> None:
         """Where the robot's end speaks to from now on (the service was restarted elsewhere)."""
-        self._peer = address
+        if self._door is None and not self._closed:
+            self._seeker.look_at(address, connected=self._epoch is not None)
         self._path.address = address
-        if self.role is Role.ROBOT and not self._closed:
-            self._moving = self._epoch is not None
-            self._hello = None
-            self._hello_wait = self._config.hello_retry
-            self._hello_at = 0.0
 
     def close(self, now: float) -> None:
         """Say goodbye. Call `transmit` once more to send it; then the session is over."""
@@ -223,7 +206,7 @@ class Session:
         """When to call `handle_timer` and `transmit`, if nothing happens before; None: not by itself."""
         if self._closed:
             return None
-        due = min(self._sender.next_timer(), self._hello_at, self._ping_at, self._report_at, self._check_at)
+        due = min(self._sender.next_timer(), self._seeker.due, self._ping_at, self._report_at, self._check_at)
         return due if due < math.inf else None
 
     def handle_timer(self, now: float) -> None:
@@ -232,12 +215,13 @@ class Session:
             return
         if now >= self._check_at:
             self._check(now)
-        if now >= self._hello_at:
+        if now >= self._seeker.due:
             self._seek(now)
         if now >= self._ping_at:
             self._ping(now)
             self._receiver.sweep(now)
-            self._ping_at = now + self._config.keepalive
+            quiet = patience(self._config, now - self._last_heard)
+            self._ping_at = now + (self._config.keepalive if self._connected else quiet)
         if now >= self._report_at:
             self._path.arrivals.evaluate()
             self._report(now)
@@ -247,33 +231,18 @@ class Session:
 
     def _seek(self, now: float) -> None:
         """The robot's end: ask for the service, or whether it still knows us."""
-        config, epoch = self._config, self._epoch
-        heard_lately = self._last_heard + config.probe_after > now
-        if epoch is not None and self._hello is None and heard_lately and not self._moving:
-            self._hello_at = self._last_heard + config.probe_after
-            return
-        if self._hello is None or self._hello.made_at + HELLO_LIFE < now:
-            self._proposal = (self._proposal + 1) % 256
-            held = NO_KEYS if epoch is None else epoch.ciphers.resume
-            self._hello = Hello(
-                self.session_id, self._key, list(self._table.values()), self._proposal, held, self._entropy, now
-            )
-        self._send_raw(self._hello.common, self._hello.message, self._peer)
-        self._hello.sent += 1
-        if epoch is None:
-            wait = self._hello_wait
-            self._hello_wait = min(2 * wait, config.hello_retry_max)
-        else:
-            self._ping(now)
-            silence = now - self._last_heard
-            wait = min(max(config.probe_interval, PROBE_SHARE * silence), config.hello_retry_max)
-        self._hello_at = now + wait
+        held = None if self._epoch is None else self._epoch.ciphers
+        hello = self._seeker.seek(held, self._last_heard, now)
+        if hello is not None:
+            self._send_raw(hello.common, hello.message, self._seeker.peer)
+            if held is not None:
+                self._ping(now)
 
     def _on_handshake(self, kind: int, common: bytes, message: bytes, address: Hashable, now: float) -> None:
         if kind == HELLO and self._door is not None:
             self._on_hello(self._door, common, message, address, now)
-        elif kind == WELCOME and self._hello is not None:
-            self._on_welcome(self._hello, common, message, address, now)
+        elif kind == WELCOME and self._seeker.hello is not None:
+            self._on_welcome(self._seeker.hello, common, message, address, now)
         else:
             self._receiver.rejected["unasked"] += 1
 
@@ -298,11 +267,10 @@ class Session:
         if welcome is None:
             self._receiver.rejected["welcome_forged"] += 1
             return
-        self._hello = None
         if welcome.outcome is None:
             if welcome.reason != self._refusal:
                 self._refuse(welcome.reason)
-            self._hello_at = now + self._config.hello_retry_max
+            self._seeker.rest(now + self._config.hello_retry_max)
             return
         self._start_epoch(self._make_epoch(welcome.outcome), address, now)
         if hello.sent == 1:  # else nobody knows which one was answered, and the first ping will tell more
@@ -333,7 +301,6 @@ class Session:
         if self._epoch is not None:
             self._previous, self._previous_until = self._epoch, now + self._config.old_keys
         self._epoch = epoch
-        self._proposal = epoch.id
         self._control = SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
@@ -348,15 +315,8 @@ class Session:
         self._last_heard = now
         self._ping_at = now
         self._report_at = now + self._config.report_interval
-        self._stop_seeking(now)
+        self._seeker.found(now, epoch.id)
         self._connect(epoch.topics, now)
-
-    def _stop_seeking(self, now: float) -> None:
-        self._hello = None
-        self._moving = False
-        self._hello_wait = self._config.hello_retry
-        if self.role is Role.ROBOT:
-            self._hello_at = now + self._config.probe_after
 
     def _end_epoch(self, now: float) -> None:
         """The peer said goodbye."""
@@ -364,7 +324,8 @@ class Session:
         self._epoch = None
         self._sender.start_epoch(None)
         self._ping_at = self._report_at = math.inf
-        self._stop_seeking(now)
+        if self._door is None:
+            self._seeker.rest(now + self._config.hello_retry)
         if self._connected:
             self._disconnect("goodbye")
 
@@ -410,37 +371,28 @@ class Session:
             if self._door is not None:
                 self._door.confirm()
             self._start_epoch(epoch, address, now)
-        if epoch is self._epoch and not (self._moving and address != self._peer):
+        if epoch is self._epoch and self._seeker.counts(address):
             self._last_heard = now
             if newest and address != self._path.address:
                 self._path.address = address
                 self._events.append(PeerMoved(address))
             if not self._connected:
                 self._connect(epoch.topics, now)
-            if self._hello is not None:
-                self._stop_seeking(now)
+            if self._seeker.hello is not None:
+                self._seeker.found(now, epoch.id)
         sequence, micros = INNER.unpack_from(plaintext)
         if index == 0:
             self._on_control(epoch, plaintext[INNER.size :], micros, now)
             return
-        topic = epoch.receive[index]
-        counters, tracker = topic.counters, topic.tracker
-        counters.late += tracker.observe(sequence, now)
-        clock = self._clock
-        known = clock.known
-        sent_at = micros / 1e6 - clock.offset if known else now
-        in_order = sequence > topic.newest
-        counters.arrived(now - sent_at if known else math.nan, clock.error, in_order, now)
-        if in_order:
-            topic.newest = sequence
-        if topic.newest_only and (not in_order or self._outdated(epoch, index)):
-            counters.superseded += 1
-            return
+        topic, clock = epoch.receive[index], self._clock
+        if epoch is self._epoch and clock.known:
+            sent_at, error = micros / 1e6 - clock.offset, clock.error
+        else:
+            sent_at, error = now, math.inf
         size = len(plaintext) - INNER.size
-        counters.delivered += 1
-        counters.bytes_delivered += size
-        payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
-        self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, clock.error, now))
+        if topic.arrived(sequence, size, now - sent_at, error, self._outdated(epoch, index), now):
+            payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
+            self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, error, now))
 
     def _outdated(self, epoch: Epoch, index: int) -> bool:
         """Whether a message of the keys before comes after a newer one under the present keys."""

@@ -23,11 +23,14 @@ class TopicStats:
     delivered: int = 0
     """Complete and authentic at the receiver, and given to its graph."""
     lost: int = 0
-    """Sent, never completed: gaps in the topic's sequence that are older than its lifespan."""
+    """Sent, never completed: gaps in the topic's sequence that are older than its lifespan. When nothing is under
+    way any more, ``sent == delivered + superseded + lost`` (of one peer's life: what was sent to a peer just before
+    it was restarted is in ``sent`` only)."""
     late: int = 0
     """Arrived after having been counted lost; subtracted from ``lost`` again."""
     expired: int = 0
-    """Dropped for age in the sender's queue, or partly arrived and dropped in the receiver's reassembly."""
+    """Dropped for age in the sender's queue or on its way out, or partly arrived and dropped in the receiver's
+    reassembly (those are among the lost too)."""
     replaced: int = 0
     """Dropped in the sender's queue because newer ones filled it."""
     superseded: int = 0

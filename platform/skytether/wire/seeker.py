@@ -1,0 +1,94 @@
+"""When the robot's end speaks first: to find the service, to find it again, to find it elsewhere (rule 1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+
+from .config import Config
+from .crypto import Ciphers
+from .handshake import NO_KEYS, Entropy, Hello
+from .topic import Topic
+
+HELLO_LIFE = 5.0
+"""Seconds before an unanswered HELLO is replaced by a new one: less than the service remembers it."""
+PROBE_SHARE = 0.02
+"""Time between probes as a share of the silence: who was away for 5 s is found within 0.1 s."""
+
+
+def patience(config: Config, silence: float) -> float:
+    """Time between attempts to reach a peer that was last heard ``silence`` seconds ago."""
+    return min(max(config.probe_interval, PROBE_SHARE * silence), config.hello_retry_max)
+
+
+class Seeker:
+    """Makes HELLO when it is time. The service's end has one that never does."""
+
+    def __init__(self, session_id: int, key: bytes, topics: Sequence[Topic], config: Config, entropy: Entropy) -> None:
+        self._session_id = session_id
+        self._key = key
+        self._topics = topics
+        self._config = config
+        self._entropy = entropy
+        self._wait = config.hello_retry
+        self._proposal = entropy(1)[0]
+        self.peer: Hashable | None = None
+        """Where the service should be."""
+        self.hello: Hello | None = None
+        """The one that is to be answered."""
+        self.due = math.inf
+        """When to call `seek`."""
+        self._elsewhere = False
+        """Told to look in another place, from which no answer came yet."""
+
+    def look_at(self, peer: Hashable, connected: bool) -> None:
+        """Look there at once, even if somebody is heard from another place."""
+        self.peer = peer
+        self.hello = None
+        self.due = 0.0
+        self._wait = self._config.hello_retry
+        self._elsewhere = connected
+
+    def counts(self, address: Hashable) -> bool:
+        """Whether a message from there tells that the service is found."""
+        return not self._elsewhere or address == self.peer
+
+    def found(self, now: float, epoch: int) -> None:
+        """The service is heard; ``epoch`` is the one in use, so that the next HELLO proposes another."""
+        self.hello = None
+        self._elsewhere = False
+        self._wait = self._config.hello_retry
+        self._proposal = epoch
+        self.due = now + self._config.probe_after if self.peer is not None else math.inf
+
+    def rest(self, until: float) -> None:
+        """Ask again, anew, at that time."""
+        self.hello = None
+        self.due = until
+
+    def seek(self, held: Ciphers | None, last_heard: float, now: float) -> Hello | None:
+        """What to send now.
+
+        Args:
+            held: Keys in use, if any.
+            last_heard: When the service was heard.
+            now: Time.
+
+        Returns:
+            None if the service was heard lately.
+        """
+        config = self._config
+        if held is not None and self.hello is None and not self._elsewhere and last_heard + config.probe_after > now:
+            self.due = last_heard + config.probe_after
+            return None
+        if self.hello is None or self.hello.made_at + HELLO_LIFE < now:
+            self._proposal = (self._proposal + 1) % 256
+            name = NO_KEYS if held is None else held.resume
+            self.hello = Hello(self._session_id, self._key, self._topics, self._proposal, name, self._entropy, now)
+        self.hello.sent += 1
+        if held is None:
+            self.due = now + self._wait
+            self._wait = min(2 * self._wait, config.hello_retry_max)
+        else:
+            self.due = now + patience(config, now - last_heard)
+        return self.hello
