@@ -94,14 +94,17 @@ class ProcessRuntime(Runtime):
         self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
 
     def _adopt(self, folder: Path) -> _Run:
-        noted = _read_json(folder / "run.json")
+        note = folder / "run.json"
+        noted = _read_json(note)
         process = None
         if noted.get("boot") == BOOT_ID:
-            # Killed between the launch and the note of its pid: the process is known by its grant.
-            identity = noted.get("process")
-            process = (
-                ProcessId(*identity) if identity else find_by_environment(GRANT_VARIABLE, str(folder / "grant.json"))
-            )
+            if "process" in noted:
+                process = ProcessId(*noted["process"])
+            else:
+                # The orchestrator was killed between launch and note: the process is known by its grant.
+                process = find_by_environment(GRANT_VARIABLE, str(folder / "grant.json"))
+                if process is not None:
+                    _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
         return _Run(int(noted.get("attempt", 0)), process, data=str(noted.get("data", "")))
 
     def refuses(self, spec: ServiceSpec) -> str | None:

@@ -1,0 +1,340 @@
+"""The orchestrator as a program: real processes, killed for real."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from skytether.api.client import Client
+from skytether.api.rest import Instance, InstanceCreate, State
+from skytether.orchestrator.runtimes.procfs import ProcessStat
+
+pytestmark = pytest.mark.slow
+
+PATIENCE = 15.0
+ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
+
+
+class Program:
+    """``skytether orchestrator run`` over one state folder."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.folder = folder
+        self.options = options
+        self.process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def log(self) -> str:
+        return (self.folder.parent / "log").read_text()
+
+    def spawn(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--state-dir", str(self.folder)]
+        with (self.folder.parent / "log").open("ab") as log:
+            self.process = subprocess.Popen([*command, "--port", "0", *self.options], stdout=log, stderr=log)
+        return self.process
+
+    def start(self) -> Client:
+        (self.folder / "address").unlink(missing_ok=True)
+        self.spawn()
+        until(lambda: (self.folder / "address").exists(), self)
+        return Client(
+            (self.folder / "address").read_text().strip(), (self.folder / "operator.token").read_text().strip()
+        )
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        assert self.process is not None
+        self.process.send_signal(number)
+        status = self.process.wait(PATIENCE)
+        self.process = None
+        return status
+
+    def fails(self) -> tuple[int, str]:
+        """Start one that cannot; its status and its only line."""
+        status = self.spawn().wait(PATIENCE)
+        self.process = None
+        lines = self.log.strip().splitlines()
+        assert len(lines) == 1, self.log
+        return status, lines[0]
+
+    def pid_of(self, instance: str) -> int:
+        note = self.folder / "sites/local/instances" / instance / "run.json"
+        return int(json.loads(note.read_text())["process"][0])
+
+    def clean_up(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+        for pid in self.services():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def services(self) -> set[int]:
+        """All processes that have a grant in this state folder."""
+        mine = b"SKYTETHER_GRANT=" + os.fsencode(self.folder)
+        return {int(p.name) for p in Path("/proc").glob("[0-9]*") if mine in environment(p)}
+
+
+def environment(process: Path) -> bytes:
+    with contextlib.suppress(OSError):
+        return (process / "environ").read_bytes()
+    return b""
+
+
+def until(condition: Callable[[], Any], program: Program | None = None, patience: float = PATIENCE) -> float:
+    """Wait for it; returns how long it took."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < patience, program.log if program else ""
+        assert program is None or program.process is None or program.process.poll() is None, program.log
+        time.sleep(0.005)
+    return time.monotonic() - began
+
+
+def alive(pid: int) -> bool:
+    stat = ProcessStat.read(pid)
+    return stat is not None and not stat.zombie
+
+
+@pytest.fixture
+def programs(tmp_path: Path) -> Iterator[Callable[..., Program]]:
+    made: list[Program] = []
+
+    def make(*options: str, name: str = "one") -> Program:
+        (tmp_path / name).mkdir(exist_ok=True)
+        made.append(Program(tmp_path / name / "state", *options))
+        return made[-1]
+
+    yield make
+    for program in made:
+        program.clean_up()
+
+
+def with_toy(client: Client, manifest: Any) -> Client:
+    client.put_service("toy", manifest(needs={"cpu": 0.01, "memory_mb": 1}, params={"additionalProperties": True}))
+    return client
+
+
+def test_first_start_and_orderly_end(programs: Any) -> None:
+    program = programs()
+    with program.start() as client:
+        assert [site.name for site in client.sites()] == ["local"]
+        assert {"virtual-trail", "recorder"} <= {m.metadata.name for m in client.services()}
+    folder = program.folder
+    assert folder.stat().st_mode & 0o777 == 0o700
+    for secret in ("operator.token", "secret.key"):
+        assert (folder / secret).stat().st_mode & 0o777 == 0o600
+    assert program.end() == 0
+    assert not (folder / "address").exists()
+    assert (folder / "operator.token").read_text().strip() not in program.log
+    assert "Traceback" not in program.log
+
+
+def test_a_killed_service_is_seen_within_a_second_and_runs_again_at_the_same_port(programs: Any, manifest: Any) -> None:
+    program = programs()
+    with with_toy(program.start(), manifest) as client:
+        made = client.wait_running(client.create_instance(ASK).id)
+        pid = program.pid_of(made.id)
+        seen: list[float] = []
+        watching = threading.Event()
+
+        def watch() -> None:
+            for event in client.watch(made.id, timeout=PATIENCE):
+                watching.set()
+                if event.state is State.STARTING and event.reason:
+                    seen.append(time.monotonic())
+                    return
+
+        thread = threading.Thread(target=watch)
+        thread.start()
+        assert watching.wait(PATIENCE)
+        killed = time.monotonic()
+        os.kill(pid, signal.SIGKILL)
+        thread.join()
+        assert seen[0] - killed < 1.0
+        until(lambda: client.get_instance(made.id).state is State.RUNNING, program)
+        again = client.get_instance(made.id)
+        assert (again.restarts, again.session) == (1, made.session)
+        assert program.pid_of(made.id) != pid
+
+
+def test_a_killed_orchestrator_comes_back_adopts_what_runs_and_loses_nothing(programs: Any, manifest: Any) -> None:
+    program = programs()
+    with with_toy(program.start(), manifest) as client:
+        short = client.create_instance(ASK.model_copy(update={"lease_s": 1.0}), idempotency_key="short")
+        made = [client.wait_running(client.create_instance(ASK).id) for _ in range(3)]
+        pids = [program.pid_of(i.id) for i in made]
+        events = list(client.watch(made[0].id, timeout=0.1))
+    program.end(signal.SIGKILL)
+    assert all(alive(pid) for pid in pids)
+    time.sleep(1.0)  # the short lease ends while nobody can renew it
+    with program.start() as client:
+        assert client.get_instance(short.id).state in (State.STARTING, State.RUNNING)
+        for before, pid in zip(made, pids, strict=True):
+            after = client.get_instance(before.id)
+            assert after.model_dump(exclude={"lease_expires_at"}) == before.model_dump(exclude={"lease_expires_at"})
+            assert program.pid_of(before.id) == pid
+            assert alive(pid)
+        assert list(client.watch(made[0].id, timeout=0.1)) == events
+        assert client.get_service("toy").metadata.name == "toy"
+        client.delete_instance(made[0].id)
+        assert list(client.watch(made[0].id, timeout=PATIENCE))[-1].state is State.STOPPED
+        assert not alive(pids[0])
+
+
+def test_what_died_while_the_orchestrator_was_dead_runs_again(programs: Any, manifest: Any) -> None:
+    program = programs()
+    with with_toy(program.start(), manifest) as client:
+        made = client.wait_running(client.create_instance(ASK).id)
+    program.end(signal.SIGKILL)
+    os.kill(program.pid_of(made.id), signal.SIGKILL)
+    with program.start() as client:
+        until(lambda: client.get_instance(made.id).restarts == 1, program)
+        assert client.wait_running(made.id).session == made.session
+
+
+def test_killed_in_the_middle_of_starting_it_leaves_no_doubles_and_no_orphans(programs: Any, manifest: Any) -> None:
+    program = programs()
+    ids: set[str] = set()
+    for delay in (0.0, 0.02, 0.05, 0.1):
+        with with_toy(program.start(), manifest) as client:
+            ids |= {client.create_instance(ASK).id for _ in range(2)}
+            time.sleep(delay)
+            program.end(signal.SIGKILL)
+    with program.start() as client:
+        until(lambda: all(client.get_instance(i).state is State.RUNNING for i in ids), program)
+        assert program.services() == {program.pid_of(i) for i in ids}
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_at_shutdown_instances_run_on_unless_told_otherwise(programs: Any, manifest: Any, ends: bool) -> None:
+    program = programs(*(["--stop-instances"] if ends else []))
+    with with_toy(program.start(), manifest) as client:
+        made = client.wait_running(client.create_instance(ASK).id)
+        pid = program.pid_of(made.id)
+    assert program.end() == 0
+    assert alive(pid) is not ends
+    with program.start() as client:
+        after = client.get_instance(made.id)
+        expected = (State.STOPPED, "the orchestrator was stopped") if ends else (State.RUNNING, "")
+        assert (after.state, after.reason) == expected
+
+
+def test_watchers_do_not_hold_up_the_end(programs: Any, manifest: Any) -> None:
+    program = programs("--stop-instances")
+    with with_toy(program.start(), manifest) as client:
+        made = client.wait_running(client.create_instance(ASK).id)
+        states: list[State] = []
+        watching = threading.Event()
+
+        def watch() -> None:
+            for event in client.watch(made.id, timeout=PATIENCE):
+                states.append(event.state)
+                watching.set()
+
+        thread = threading.Thread(target=watch)
+        thread.start()
+        assert watching.wait(PATIENCE)
+        began = time.monotonic()
+        assert program.end() == 0
+        assert time.monotonic() - began < 3
+        thread.join()
+        assert State.RUNNING in states
+
+
+def test_a_service_that_ends_at_once_is_failed_with_its_last_line(programs: Any, manifest: Any) -> None:
+    program = programs()
+    with with_toy(program.start(), manifest) as client:
+        ask = ASK.model_copy(update={"params": {"exit_status": 2, "say": "mass: must be above 0"}})
+        made = client.create_instance(ask)
+        last: Instance | Any = list(client.watch(made.id, timeout=PATIENCE))[-1]
+        assert last.state is State.FAILED
+        assert last.reason == (
+            'the service ended with exit status 2; its last line: "mass: must be above 0"; '
+            "correct what it names and ask again"
+        )
+        assert client.logs(made.id) == "mass: must be above 0\n"
+
+
+def test_a_taken_port_is_one_sentence(programs: Any) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        status, line = programs("--port", str(port)).fails()
+    assert status == 1
+    assert line == (
+        f"error: cannot listen on 127.0.0.1 port {port}: Address already in use; give another with --host or --port"
+    )
+
+
+def test_an_address_that_is_not_here_is_one_sentence(programs: Any) -> None:
+    status, line = programs("--host", "192.0.2.1").fails()
+    assert status == 1
+    assert "cannot listen on 192.0.2.1 port 0: Cannot assign requested address" in line
+
+
+def test_a_second_orchestrator_over_the_same_folder_is_kept_out(programs: Any) -> None:
+    first = programs()
+    first.start().close()
+    pid = first.process.pid
+    done = subprocess.run(
+        [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--state-dir", str(first.folder), "--port", "0"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        f"error: another orchestrator (pid {pid}) uses {first.folder}: "
+        "stop it, or give another folder with --state-dir\n"
+    )
+    assert (first.folder / "address").exists()
+
+
+def test_a_catalogue_with_a_typo_is_one_sentence(programs: Any, manifest: Any, tmp_path: Path) -> None:
+    (tmp_path / "cat").mkdir()
+    typo = manifest(topics=[{"name": "a", "type": "b", "direction": "in", "prority": 3}])
+    (tmp_path / "cat/mine.yaml").write_text(yaml.safe_dump(typo))
+    status, line = programs("--catalog", str(tmp_path / "cat")).fails()
+    assert status == 2
+    assert line == f"error: {tmp_path}/cat/mine.yaml: spec.topics.0.prority: unknown key, did you mean 'priority'?"
+
+
+def test_a_folder_of_manifests_is_served(programs: Any, manifest: Any, tmp_path: Path) -> None:
+    (tmp_path / "cat").mkdir()
+    (tmp_path / "cat/mine.yaml").write_text(yaml.safe_dump(manifest("mine")))
+    with programs("--catalog", str(tmp_path / "cat")).start() as client:
+        assert client.get_service("mine").metadata.name == "mine"
+
+
+def test_a_state_folder_that_is_a_file_and_secrets_for_all_and_a_broken_database(programs: Any) -> None:
+    blocked = programs(name="file")
+    blocked.folder.write_text("")
+    status, line = blocked.fails()
+    assert (status, line) == (1, f"error: cannot make {blocked.folder}: File exists; give another --state-dir")
+
+    open_to_all = programs(name="open")
+    open_to_all.folder.mkdir()
+    (open_to_all.folder / "secret.key").write_bytes(b"x" * 32)
+    (open_to_all.folder / "secret.key").chmod(0o644)
+    key = open_to_all.folder / "secret.key"
+    assert open_to_all.fails() == (1, f"error: {key} can be read by others: chmod 600 {key}")
+
+    broken = programs(name="broken")
+    broken.folder.mkdir()
+    (broken.folder / "state.db").write_bytes(b"no database" * 100)
+    assert broken.fails() == (1, "error: the database cannot be used: file is not a database")
