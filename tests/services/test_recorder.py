@@ -4,16 +4,13 @@ import resource
 import runpy
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 
 import skytether_services.recorder
 from skytether.api.manifest import Manifest
@@ -45,12 +42,12 @@ def read(path: Path) -> list[tuple[Any, Any, Any]]:
 
 
 def survivors(path: Path) -> list[int]:
-    """Sequence numbers in a file that has no end, read from the front as `mcap recover` does."""
-    found: list[int] = []
-    with path.open("rb") as stream, suppress(EndOfFile):
-        for record in StreamReader(stream).records:
-            if isinstance(record, Message):
-                found.append(record.sequence)  # noqa: PERF401  # extend would lose all when the file ends early
+    """Sequence numbers in a file that nobody closed, as both readers find them, which refuse a file without its end."""
+    from rosbags.highlevel import AnyReader
+
+    found = [message.sequence for _, _, message in read(path)]
+    with AnyReader([path]) as reader:
+        assert sum(1 for _ in reader.messages()) == len(found)
     return found
 
 
@@ -180,6 +177,23 @@ def test_a_killed_recorder_loses_at_most_the_last_flush_period(tmp_path: Path) -
     assert len(read(only_file(tmp_path))) == 65
 
 
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_a_recorder_killed_between_two_flushes_leaves_whole_files_too(tmp_path: Path, compression: str) -> None:
+    harness = recorder(tmp_path, compression=compression, chunk_size=0.001, flush_period=60)
+    offer(harness, value="cdr std_msgs/msg/Float64")
+    kept = 0
+    for number in range(50):
+        harness.send("value", Float64(number))
+        harness.step()
+        found = survivors(only_file(tmp_path))
+        assert found == list(range(len(found)))
+        assert kept <= len(found) <= number + 1
+        kept = len(found)
+    assert kept > 10
+    harness.stop()
+    assert len(read(only_file(tmp_path))) == 50
+
+
 def test_files_roll_over_at_their_size_and_lose_nothing(tmp_path: Path) -> None:
     harness = recorder(tmp_path, compression="none", max_size=0.05, flush_period=0.05)
     offer(harness, value="cdr std_msgs/msg/Float64")
@@ -242,6 +256,29 @@ def test_a_full_disk_ends_the_recording_with_one_sentence_and_the_service_stays_
     survived = survivors(only_file(tmp_path))
     assert survived == list(range(len(survived)))
     assert len(survived) >= 40
+
+
+def test_a_disk_full_at_the_end_costs_the_index_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    harness = recorder(tmp_path, flush_period=0.05)
+    offer(harness, value="cdr std_msgs/msg/Float64")
+    for number in range(5):
+        harness.send("value", Float64(number))
+        harness.step()
+    with disk_of(only_file(tmp_path).stat().st_size):
+        harness.stop()
+    assert "cannot write the recording" in caplog.text
+    assert survivors(only_file(tmp_path)) == list(range(5))
+
+
+def test_a_disk_full_from_the_start_leaves_no_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    harness = recorder(tmp_path)
+    offer(harness, value="cdr std_msgs/msg/Float64")
+    with disk_of(10):
+        harness.send("value", Float64())
+        harness.step()
+        harness.stop()
+    assert "cannot write the recording" in caplog.text
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_data_directory_that_cannot_be_made_is_said_at_start(tmp_path: Path) -> None:

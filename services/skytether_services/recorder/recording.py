@@ -1,18 +1,23 @@
 """MCAP files: one channel for each topic, a new file when one is large enough.
 
+Each piece that is written has an end of file behind it, which the next piece overwrites: what a killed recorder leaves
+opens in every reader. Only the index is missing then, so a reader has to scan the file.
+
 Format: https://mcap.dev/spec, and https://mcap.dev/spec/registry for the names of encodings.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.writer import CompressionType, Writer
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from skytether.messages import definition_of, hash_of
 from skytether.service import RawReceived
@@ -20,6 +25,8 @@ from skytether.service import RawReceived
 _COMPRESSION = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 _PROFILE = {"cdr": "ros2", "ros1": "ros1"}
 _SCHEMA_ENCODING = {"cdr": "ros2msg", "ros1": "ros1msg"}
+_END = struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
+"""End of a file without a summary: places and checksums of 0 say that there are none."""
 
 
 class File:
@@ -42,6 +49,7 @@ class File:
         self._stream: BinaryIO = path.open("xb")
         self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
         self._channels: dict[tuple[str, str], int] = {}
+        self._ended_at = 0
         self._writer.start(profile)
         self._writer.add_metadata("skytether", metadata)
 
@@ -60,6 +68,7 @@ class File:
             sequence=message.sequence & 0xFFFFFFFF,
             data=message.payload,
         )
+        self._end_for_now()
 
     def flush(self) -> int:
         """Hand what was written to the system, so that a killed process loses nothing of it.
@@ -68,19 +77,39 @@ class File:
             Size of the file in bytes.
         """
         self._writer.flush()  # type: ignore[no-untyped-call]
+        self._end_for_now()
         return self._stream.tell()
 
     def close(self) -> None:
         """Write the summary and close; without it a reader has to scan the file."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
-        finally:
             self._stream.close()
+        except OSError:
+            self.abandon()
+            raise
 
     def abandon(self) -> None:
-        """Close without anything more to write."""
+        """Close without anything more to write; what was flushed before stays readable, a file without it goes."""
         with suppress(OSError):
             self._stream.close()
+        if not self._ended_at:
+            self.path.unlink(missing_ok=True)
+            return
+        with suppress(OSError), self.path.open("r+b") as stream:
+            stream.truncate(self._ended_at)
+            stream.seek(self._ended_at)
+            stream.write(_END)
+
+    def _end_for_now(self) -> None:
+        """If something was written to the stream, put an end of file behind it; what comes next overwrites that."""
+        end = self._stream.tell()
+        if end == self._ended_at:
+            return
+        self._stream.write(_END)
+        self._stream.flush()
+        self._stream.seek(end)
+        self._ended_at = end
 
     def _add_channel(self, message: RawReceived) -> int:
         definition = definition_of(message.type, message.encoding)
