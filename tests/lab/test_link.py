@@ -89,6 +89,20 @@ def test_an_idle_link_takes_a_packet_larger_than_its_queue():
     assert model.decide(100, 1.0) == ()
 
 
+def test_a_full_queue_empties_at_the_new_rate():
+    size = 1000 - IP_UDP_HEADERS
+    model = LinkModel(LinkConditions(rate=1e4, queue=10_000), "up")
+    assert sum(bool(model.decide(size, 0.0)) for _ in range(20)) == 10  # 0.8 s each: 8 s of queue
+    model.conditions = LinkConditions(rate=1e6, queue=10_000)
+    # 0.8 s later 9000 bytes are left: 72 ms at 1 Mbit/s, and room for one packet of 8 ms.
+    assert model.decide(size, 0.8) == (pytest.approx(0.88),)
+    assert model.decide(size, 0.8) == ()
+    model.conditions = LinkConditions()
+    assert model.decide(size, 0.81) == (0.81,)
+    model.conditions = LinkConditions(rate=1e6, queue=10_000)
+    assert model.decide(size, 0.82) == (pytest.approx(0.828),)
+
+
 def test_reordered_packets_are_held_back():
     model, times = arrivals(LinkConditions(delay=0.05, reorder=0.1, reorder_by=0.02, seed=5))
     found = Counter(round(d, 6) for d in delays(times))
@@ -120,6 +134,7 @@ def test_a_cut_link_passes_nothing_and_changes_hold_from_the_next_packet_on():
         ({"rate": 0}, "rate must be above 0"),
         ({"queue": -1}, "queue must be at least 0"),
         ({"burst": 0.5}, "burst must be at least 1"),
+        ({"burst": float("inf")}, "burst must be at least 1 packet and finite"),
         ({"loss": 0.9, "burst": 4}, "loss must be 0 to 0.8 with bursts of 4"),
         ({"jitter": float("nan")}, "jitter must be 0 to 60 s"),
     ],

@@ -6,6 +6,7 @@ The sockets around it are in `link`. A link is two `LinkModel`, one for each dir
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from math import inf
 from random import Random
 
 IP_UDP_HEADERS = 28
@@ -61,8 +62,8 @@ class LinkConditions:
         if self.queue < 0:
             raise ValueError(f"link: queue must be at least 0 bytes, not {self.queue}")
         if self.burst is not None:
-            if not self.burst >= 1:
-                raise ValueError(f"link: burst must be at least 1 packet, not {self.burst}")
+            if not 1 <= self.burst < inf:
+                raise ValueError(f"link: burst must be at least 1 packet and finite, not {self.burst}")
             most = self.burst / (1 + self.burst)
             if self.loss > most:
                 raise ValueError(
@@ -90,11 +91,6 @@ class LinkCounters:
     """Seconds that packets left after the time decided, summed: the emulator's own error."""
     late_max: float = 0.0
 
-    @property
-    def late_mean(self) -> float:
-        """The emulator's own mean error in seconds."""
-        return self.late_total / self.forwarded if self.forwarded else 0.0
-
     def copy(self) -> LinkCounters:
         """A snapshot."""
         return LinkCounters(**{f.name: getattr(self, f.name) for f in fields(self)})
@@ -104,7 +100,8 @@ class LinkModel:
     """One direction of a link: says when each packet arrives, if at all.
 
     Attributes:
-        conditions: May be replaced at any time, from any thread; holds from the next packet on.
+        conditions: May be replaced at any time, from any thread; holds from the next packet on. Packets that wait in
+            front of a rate limit keep the times decided for them.
         counters: What was decided.
     """
 
@@ -115,8 +112,8 @@ class LinkModel:
         self._applied: LinkConditions | None = None
         self._random = Random()
         self._in_burst = False
-        self._queue_free_at = float("-inf")
-        self._last_arrival = float("-inf")
+        self._queue_free_at = -inf
+        self._last_arrival = -inf
 
     def decide(self, size: int, now: float) -> tuple[float, ...]:
         """When a packet that enters the link now leaves it.
@@ -130,7 +127,7 @@ class LinkModel:
         """
         conditions = self.conditions
         if conditions is not self._applied:
-            self._apply(conditions)
+            self._apply(conditions, now)
         counters = self.counters
         counters.received += 1
         if conditions.cut:
@@ -154,7 +151,12 @@ class LinkModel:
             return arrival, self._arrival(leaves, conditions)
         return (arrival,)
 
-    def _apply(self, conditions: LinkConditions) -> None:
+    def _apply(self, conditions: LinkConditions, now: float) -> None:
+        before = self._applied.rate if self._applied is not None else None
+        # What waits in the queue waits on, but is sent at the new rate; a link without a limit has no queue.
+        if before is not None:
+            waiting = max(self._queue_free_at - now, 0.0) * before
+            self._queue_free_at = now + (waiting / conditions.rate if conditions.rate is not None else 0.0)
         if self._applied is None or self._applied.seed != conditions.seed:
             # The direction is part of the seed, or both directions would lose the same packets.
             self._random = Random(f"{conditions.seed} {self._direction}")
