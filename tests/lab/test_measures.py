@@ -53,6 +53,12 @@ def test_standing_still_does_not_weigh_in_the_tracking_error() -> None:
     assert measure(waiting, STRAIGHT).time_s == pytest.approx(measure(moving, STRAIGHT).time_s + 10)
 
 
+def test_standing_still_does_not_weigh_after_a_long_stride_between_two_samples() -> None:
+    strides = [Sample(i, 0.2 * i, 0.1 * (i % 2), Source.CLOUD) for i in range(12)]
+    waiting = [Sample(11 + i, 2.2, 0.1, Source.STOP) for i in range(1, 200)]
+    assert measure([*strides, *waiting], STRAIGHT).kte_m == pytest.approx(measure(strides, STRAIGHT).kte_m)
+
+
 def test_seconds_of_each_source() -> None:
     samples = [s._replace(source=Source.FALLBACK if 1 <= s.x < 2 else Source.CLOUD) for s in walk((0, 0), (4, 0))]
     seconds = measure(samples, STRAIGHT).source_s

@@ -3,9 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from skytether.control.admittance import Velocity
 from skytether.lab.person import Person, PersonParams
 from skytether.lab.trail import ORIGIN, Pose, Trail
-from skytether.lab.walker import Arms, Velocity
+from skytether.lab.walker import Arms
 
 DT = 0.01
 D = 0.5

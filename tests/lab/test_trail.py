@@ -49,3 +49,19 @@ def test_progress_never_goes_back_and_never_skips() -> None:
 def test_refuses_what_is_no_segment(segment: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="a segment is"):
         Trail([segment])
+
+
+@pytest.mark.parametrize(
+    "segments",
+    [
+        [],
+        [{"length": 0.0}],
+        [{"length": -1.0}],
+        [{"length": math.nan}],
+        [{"length": math.inf}],
+        [{"radius": 1, "angle": 0}],
+    ],
+)
+def test_refuses_what_has_no_length(segments: list[dict[str, float]]) -> None:
+    with pytest.raises(ValueError, match=r"trail: (a segment must be longer than 0 m|it needs at least one segment)"):
+        Trail(segments)

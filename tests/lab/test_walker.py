@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from skytether.lab.walker import STANDSTILL, Arms, Velocity, Walker, WalkerParams
+from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.lab.walker import Arms, Walker, WalkerParams
 
 DT = 0.01
 RELAXED = Arms(0.0, 0.0)

@@ -82,6 +82,7 @@ class Judge:
         self._errors: list[float] = []
         self._source_s = dict.fromkeys(Source, 0.0)
         self._distance = 0.0
+        self._next_error_at = 0.0
         self._began = 0.0
         self._last: Sample | None = None
 
@@ -106,8 +107,9 @@ class Judge:
             self._distance += math.hypot(sample.x - self._last.x, sample.y - self._last.y)
         self._last = sample
         self._progress.update(sample.x, sample.y)
-        if self._distance >= len(self._errors) * _SPACING:
+        if self._distance >= self._next_error_at:
             self._errors.append(self._progress.offset)
+            self._next_error_at = (self._distance // _SPACING + 1) * _SPACING
 
     def result(self) -> Measures:
         """The measures so far.

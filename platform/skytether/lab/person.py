@@ -18,8 +18,10 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from skytether.control.admittance import STANDSTILL, Velocity
+
 from .trail import Pose, Progress, Trail
-from .walker import STANDSTILL, Arms, Velocity
+from .walker import Arms
 
 T = TypeVar("T")
 V = TypeVar("V", float, "np.typing.NDArray[np.float64]")

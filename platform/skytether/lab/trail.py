@@ -54,7 +54,9 @@ class Trail:
     """A polyline along the segments; it starts at the origin with heading 0."""
 
     def __init__(self, segments: Segments = THESIS_TRAIL) -> None:
-        """Raises ValueError for a segment that is neither a straight line nor an arc."""
+        """Raises ValueError for no segments, and for one that is neither a straight line nor an arc of some length."""
+        if not segments:
+            raise ValueError("trail: it needs at least one segment")
         headings, steps = [], []
         heading = 0.0
         for segment in segments:
@@ -119,7 +121,11 @@ class Progress:
 
 def _length_and_turn(segment: Mapping[str, float]) -> tuple[float, float]:
     if set(segment) == {"length"}:
-        return segment["length"], 0.0
-    if set(segment) == {"radius", "angle"}:
-        return segment["radius"] * abs(segment["angle"]), segment["angle"]
-    raise ValueError(f"trail: a segment is {{length}} or {{radius, angle}}, not {dict(segment)}")
+        length, turn = segment["length"], 0.0
+    elif set(segment) == {"radius", "angle"}:
+        length, turn = segment["radius"] * abs(segment["angle"]), segment["angle"]
+    else:
+        raise ValueError(f"trail: a segment is {{length}} or {{radius, angle}}, not {dict(segment)}")
+    if not 0 < length < math.inf:
+        raise ValueError(f"trail: a segment must be longer than 0 m, not {dict(segment)}")
+    return length, turn

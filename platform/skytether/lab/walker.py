@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.control.admittance import STANDSTILL, Velocity
+
 from .trail import ORIGIN, Pose
 
 
@@ -43,16 +45,6 @@ class WalkerParams:
     slip: float = 0.0003
     force_noise: float = 0.8
     force_step: float = 0.05
-
-
-class Velocity(NamedTuple):
-    """Forward [m/s] and about the vertical axis [rad/s], positive to the left."""
-
-    linear: float
-    angular: float
-
-
-STANDSTILL = Velocity(0.0, 0.0)
 
 
 class Arms(NamedTuple):

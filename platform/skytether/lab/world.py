@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from skytether.control.admittance import Velocity
 from skytether.messages import (
     Header,
     JointState,
@@ -25,7 +26,7 @@ from skytether.messages import Pose as PoseMessage
 
 from .person import Person, PersonParams
 from .trail import Pose, Trail
-from .walker import Arms, Velocity, Walker, WalkerParams
+from .walker import Arms, Walker, WalkerParams
 
 STEP = 0.01
 """Sampling time of the walker's electronics, s (thesis section 2.4)."""
