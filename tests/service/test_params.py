@@ -76,6 +76,28 @@ def test_wrong_ones_are_named_with_what_is_allowed(given: Any, sentence: str) ->
     assert caught.value.status == 2
 
 
+@dataclass(frozen=True)
+class Range:
+    low: float = param(0.0, doc="Lower end.")
+    high: float = param(1.0, doc="Upper end.")
+
+    def __post_init__(self) -> None:
+        if self.low > self.high:
+            raise ValueError(f"low must not be above high, {self.low} is above {self.high}")
+
+
+@dataclass(frozen=True)
+class Ranges:
+    speeds: tuple[Range, ...] = param((), doc="Of the walker.")
+
+
+def test_what_the_dataclass_itself_refuses_is_said_in_its_words() -> None:
+    with pytest.raises(ConfigError, match=r"^parameters: low must not be above high, 2.0 is above 1.0$"):
+        read_params(Range, {"low": 2.0})
+    with pytest.raises(ConfigError, match=r"^parameter 'speeds.0': low must not be above high, 2.0 is above 1.0$"):
+        read_params(Ranges, {"speeds": [{"low": 2.0, "high": 1.0}]})
+
+
 def test_an_empty_list_is_too_short() -> None:
     with pytest.raises(ConfigError, match=r"parameter 'trail'.*at least 1 item"):
         read_params(Params, {"trail": []})

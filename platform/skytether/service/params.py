@@ -68,7 +68,8 @@ def read_params(cls: type[T], given: Mapping[str, Any]) -> T:
     """Check what was given against the dataclass ``cls``, and make one.
 
     Raises:
-        ConfigError: Names each key that is unknown, missing or wrong, and what is allowed.
+        ConfigError: Names each key that is unknown, missing or wrong, and what is allowed; or says what the
+            ``ValueError`` says that ``cls`` raises in its ``__post_init__``.
     """
     try:
         model = _model(cls).model_validate_json(json.dumps({"params": given}))
@@ -114,6 +115,8 @@ def _plain(schema: dict[str, Any]) -> dict[str, Any]:
 
 def _sentence(cls: type[Any], problem: dict[str, Any]) -> str:
     key = ".".join(str(part) for part in problem["loc"][1:])
+    if problem["type"] == "value_error":  # raised by the dataclass's own __post_init__
+        return f"parameter '{key}': {problem['ctx']['error']}" if key else f"parameters: {problem['ctx']['error']}"
     if not key:
         return f"parameters must be a mapping, not {problem['input']!r}"
     match problem["type"]:
