@@ -34,7 +34,7 @@ def preview_distance(*, torque_gain: float, sensor_distance: float, angular_damp
 
 def lateral_error(path: Path, pose: Pose, s: float) -> float:
     """Distance from the trail's point at arc length s, across its tangent [m]; positive to the left of the trail."""
-    point = path.at(s).pose
+    point = path.at(s)
     return -math.sin(point.heading) * (pose.x - point.x) + math.cos(point.heading) * (pose.y - point.y)
 
 
@@ -48,5 +48,5 @@ def orientation_error(path: Path, pose: Pose, s: float, *, lateral_gain: float, 
         lateral_gain: k, of the lateral error [1/m].
         preview: How far ahead the tangent is taken [m].
     """
-    tangent = path.at(s + preview).pose.heading
+    tangent = path.at(s + preview).heading
     return wrap(tangent - math.atan(lateral_gain * lateral_error(path, pose, s)) - pose.heading)

@@ -19,11 +19,8 @@ class Pose(NamedTuple):
 ORIGIN = Pose(0.0, 0.0, 0.0)
 
 
-class PathPoint(NamedTuple):
-    """A point of the trail: where it is, its tangent's heading [rad] and its curvature [1/m], positive to the left."""
-
-    pose: Pose
-    curvature: float
+_ROUND = math.tau * (1 + 1e-9)
+"""Largest turn of one arc [rad]: a full circle, and what rounding of its radius adds."""
 
 
 def wrap(angle: float) -> float:
@@ -100,21 +97,21 @@ class Path:
         for number, (length, curvature) in enumerate(pieces, 1):
             if not 0 < length < math.inf:
                 raise ValueError(f"trail: segment {number} must be longer than 0 m, not {length}")
-            if abs(length * curvature) > math.tau:
+            if abs(length * curvature) > _ROUND:
                 raise ValueError(f"trail: segment {number} is more than a full circle")
             self._pieces.append(Piece(start, self.length, length, curvature))
             start = self._pieces[-1].at(length)
             self.length += length
 
-    def at(self, s: float) -> PathPoint:
-        """The point at arc length s; outside the trail, on the straight continuation of its ends."""
+    def at(self, s: float) -> Pose:
+        """Point and tangent at arc length s; outside the trail, on the straight continuation of its ends."""
         if s < 0:
-            return PathPoint(advance(self._pieces[0].start, s, 0.0), 0.0)
+            return advance(self._pieces[0].start, s, 0.0)
         for piece in self._pieces:
             if s < piece.begin + piece.length:
-                return PathPoint(piece.at(s - piece.begin), piece.curvature)
+                return piece.at(s - piece.begin)
         last = self._pieces[-1]
-        return PathPoint(advance(last.at(last.length), s - self.length, 0.0), 0.0)
+        return advance(last.at(last.length), s - self.length, 0.0)
 
     def closest(self, x: float, y: float, low: float = 0.0, high: float = math.inf) -> float:
         """Arc length of the point nearest to (x, y) among those from ``low`` to ``high``.
