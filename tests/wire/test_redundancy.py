@@ -35,6 +35,7 @@ def test_the_policy_keeps_to_the_limits_of_its_configuration():
     policy = FixedRedundancy(Config(assumed_loss=0.4, max_copies=3, max_parity=0.25))
     assert policy(1, 1, 0.99999) == 2
     assert policy(40, 1, 0.99999) == 10
+    assert policy(2, 1, 0.99999) == 2  # not fewer than a single packet has
     assert FixedRedundancy(Config(assumed_loss=0.8, max_parity=9))(100, 2, 0.9999) == 156
 
 

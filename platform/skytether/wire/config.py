@@ -46,8 +46,8 @@ class Config:
     """Share of packets that redundancy is sized for (rule 5)."""
     max_copies: int = 5
     """Most packets that carry the same one-shard message."""
-    max_parity: float = 0.5
-    """Most parity shards per data shard."""
+    max_parity: float = 1.0
+    """Most parity shards per data shard; messages of few shards may have ``max_copies - 1`` in any case."""
     copy_spacing: float = 0.002
     """Time between copies of a one-shard message: longer than most bursts of loss, shorter than a control period."""
 

@@ -29,7 +29,7 @@ Key = tuple[bytes, int]
 
 
 class _Block:
-    __slots__ = ("count", "k", "rows", "seen", "singles")
+    __slots__ = ("count", "data", "k", "rows", "seen", "singles")
 
     def __init__(self, k: int) -> None:
         self.k = k
@@ -39,10 +39,12 @@ class _Block:
         """Indices and shards that came in batches."""
         self.singles: dict[int, bytes] = {}
         """Shards that came alone, by index."""
+        self.data: Bytes | None = None
+        """All data shards, once there are enough shards; it takes no more then."""
 
     def add(self, index: int, shard: memoryview | bytes) -> int:
         """Returns how many shards were new."""
-        if self.seen[index]:
+        if self.seen[index] or self.data is not None:
             return 0
         self.seen[index] = 1
         self.singles[index] = bytes(shard)
@@ -50,6 +52,8 @@ class _Block:
         return 1
 
     def add_rows(self, indices: Bytes, shards: Bytes) -> int:
+        if self.data is not None:
+            return 0
         seen = np.frombuffer(self.seen, np.uint8)
         if seen[indices].any() or not (indices[1:] > indices[:-1]).all():  # repeated or reordered: one by one
             return sum(self.add(int(index), shard.tobytes()) for index, shard in zip(indices, shards, strict=True))
@@ -58,8 +62,9 @@ class _Block:
         self.count += len(indices)
         return len(indices)
 
-    def write(self, out: Bytes) -> None:
-        """Fill ``out`` (k shards) from at least k shards."""
+    def finish(self, size: int) -> None:
+        """Make the data shards from what there is, at least k shards."""
+        out = self.data = np.empty((self.k, size), np.uint8)
         rows = self.rows
         if self.singles:
             shards = np.frombuffer(b"".join(self.singles.values()), np.uint8).reshape(len(self.singles), -1)
@@ -81,6 +86,7 @@ class _Block:
             decoded = decode(tuple(sources), tuple(numbers))
             for i in missing:
                 out[i] = np.frombuffer(decoded[i], np.uint8)
+        self.rows, self.singles = [], {}
 
 
 class Entry:
@@ -101,12 +107,9 @@ class Entry:
 
     def assemble(self) -> memoryview:
         """The sealed message."""
-        shape = self.shape
-        out = np.empty((shape.shards, shape.size), np.uint8)
-        for number, block in self.blocks.items():
-            start = shape.block_start(number)
-            block.write(out[start : start + block.k])
-        return out.reshape(-1).data[: shape.length]
+        parts = [block.data for _, block in sorted(self.blocks.items()) if block.data is not None]
+        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return whole.reshape(-1).data[: self.shape.length]
 
 
 class Reassembly:
@@ -197,6 +200,8 @@ class Reassembly:
 
     def _added(self, entry: Entry, block: _Block, before: int, new: int) -> memoryview | None:
         if before < block.k <= block.count:
+            # Block by block, so that the last shard of a large message does not have to wait for all of them.
+            block.finish(entry.shape.size)
             entry.missing -= 1
             if entry.missing == 0:
                 self._forget(entry)

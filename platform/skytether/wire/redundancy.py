@@ -59,5 +59,5 @@ class FixedRedundancy:
         config = self._config
         if k == 1 and blocks == 1:
             return plan(1, delivery, config.assumed_loss, config.max_copies - 1)
-        limit = min(int(k * config.max_parity + 0.5), MAX_SHARDS - k)
+        limit = min(max(int(k * config.max_parity + 0.5), config.max_copies - 1), MAX_SHARDS - k)
         return plan(k, delivery ** (1 / blocks), config.assumed_loss, limit)
