@@ -338,3 +338,9 @@ def test_a_state_folder_that_is_a_file_and_secrets_for_all_and_a_broken_database
     broken.folder.mkdir()
     (broken.folder / "state.db").write_bytes(b"no database" * 100)
     assert broken.fails() == (1, "error: the database cannot be used: file is not a database")
+
+
+def test_a_database_address_that_is_none_is_one_sentence(programs: Any) -> None:
+    status, line = programs("--database", "nosuch://x").fails()
+    assert status == 2
+    assert line.startswith("error: the database address cannot be used: ")

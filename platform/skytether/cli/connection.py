@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skytether.orchestrator.settings import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
+
 from .output import fail
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
 
-_STATE_DIR = Path("~/.local/state/skytether")
-_DEFAULT_URL = "http://127.0.0.1:8600"
 
 Url = Annotated[
     str | None,
@@ -55,16 +55,16 @@ def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
 
 def _local_url() -> str:
     try:
-        return (_STATE_DIR.expanduser() / "address").read_text().strip()
+        return (default_state_dir() / "address").read_text().strip()
     except OSError:
-        return _DEFAULT_URL
+        return f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 
 
 def _token(given: Path | None) -> str:
     """A file named on the command line goes before the environment, and that before this machine's."""
     if given is None and os.environ.get("SKYTETHER_TOKEN"):
         return os.environ["SKYTETHER_TOKEN"].strip()
-    path = given or _STATE_DIR.expanduser() / "operator.token"
+    path = given or default_state_dir() / "operator.token"
     try:
         return path.read_text(encoding="ascii").strip()
     except FileNotFoundError:

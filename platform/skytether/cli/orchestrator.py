@@ -44,13 +44,13 @@ def run(
 
     from skytether.orchestrator.server import StartError
     from skytether.orchestrator.server import run as serve
-    from skytether.orchestrator.settings import DEFAULT_STATE_DIR, Settings
+    from skytether.orchestrator.settings import Settings, default_state_dir
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     for chatty in ("alembic", "uvicorn"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     settings = Settings(
-        state_dir=(state_dir or DEFAULT_STATE_DIR).absolute(),
+        state_dir=(state_dir or default_state_dir()).absolute(),
         host=host,
         port=port,
         database_url=database,
@@ -62,3 +62,5 @@ def run(
         serve(settings)
     except StartError as error:
         fail(str(error), 2 if error.usage else 1)
+    except KeyboardInterrupt:  # before there was anything to end
+        raise typer.Exit(130) from None

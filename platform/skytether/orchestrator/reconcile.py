@@ -127,6 +127,7 @@ class Reconciler:
             if str(error) != site.failure:
                 log.warning("site %s: %s", site.name, error)
             site.failure = str(error)
+            site.capacity = None  # it may come back as another machine
             return self._timing.place
         site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
         strangers = observed.keys() - {record.id for record in live}

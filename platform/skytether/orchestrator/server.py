@@ -54,6 +54,9 @@ def run(settings: Settings) -> None:
             core = Orchestrator(settings)
         except SecretFileError as error:
             raise StartError(str(error)) from error
+        except (SQLAlchemyError, ImportError) as error:
+            text = str(error).splitlines()[0]
+            raise StartError(f"the database address cannot be used: {text}", usage=True) from error
         _serve(core, listener)
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8600
-DEFAULT_STATE_DIR = Path("~/.local/state/skytether").expanduser()
+
+
+def default_state_dir() -> Path:
+    """Where a person's orchestrator keeps its state, by the XDG base directory specification."""
+    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "skytether"
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Limits:
 class Settings:
     """One orchestrator."""
 
-    state_dir: Path = DEFAULT_STATE_DIR
+    state_dir: Path
     """Database, tokens, secret key, instances' folders. Mode 0700."""
     host: str = DEFAULT_HOST
     """Address to listen on. Loopback, because there is no TLS unless a proxy in front brings it."""

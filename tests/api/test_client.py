@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+
+from skytether.api.client import ApiError, Client, NotRunning, Unreachable
+from skytether.api.rest import InstanceCreate, Renew, RobotCreate, State
+
+Answer = tuple[int, str, bytes]
+"""Status, content type, body."""
+NOW = "2026-01-01T00:00:00Z"
+INSTANCE = {
+    "id": "i1",
+    "robot": "walker",
+    "service": "toy",
+    "state": "running",
+    "created_at": NOW,
+    "updated_at": NOW,
+    "lease_expires_at": NOW,
+}
+
+
+class Script:
+    """A server that answers what the test says, and remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.answers: dict[tuple[str, str], Answer] = {}
+        self.asked: list[tuple[str, str, dict[str, str], Any]] = []
+        self.url = ""
+
+    def says(self, method: str, path: str, document: Any, status: int = 200) -> None:
+        self.answers[method, path] = (status, "application/json", json.dumps(document).encode())
+
+
+@pytest.fixture
+def script() -> Iterator[Script]:
+    script = Script()
+
+    class Handler(BaseHTTPRequestHandler):
+        def handle_any(self) -> None:
+            body = self.rfile.read(int(self.headers.get("content-length", 0)))
+            headers = {k.lower(): v for k, v in self.headers.items()}
+            script.asked.append((self.command, self.path, headers, json.loads(body) if body else None))
+            status, kind, content = script.answers[self.command, self.path]
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            if status != 204:
+                self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        do_GET = do_POST = do_PUT = do_DELETE = handle_any  # noqa: N815
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    script.url = f"http://127.0.0.1:{server.server_address[1]}"
+    yield script
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def client(script: Script) -> Iterator[Client]:
+    with Client(script.url + "/", "sky-token") as client:
+        yield client
+
+
+def test_requests_carry_token_body_and_idempotency_key(script: Script, client: Client) -> None:
+    script.says("POST", "/api/v1/instances", INSTANCE, 201)
+    made = client.create_instance(InstanceCreate(robot="walker", service="toy", params={"a": 1}), idempotency_key="k")
+    assert made.state is State.RUNNING
+    _, _, headers, body = script.asked[0]
+    assert headers["authorization"] == "Bearer sky-token"
+    assert headers["idempotency-key"] == "k"
+    assert body["params"] == {"a": 1}
+    client.create_instance(InstanceCreate(robot="walker", service="toy"))
+    client.create_instance(InstanceCreate(robot="walker", service="toy"))
+    keys = [headers["idempotency-key"] for _, _, headers, _ in script.asked]
+    assert len(set(keys)) == 3, "a key of its own for each request that brings none"
+
+
+def test_small_verbs(script: Script, client: Client) -> None:
+    script.says("GET", "/api/v1/instances", [INSTANCE])
+    script.says("GET", "/api/v1/instances/i1", INSTANCE)
+    script.says("POST", "/api/v1/instances/i1/renew", INSTANCE)
+    script.answers["DELETE", "/api/v1/instances/i1"] = (204, "text/plain", b"")
+    script.answers["GET", "/api/v1/sites/lab/probe"] = (204, "text/plain", b"")
+    script.answers["GET", "/api/v1/instances/i1/logs?tail=7"] = (200, "text/plain", "grün\n".encode())
+    assert [i.id for i in client.instances()] == ["i1"]
+    assert client.get_instance("i1").robot == "walker"
+    client.renew_instance("i1", Renew(lease_s=3))
+    assert script.asked[-1][3]["lease_s"] == 3
+    client.renew_instance("i1")
+    client.delete_instance("i1")
+    assert 0 < client.probe("lab") < 5
+    assert client.logs("i1", tail=7) == "grün\n"
+
+
+def test_a_problem_is_an_error_with_its_sentence(script: Script, client: Client) -> None:
+    problem = {"title": "Not found", "status": 404, "detail": "there is no instance 'i1'"}
+    script.answers["GET", "/api/v1/instances/i1"] = (404, "application/problem+json", json.dumps(problem).encode())
+    with pytest.raises(ApiError) as caught:
+        client.get_instance("i1")
+    assert str(caught.value) == "there is no instance 'i1'"
+    assert caught.value.problem.status == 404
+
+
+@pytest.mark.parametrize(
+    ("status", "content", "sentence"),
+    [
+        (502, b"<html>", "the answer was HTTP 502: is this the address of an orchestrator?"),
+        (302, b"", "the answer was HTTP 302: is this the address of an orchestrator?"),
+        (200, b"<html>", "the orchestrator's answer is not understood: has it another version? (no JSON)"),
+        (200, b'{"id": 1}', "the orchestrator's answer is not understood: has it another version?"),
+    ],
+)
+def test_an_answer_of_something_else_is_one_sentence(
+    script: Script, client: Client, status: int, content: bytes, sentence: str
+) -> None:
+    script.answers["GET", "/api/v1/instances/i1"] = (status, "text/html", content)
+    with pytest.raises(ApiError) as caught:
+        client.get_instance("i1")
+    assert str(caught.value).startswith(sentence)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_that_is_none(script: Script, client: Client) -> None:
+    script.says("GET", "/api/v1/instances", {"not": "a list"})
+    with pytest.raises(ApiError, match="is not understood"):
+        client.instances()
+
+
+CALLS: list[Callable[[Client], Any]] = [
+    lambda c: c.instances(),
+    lambda c: c.create_instance(InstanceCreate(robot="r", service="s")),
+    lambda c: list(c.watch("i1")),
+    lambda c: c.wait_running("i1", timeout=1),
+    lambda c: c.create_robot(RobotCreate(name="r")),
+    lambda c: c.metrics(),
+]
+
+
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("url", ["http://127.0.0.1:1", "http://no-such-host.invalid", "127.0.0.1:8600", "ftp://x"])
+def test_nobody_there_is_one_sentence_that_says_what_to_do(call: Callable[[Client], Any], url: str) -> None:
+    with Client(url) as client, pytest.raises(Unreachable) as caught:
+        call(client)
+    assert str(caught.value) == (
+        f"no orchestrator answers at {url}: start one with `skytether orchestrator run`, or give its address with --url"
+    )
+
+
+@pytest.mark.parametrize("token", ["line\nbreak", "grün", "\0"])
+def test_what_cannot_be_a_token_is_refused(token: str) -> None:
+    with pytest.raises(ApiError, match="what was given as token is none"):
+        Client("http://127.0.0.1:1", token)
+
+
+def events(*states: str) -> bytes:
+    lines = []
+    for number, state in enumerate(states, 1):
+        data = {"id": number, "instance": "i1", "at": NOW, "state": state, "reason": f"r{number}"}
+        lines.append(f"event: state\ndata: {json.dumps(data)}\nid: {number}\n\n")
+    return (": ping\n\n" + "".join(lines)).encode()
+
+
+def test_events_are_read_and_resumed(script: Script, client: Client) -> None:
+    path = "/api/v1/instances/i1/events"
+    script.answers["GET", path] = (200, "text/event-stream", events("pending", "running", "stopped"))
+    seen = list(client.watch("i1", after=5))
+    assert [(e.id, e.state) for e in seen] == [(1, "pending"), (2, "running"), (3, "stopped")]
+    assert script.asked[0][2]["last-event-id"] == "5"
+
+
+def test_watching_what_is_not_there(script: Script, client: Client) -> None:
+    problem = {"title": "Not found", "status": 404, "detail": "there is no instance 'i1'"}
+    script.says("GET", "/api/v1/instances/i1/events", problem, 404)
+    with pytest.raises(ApiError, match="there is no instance 'i1'"):
+        list(client.watch("i1"))
+
+
+def test_waiting_gives_the_running_instance_or_says_why_not(script: Script, client: Client) -> None:
+    path = "/api/v1/instances/i1/events"
+    script.says("GET", "/api/v1/instances/i1", INSTANCE)
+    script.answers["GET", path] = (200, "text/event-stream", events("pending", "running"))
+    assert client.wait_running("i1", timeout=5).id == "i1"
+    script.answers["GET", path] = (200, "text/event-stream", events("pending", "failed"))
+    with pytest.raises(NotRunning, match=r"^instance i1 is failed: r2$"):
+        client.wait_running("i1", timeout=5)
+
+
+def test_no_secret_shows(client: Client) -> None:
+    assert "sky-token" not in repr(client) + repr(vars(client))

@@ -1,0 +1,154 @@
+"""The small verbs, against a real orchestrator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from skytether.cli.main import app
+from skytether.lab.embedded import EmbeddedOrchestrator
+
+MANIFEST = {
+    "apiVersion": "skytether.io/v1",
+    "kind": "Service",
+    "metadata": {"name": "toy"},
+    "spec": {
+        "entrypoint": "skytether.testing.toy_service",
+        "params": {"properties": {"say": {"type": "string"}, "exit_status": {"type": "integer"}}},
+    },
+}
+Run = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def orchestrator() -> Iterator[EmbeddedOrchestrator]:
+    with EmbeddedOrchestrator() as orchestrator:
+        yield orchestrator
+
+
+@pytest.fixture
+def run(orchestrator: EmbeddedOrchestrator, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a command line against it, as an operator whose environment names it."""
+    monkeypatch.setenv("SKYTETHER_URL", orchestrator.url)
+    monkeypatch.setenv("SKYTETHER_TOKEN", orchestrator.operator_token)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    return lambda *arguments: CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+
+
+def good(result: Result) -> Any:
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def bad(result: Result, status: int = 1) -> str:
+    """The one sentence of a command that failed."""
+    assert result.exit_code == status, result.output
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    return lines[0].removeprefix("error: ")
+
+
+@pytest.mark.slow
+def test_a_service_from_file_to_log(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump(MANIFEST))
+    assert good(run("apply", "-f", str(tmp_path / "toy.yaml"), "--json"))[0]["metadata"]["name"] == "toy"
+    assert "toy" in [m["metadata"]["name"] for m in good(run("service", "list", "--json"))]
+    assert "toy" in run("service", "list").stdout
+    assert [site["name"] for site in good(run("site", "list", "--json"))] == ["local"]
+    assert "local" in run("site", "list").stdout
+
+    made = good(run("instance", "create", "toy", "--robot", "walker", "--params", '{"say": "hello [there]"}', "--json"))
+    assert made["state"] == "running"
+    assert "key" not in made["session"]
+    assert good(run("instance", "show", made["id"], "--json"))["id"] == made["id"]
+    shown = run("instance", "show", made["id"]).stdout
+    assert yaml.safe_load(shown)["service"] == "toy"
+    assert "key" not in yaml.safe_load(shown)["session"]
+    assert made["id"] in [i["id"] for i in good(run("instance", "list", "--json"))]
+    assert made["id"] in run("instance", "list").stdout
+    assert run("instance", "logs", made["id"]).stdout == "hello [there]\n"
+    assert good(run("instance", "logs", made["id"], "--json"))["lines"] == ["hello [there]"]
+    assert run("instance", "delete", made["id"]).exit_code == 0
+    assert run("instance", "delete", made["id"]).exit_code == 0
+    assert run("service", "delete", "toy").exit_code == 0
+    assert "there is no service 'toy'" in bad(run("instance", "create", "toy", "--robot", "walker"))
+
+
+@pytest.mark.slow
+def test_a_robot_gets_its_token_on_standard_output_alone(run: Run, tmp_path: Path) -> None:
+    added = run("robot", "add", "newcomer", "--service", "toy")
+    token = added.stdout.strip()
+    assert token.startswith("sky-")
+    assert token not in added.stderr
+    assert good(run("robot", "list", "--json"))[0]["services"] == ["toy"]
+    assert "newcomer" in run("robot", "list").stdout
+    assert "there is a robot 'newcomer' already" in bad(run("robot", "add", "newcomer"))
+    (tmp_path / "token").write_text(f"{token}\n")
+    assert good(run("instance", "list", "--token-file", str(tmp_path / "token"), "--json")) == []
+    assert "it needs the operator's token" in bad(run("robot", "list", "--token-file", str(tmp_path / "token")))
+    assert run("robot", "delete", "newcomer").exit_code == 0
+    assert "this token is not known here" in bad(run("site", "list", "--token-file", str(tmp_path / "token")))
+
+
+@pytest.mark.slow
+def test_a_service_that_ends_at_once_is_told(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump(MANIFEST))
+    run("apply", "-f", str(tmp_path / "toy.yaml"))
+    sentence = bad(run("instance", "create", "toy", "--robot", "r", "--params", '{"exit_status": 2, "say": "no mass"}'))
+    assert 'is failed: the service ended with exit status 2; its last line: "no mass"' in sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "status", "sentence"),
+    [
+        (yaml.safe_dump({**MANIFEST, "spce": 1}), 1, "spce: unknown key, did you mean 'spec'?"),
+        ("a: [", 2, "is no YAML"),
+        ("", 2, "holds no manifest"),
+        ("- 1", 2, "metadata.name: is missing"),
+        (None, 2, "No such file"),
+    ],
+)
+def test_a_wrong_file_is_one_sentence(run: Run, tmp_path: Path, text: str | None, status: int, sentence: str) -> None:
+    if text is not None:
+        (tmp_path / "x.yaml").write_text(text)
+    assert sentence in bad(run("apply", "-f", str(tmp_path / "x.yaml")), status)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "status", "sentence"),
+    [
+        (["instance", "show", "x"], 1, "there is no instance 'x'"),
+        (["instance", "create", "toy", "--robot", "R!"], 2, "robot: "),
+        (["instance", "create", "toy", "--robot", "r", "--params", "{"], 2, "--params is no JSON"),
+        (["instance", "create", "toy", "--robot", "r", "--params", "[]"], 2, "params: "),
+        (["robot", "add", "R!"], 2, "'R!' is no name"),
+        (["site", "list", "--token-file", "/nowhere"], 2, "there is no token file /nowhere"),
+        (
+            ["site", "list", "--url", "http://127.0.0.1:1"],
+            1,
+            "no orchestrator answers at http://127.0.0.1:1: start one",
+        ),
+    ],
+)
+def test_wrong_use_is_one_sentence(run: Run, arguments: list[str], status: int, sentence: str) -> None:
+    assert sentence in bad(run(*arguments), status)
+
+
+def test_without_any_orchestrator_it_says_how_to_start_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("SKYTETHER_URL", "SKYTETHER_TOKEN", "SKYTETHER_TOKEN_FILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    state = tmp_path / ".local/state/skytether"
+    state.mkdir(parents=True)
+    (state / "address").write_text("http://127.0.0.1:1\n")
+    assert "start one with `skytether orchestrator run`" in bad(CliRunner().invoke(app, ["site", "list"]))

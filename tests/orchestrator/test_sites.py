@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skytether.api.rest import SiteCreate
+from skytether.orchestrator import sites as module
+from skytether.orchestrator.core import Orchestrator
+from skytether.orchestrator.errors import InvalidError
+from skytether.orchestrator.runtimes.base import Runtime
+from skytether.orchestrator.runtimes.process import ProcessRuntime
+from skytether.orchestrator.settings import Settings, Timing
+from skytether.orchestrator.sites import load_runtime
+from skytether.orchestrator.store import Store
+from skytether.testing.runtimes import FakeRuntime
+
+Start = Callable[..., Orchestrator]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    started: list[Orchestrator] = []
+
+    def make(find: Any = lambda _: FakeRuntime, timing: Timing = Timing()) -> Orchestrator:  # noqa: B008
+        started.append(Orchestrator(Settings(state_dir=tmp_path, timing=timing), find_runtime=find))
+        started[-1].start()
+        return started[-1]
+
+    yield make
+    for one in started:
+        one.stop()
+
+
+def stored(folder: Path, *sites: SiteCreate) -> None:
+    store = Store(f"sqlite:///{folder}/state.db")
+    store.migrate()
+    for site in sites:
+        store.add_site(site)
+    store.close()
+
+
+def test_runtimes_are_found_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load_runtime("process") is ProcessRuntime
+    points = [
+        EntryPoint("gone", "no_such_module:X", module.RUNTIMES),
+        EntryPoint("odd", "pathlib:Path", module.RUNTIMES),
+    ]
+    monkeypatch.setattr(module, "entry_points", lambda **_: points)
+    with pytest.raises(InvalidError, match="there is no runtime 'x'; installed are: gone, odd"):
+        load_runtime("x")
+    with pytest.raises(InvalidError, match="'gone' cannot be used: No module named 'no_such_module'"):
+        load_runtime("gone")
+    with pytest.raises(InvalidError, match="entry point 'odd' is no Runtime"):
+        load_runtime("odd")
+
+
+def test_there_is_a_local_site_of_tier_edge_unless_there_is_another(start: Start, tmp_path: Path) -> None:
+    core = start()
+    assert [(s.asked.name, s.asked.tier, s.asked.runtime) for s in core.sites.all()] == [("local", "edge", "process")]
+    assert core.sites.get("local").unreachable == ""
+    core.sites.add(SiteCreate(name="mine", tier="cloud", runtime="fake"))
+    core.sites.delete("local")
+    core.stop()
+    assert [s.name for s in start().sites.all()] == ["mine"]
+
+
+def test_a_site_whose_runtime_is_gone_is_listed_with_the_reason_and_can_be_deleted(
+    start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stored(tmp_path, SiteCreate(name="old", tier="edge", runtime="dokcer"))
+    core = start(find=load_runtime)
+    site = core.sites.get("old")
+    assert site.unreachable == "runtime: there is no runtime 'dokcer'; installed are: process"
+    assert "site old cannot be used" in caplog.text
+    core.sites.delete("old")
+    assert core.sites.all() == []
+
+
+def test_a_site_that_hangs_is_unreachable_and_holds_up_no_other(start: Start, tmp_path: Path) -> None:
+    stored(
+        tmp_path, SiteCreate(name="hangs", tier="edge", runtime="h"), SiteCreate(name="works", tier="edge", runtime="w")
+    )
+
+    class HangingRuntime(FakeRuntime):
+        def observe(self) -> Any:
+            time.sleep(0.3)
+            return super().observe()
+
+    kinds: dict[str, type[Runtime]] = {"h": HangingRuntime, "w": FakeRuntime}
+    core = start(find=kinds.__getitem__, timing=Timing(observe=0.01, site_silent=0.15))
+    hangs, works = core.sites.get("hangs"), core.sites.get("works")
+    deadline = time.monotonic() + 5
+    while "it has not answered for" not in hangs.unreachable:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert works.unreachable == ""
+
+
+def test_a_reconciler_that_hangs_is_not_ready(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    core = start()
+    assert core.not_ready() == ""
+    core.placer.stop(5)
+    core.placer.last_pass -= 31
+    assert core.not_ready() == "the reconciler has made no pass for 31 s"
