@@ -28,6 +28,8 @@ class Params:
 class Recorder(Service[Params]):
     """Writes everything that the robot sends to MCAP files in the instance's data directory.
 
+    Foxglove and the `mcap` tools read them all; rosbags reads those of ROS 2 robots, it knows no ROS 1 in MCAP.
+
     When a file cannot be written (disk full), it stops recording, says so once, and stays up: ending would make the
     orchestrator start it again and again, with a useless file each time. What was flushed stays readable.
     """
