@@ -32,20 +32,20 @@ class Remote:
         return self._sent[-1] if self._sent else None  # type: ignore[return-value]
 
 
-def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 50.0) -> tuple[World, Measures]:
+def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 46.0) -> tuple[World, Measures]:
     world = World(TRAIL, seed=seed)
     samples = simulate(world, Remote(), rtt=rtt, loss=loss, duration=duration, random=np.random.default_rng(seed))
     return world, measure(samples, TRAIL)
 
 
 @pytest.mark.parametrize(
-    ("rtt", "loss", "kte"),
-    [(0.0, 0.0, 0.03), (0.1, 0.05, 0.03), (0.3, 0.0, 0.03), (0.5, 0.0, 0.03), (0.5, 0.3, 0.04)],
+    ("rtt", "loss"),
+    [(0.0, 0.0), (0.1, 0.05), (0.3, 0.0), (0.5, 0.3)],
 )
-def test_guides_along_the_trail(rtt: float, loss: float, kte: float) -> None:
+def test_guides_along_the_trail(rtt: float, loss: float) -> None:
     world, result = walk(rtt=rtt, loss=loss)
     assert result.completed
-    assert result.kte_m < kte
+    assert result.kte_m < 0.03
     assert result.deviation_max_m < 0.1
     assert 0.15 < result.mean_speed_m_s < 0.25
     # Stopped at the end and stays there, though the person may still push.
@@ -63,7 +63,7 @@ def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
             return super().step(now)
 
     world = World(TRAIL, seed=2)
-    result = measure(simulate(world, Restarting(), rtt=0.1, duration=50.0), TRAIL)
+    result = measure(simulate(world, Restarting(), rtt=0.1, duration=46.0), TRAIL)
     assert result.completed
     assert result.kte_m < 0.03
 
@@ -71,7 +71,7 @@ def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
 def test_finds_back_from_beside_the_trail() -> None:
     world = World(TRAIL, seed=3)
     world.walker.pose = world.walker.odometry = world.pose._replace(y=0.4, heading=0.3)
-    samples = simulate(world, Remote(), rtt=0.5, duration=50.0)
+    samples = simulate(world, Remote(), rtt=0.5, duration=46.0)
     late = [sample for sample in samples if sample.time > 20.0]
     assert measure(samples, TRAIL).completed
     offsets = [abs(TRAIL.locate(sample.x, sample.y).offset) for sample in late[::50]]
