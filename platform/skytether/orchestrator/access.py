@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .errors import ConflictError, ForbiddenError, NotFoundError, UnauthenticatedError
+from .errors import ConflictError, ForbiddenError, UnauthenticatedError
 from .security import PREFIX_LENGTH, Secrets, TokenHash, new_token
 from .store import RobotRow, Store
 
@@ -103,14 +103,3 @@ class Access:
         """Forget a robot: its token is worth nothing from now on. One that is gone already is no error."""
         self._store.delete_robot(name)
         self._noted.pop(name, None)
-
-    def robot(self, name: str) -> RobotRow:
-        """One robot.
-
-        Raises:
-            NotFoundError: There is none of that name.
-        """
-        for row in self._store.robots():
-            if row.name == name:
-                return row
-        raise NotFoundError(f"there is no robot '{name}'")
