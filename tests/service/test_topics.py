@@ -166,6 +166,21 @@ def test_messages_go_both_ways_in_the_robots_encoding(encoding) -> None:
     assert harness.newest("cmd_vel") == Twist(Vector3(x=0.1))
 
 
+def test_an_agreed_encoding_is_compiled_once_and_before_the_next_step_not_in_the_bridges_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    warmed: list[tuple[str, str]] = []
+    monkeypatch.setattr(
+        "skytether.service.port.warm",
+        lambda types, encoding: warmed.extend((cls.__name__, encoding) for cls in types),
+    )
+    harness = Harness(Echo, encoding="ros1")
+    assert warmed == []
+    harness.step()
+    harness.step()
+    assert sorted(warmed) == [("Float64", "ros1"), ("Twist", "ros1"), ("Twist", "ros1")]
+
+
 def test_publish_without_a_robot_is_false() -> None:
     harness = Harness(Echo)
     harness.disconnect()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import resource
 import runpy
 import sys
@@ -17,6 +18,7 @@ from skytether.api.manifest import Manifest
 from skytether.messages import Float64, Header, LaserScan, Time, definition_of, encode, type_hash
 from skytether.service import ConfigError, ServiceError, params_schema
 from skytether.testing.service import Harness
+from skytether.wire.events import MessageReceived
 from skytether.wire.topic import Direction, Topic
 from skytether_services.recorder.service import Recorder
 
@@ -113,6 +115,17 @@ def test_sequence_numbers_show_what_the_link_lost(tmp_path: Path) -> None:
     harness.step()
     harness.stop()
     assert [m.sequence for _, _, m in read(only_file(tmp_path))] == [0, 1, 3, 4]
+
+
+def test_a_robot_whose_clock_is_not_known_published_when_it_arrived(tmp_path: Path) -> None:
+    harness = recorder(tmp_path)
+    message = MessageReceived("value", b"", 2**32 + 5, 3.0, math.inf, 100.0)  # more messages than the format counts
+    harness.service.everything.put(message, "std_msgs/msg/Float64", "cdr")
+    harness.step()
+    harness.stop()
+    ((_, _, written),) = read(only_file(tmp_path))
+    assert written.publish_time == written.log_time == 1_700_000_100_000_000_000
+    assert written.sequence == 5
 
 
 def test_rosbags_reads_it(tmp_path: Path) -> None:

@@ -95,6 +95,26 @@ def test_says_nothing_when_the_wheels_fall_silent() -> None:
     assert guide.step(6.1) is None
 
 
+def test_after_a_silence_it_starts_from_standstill_with_the_new_force_alone() -> None:
+    guide = placed(Pose(1, 0, 0))
+    walk(guide, 24, 600)
+    assert guide.step(7.0) is None
+    # One step of 50 ms, the longest: (15 * 0 + 3 * 0.05) / (15 + 60 * 0.05)
+    guide.force(6, 8.0)
+    guide.wheels(Wheels(8.0, 0, 0), 8.0)
+    assert guide.step(8.0) == pytest.approx((0.15 / 18, 0))
+
+
+def test_a_stalled_machine_makes_no_leap() -> None:
+    guide = placed(Pose(1, 0, 0))
+    walk(guide, 0, 10)
+    guide.force(24, 100.0)
+    guide.wheels(Wheels(100.0, 0, 0), 100.0)
+    velocity = guide.step(100.0)  # 99.91 s after the last one, counted as 50 ms
+    assert velocity is not None
+    assert 0 < velocity.linear <= 12 * 0.05 / (15 + 60 * 0.05)
+
+
 def test_progress_goes_forward_and_a_jump_of_the_odometry_finds_the_place_anew() -> None:
     guide = placed(Pose(1, 0, 0))
     walk(guide, 24, 2)
