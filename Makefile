@@ -9,10 +9,11 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
-	$(BIN)/pytest
+	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/pytest -m slow
 
 unit: $(READY) ## the quick part, under a minute
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
 
 check: $(READY) ## style, types and layers: the same for people and CI
 	$(BIN)/ruff format --check .
