@@ -29,3 +29,13 @@ def data_dir() -> Path:
     if not Path(folder).is_dir():
         require("data", f"SKYTETHER_DATA names {folder}, which is no directory")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def netns() -> None:
+    """Network namespaces and TUN devices, for tests that need a network of their own (root on Linux)."""
+    from skytether.lab.netns import why_unavailable
+
+    trouble = why_unavailable()
+    if trouble is not None:
+        require("netns", trouble)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -36,3 +37,68 @@ def start(
     for row in rows:
         table.add_row(row.runtime, str(row.standby), f"{row.p50_s:.3f}", f"{row.p99_s:.3f}", str(row.n))
     console.print(table)
+
+
+@bench.command("bridge")
+def bridge(
+    suite: Annotated[
+        str, typer.Option(help="What to measure: table2, fig26, throughput, saturated or latency.")
+    ] = "table2",
+    condition: Annotated[
+        list[str] | None, typer.Option(help="Link of the suite table2; may be repeated. Default: all but the sweep.")
+    ] = None,
+    transport: Annotated[
+        list[str] | None, typer.Option(help="What to compare; may be repeated. Default: the suite's.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.5, max=3600, help="Length of each measurement. Default: the suite's.")
+    ] = None,
+    emulator: Annotated[
+        str, typer.Option(help="tun: IP packets between network namespaces (root); user: UDP on loopback; auto.")
+    ] = "auto",
+    congestion: Annotated[
+        str | None, typer.Option(help="TCP's congestion control. Default: bbr where the kernel has it, else cubic.")
+    ] = None,
+    camera_last: Annotated[
+        bool, typer.Option("--camera-last", help="Rank the camera below all else, not second as in the thesis.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each topic.")] = False,
+    output: Annotated[Path | None, typer.Option(help="Folder for the report, its plots and rows.json.")] = None,
+) -> None:
+    """The bridge and other transports, with the same traffic on the same bad links.
+
+    Delays are one way, from the call that sends to the call that delivers, between processes on one clock.
+    """
+    from skytether.lab.bench.bridge import BenchError, make_plan, run
+    from skytether.lab.bench.report import console_table, write_report
+
+    try:
+        plan = make_plan(
+            suite,
+            condition=condition or (),
+            transport=transport or (),
+            seconds=seconds,
+            emulator=emulator,
+            congestion=congestion,
+            camera_last=camera_last,
+        )
+    except ValueError as error:
+        fail(str(error), 2)
+    except BenchError as error:
+        fail(str(error))
+    for note in plan.notes:
+        console.print(note, style="dim", markup=False)
+    failures: list[str] = []
+    with console.status("starting ...") as line:
+        rows = list(run(plan, line.update, failures.append))
+    for sentence in failures:
+        console.print(f"not measured: {sentence}", style="yellow", markup=False)
+    if not rows:
+        fail("nothing could be measured")
+    if output is not None:
+        write_report(plan, rows, failures, output)
+        console.print(f"report: {output / 'report.md'}", markup=False)
+    if json:
+        print_json([row.document() for row in rows])
+        return
+    console.print(console_table(rows, plan.title))

@@ -116,7 +116,7 @@ class LinkEmulator:
         self.close()
 
     def _run(self) -> None:
-        _wake_on_time()
+        keep_time()
         while not self._closing:
             wait = max(0.0, self._under_way[0][0] - time.monotonic()) if self._under_way else None
             # select, not epoll: its time-out has microseconds, epoll's is rounded up to milliseconds.
@@ -198,7 +198,7 @@ def _open(bind: tuple[str, int]) -> socket.socket:
     return sock
 
 
-def _wake_on_time() -> None:
+def keep_time() -> None:
     """Ask Linux not to delay this thread's timers by its usual 50 microseconds (prctl(2))."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)

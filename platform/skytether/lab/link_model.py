@@ -76,6 +76,8 @@ class LinkCounters:
     """What one direction of a link did, in packets unless said otherwise."""
 
     received: int = 0
+    bytes_received: int = 0
+    """As counted by the caller of `LinkModel.decide`."""
     forwarded: int = 0
     """Copies included."""
     bytes_forwarded: int = 0
@@ -130,6 +132,7 @@ class LinkModel:
             self._apply(conditions, now)
         counters = self.counters
         counters.received += 1
+        counters.bytes_received += size
         if conditions.cut:
             counters.cut += 1
             return ()

@@ -1,0 +1,71 @@
+"""The rows as tables: on the console and in Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.table import Table
+
+from .bridge import Plan
+from .rows import Row
+
+COLUMNS = ("condition", "transport", "topic", "sent", "lost %", "p50", "p95", "p99", "max ms", "overhead %", "CPU %")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """One line of a table; processor time in percent of one core, robot's and service's end."""
+    cpu = " / ".join(f"{100 * s / row.seconds:.1f}" for s in (row.cpu_robot_s, row.cpu_service_s))
+    return (
+        row.condition,
+        f"{row.transport} ({row.congestion})" if row.congestion else row.transport,
+        row.topic,
+        str(row.sent),
+        f"{100 * row.lost:.2f}",
+        *(_number(v) for v in (row.delay_p50_ms, row.delay_p95_ms, row.delay_p99_ms, row.delay_max_ms)),
+        "" if row.overhead is None else f"{100 * row.overhead:.1f}",
+        cpu,
+    )
+
+
+def console_table(rows: Sequence[Row], title: str) -> Table:
+    """For people at a terminal."""
+    table = Table(title=title)
+    for i, column in enumerate(COLUMNS):
+        table.add_column(column, justify="left" if i < 3 else "right", no_wrap=True)
+    before = None
+    for row in rows:
+        key = (row.transport, row.condition)
+        if before not in (None, key):
+            table.add_section()
+        before = key
+        table.add_row(*cells(row))
+    return table
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """The same in Markdown."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + " --- |" * 3 + " ---: |" * (len(COLUMNS) - 3)]
+    lines += ["| " + " | ".join(cells(row)) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def write_report(plan: Plan, rows: Sequence[Row], failures: Sequence[str], folder: Path) -> None:
+    """Write ``report.md`` and ``rows.json``.
+
+    Args:
+        plan: What was measured.
+        rows: What came out.
+        failures: What could not be measured, a sentence each.
+        folder: Made if it is missing.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "rows.json").write_text(json.dumps([row.document() for row in rows], indent=1) + "\n")
+    remarks = [*plan.notes, *(f"not measured: {sentence}" for sentence in failures)]
+    lines = [f"# {plan.title[0].upper()}{plan.title[1:]}", "", *(f"- {remark}" for remark in remarks), ""]
+    (folder / "report.md").write_text("\n".join(lines) + "\n" + markdown_table(rows))
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"

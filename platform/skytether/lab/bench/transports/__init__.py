@@ -1,0 +1,34 @@
+"""The transports that can be measured, by name. Each is loaded when it is asked for."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from .base import EndSpec, Transport, TransportError
+
+_WHERE = {
+    "skytether": "skytether:SkytetherTransport",
+    "udp": "udp:UdpTransport",
+    "tcp": "tcp:TcpTransport",
+}
+NAMES = tuple(_WHERE)
+
+
+def load(name: str) -> type[Transport]:
+    """The class of a transport.
+
+    Raises:
+        ValueError: The name is not known; the text lists those that are.
+        TransportError: It needs a library that is not installed.
+    """
+    if name not in _WHERE:
+        raise ValueError(f"transport '{name}' is not known; choose from {', '.join(NAMES)}")
+    module, _, attribute = _WHERE[name].partition(":")
+    try:
+        found: type[Transport] = getattr(import_module(f".{module}", __name__), attribute)
+    except ModuleNotFoundError as error:
+        raise TransportError(f"{name}: needs {error.name}: pip install 'skytether[peers]'") from error
+    return found
+
+
+__all__ = ["NAMES", "EndSpec", "Transport", "TransportError", "load"]
