@@ -252,8 +252,10 @@ class Demo:
         deadline = time.monotonic() + self.settings.rtt_s + _SETTLE_S
         while time.monotonic() < deadline:
             session = self.agent.status().session
-            sent_here = [topic for topic in session.topics if topic.direction == "in"] if session else []
-            if sent_here and all(topic.sent <= topic.delivered + topic.superseded + topic.lost for topic in sent_here):
+            # Each end counts its own part at once and learns of the other's later: arrivals here, or departures there.
+            if session and all(
+                topic.sent == topic.delivered + topic.superseded + topic.lost for topic in session.topics
+            ):
                 return
             time.sleep(_LOOK_S)
 
