@@ -37,7 +37,7 @@ class Plan:
     @property
     def title(self) -> str:
         """One line."""
-        return f"{SUITES[self.suite].about}, {self.setup.seconds:g} s each"
+        return f"{SUITES[self.suite].about}, {self.setup.seconds:g} s each, delays one way in ms"
 
 
 def make_plan(

@@ -6,41 +6,48 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from .bridge import Plan
 from .rows import Row
 
-COLUMNS = ("condition", "transport", "topic", "sent", "lost %", "p50", "p95", "p99", "max ms", "overhead %", "CPU %")
+COLUMNS = ("condition", "transport", "topic", "sent", "lost %", "p50", "p95", "p99", "max", "overhead %", "CPU %")
+"""Of a complete table; delays in milliseconds, processor time in percent of one core: robot's end / service's end."""
 
 
 def cells(row: Row) -> tuple[str, ...]:
-    """One line of a table; processor time in percent of one core, robot's and service's end."""
-    cpu = " / ".join(f"{100 * s / row.seconds:.1f}" for s in (row.cpu_robot_s, row.cpu_service_s))
+    """One line of a table."""
     return (
         row.condition,
-        f"{row.transport} ({row.congestion})" if row.congestion else row.transport,
+        _named(row),
         row.topic,
         str(row.sent),
         f"{100 * row.lost:.2f}",
         *(_number(v) for v in (row.delay_p50_ms, row.delay_p95_ms, row.delay_p99_ms, row.delay_max_ms)),
         "" if row.overhead is None else f"{100 * row.overhead:.1f}",
-        cpu,
+        "/".join(f"{100 * s / row.seconds:.1f}" for s in (row.cpu_robot_s, row.cpu_service_s)),
     )
 
 
 def console_table(rows: Sequence[Row], title: str) -> Table:
-    """For people at a terminal."""
-    table = Table(title=title)
-    for i, column in enumerate(COLUMNS):
-        table.add_column(column, justify="left" if i < 3 else "right", no_wrap=True)
-    before = None
+    """For people at a terminal of 80 columns: what rows have in common stands above them."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    headers = (*COLUMNS[2:-2], "extra %", COLUMNS[-1])
+    for i, header in enumerate(headers):
+        table.add_column(header, justify="right" if i else "left", no_wrap=bool(i))
+    condition = transport = None
     for row in rows:
-        key = (row.transport, row.condition)
-        if before not in (None, key):
+        _, named, topic, *numbers, extra, cpu = cells(row)
+        empty = [""] * len(numbers)
+        if condition != row.condition:
+            condition, transport = row.condition, None
             table.add_section()
-        before = key
-        table.add_row(*cells(row))
+            table.add_row(condition, *empty, "", "", style="bold underline")
+        if transport != row.transport:
+            transport = row.transport
+            table.add_row(named, *empty, extra, cpu, style="bold")
+        table.add_row(f"  {topic}", *numbers, "", "")
     return table
 
 
@@ -65,6 +72,10 @@ def write_report(plan: Plan, rows: Sequence[Row], failures: Sequence[str], folde
     remarks = [*plan.notes, *(f"not measured: {sentence}" for sentence in failures)]
     lines = [f"# {plan.title[0].upper()}{plan.title[1:]}", "", *(f"- {remark}" for remark in remarks), ""]
     (folder / "report.md").write_text("\n".join(lines) + "\n" + markdown_table(rows))
+
+
+def _named(row: Row) -> str:
+    return f"{row.transport} ({row.congestion})" if row.congestion else row.transport
 
 
 def _number(value: float | None) -> str:

@@ -10,6 +10,12 @@ _WHERE = {
     "skytether": "skytether:SkytetherTransport",
     "udp": "udp:UdpTransport",
     "tcp": "tcp:TcpTransport",
+    "websocket-cbor": "websocket:WebsocketTransport",
+    "zenoh-tcp": "zenoh:ZenohTcp",
+    "zenoh-2tcp": "zenoh:ZenohTwoTcp",
+    "zenoh-quic": "zenoh:ZenohQuic",
+    "zenoh-udp": "zenoh:ZenohUdp",
+    "zenoh-mixed": "zenoh:ZenohMixed",
 }
 NAMES = tuple(_WHERE)
 

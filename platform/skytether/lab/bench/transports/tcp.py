@@ -26,7 +26,7 @@ class TcpTransport(Transport):
 
     def __init__(self, spec: EndSpec, deliver: Deliver) -> None:
         super().__init__(spec, deliver)
-        self._queues = {i: LatestQueue(spec.flows[i].depth) for i in spec.sends}
+        self._queues = {i: LatestQueue({i: (1, spec.flows[i].depth)}) for i in spec.sends}
         self._sockets: dict[int, socket.socket] = {}
         self._listener: socket.socket | None = None
         self._closing = False
@@ -43,7 +43,7 @@ class TcpTransport(Transport):
         return len(self._sockets) == len(self.spec.flows)
 
     def publish(self, index: int, payload: bytes) -> None:
-        self._queues[index].put(payload)
+        self._queues[index].put(index, payload)
 
     def stop(self) -> None:
         self._closing = True
@@ -78,7 +78,8 @@ class TcpTransport(Transport):
         self._sockets[index] = sock
         with contextlib.suppress(OSError):  # the end
             if index in self._queues:
-                while (payload := self._queues[index].get()) is not None:
+                while (item := self._queues[index].get()) is not None:
+                    payload = item[1]
                     sock.sendall(_LENGTH.pack(len(payload)) + payload)
             else:
                 with sock.makefile("rb", buffering=1 << 16) as stream:
