@@ -33,3 +33,7 @@ def shown(document: Path) -> dict[str, str]:
 @pytest.mark.parametrize("name", ["service.py", "__main__.py", "service.yaml", "test_wall_stop.py"])
 def test_the_page_shows_the_files_as_they_are(name: str) -> None:
     assert shown(DOCS / "writing-a-service.md")[name] == (EXAMPLE / name).read_text()
+
+
+def test_the_readme_shows_the_class_as_it_is() -> None:
+    assert (EXAMPLE / "service.py").read_text() in (DOCS.parent / "README.md").read_text()
