@@ -62,10 +62,10 @@ class Ends:
     def __init__(self):
         self.made = []
 
-    def make(self, role, port=None, *, topics=TOPICS, key=KEY, **options):
+    def make(self, role, port=None, *, topics=TOPICS, key=KEY, session_id=7, **options):
         """A bridge that is not started yet; its port is its attribute `graph`."""
         port = port or RecordingPort()
-        bridge = Bridge(SessionSpec(7, key, role, topics), port, **options)
+        bridge = Bridge(SessionSpec(session_id, key, role, topics), port, **options)
         bridge.graph = port
         self.made.append(bridge)
         return bridge

@@ -7,6 +7,8 @@ Here is what touches the system. Rules of the protocol belong into `skytether.wi
 from .endpoint import Bridge, BridgeError
 from .local import GraphPort, LocalGraph
 from .port import Port, Publisher
+from .relay import Relay, RelayStats
+from .relay_table import RelayLimits
 from .spec import SessionSpec, topic_from_api
 
 __all__ = [
@@ -16,6 +18,9 @@ __all__ = [
     "LocalGraph",
     "Port",
     "Publisher",
+    "Relay",
+    "RelayLimits",
+    "RelayStats",
     "SessionSpec",
     "topic_from_api",
 ]

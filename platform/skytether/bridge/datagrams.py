@@ -39,13 +39,13 @@ _NO_BATCHES = (errno.EINVAL, errno.EIO, errno.EOPNOTSUPP)
 """What a kernel or network device answers that cannot cut this batch."""
 
 
-def grow_buffers(sock: socket.socket) -> None:
+def grow_buffers(sock: socket.socket, size: int = SOCKET_BUFFER) -> None:
     """Ask for large kernel buffers, beyond the system's limit where privileges allow."""
     for force, plain in ((SO_RCVBUFFORCE, socket.SO_RCVBUF), (SO_SNDBUFFORCE, socket.SO_SNDBUF)):
         try:
-            sock.setsockopt(socket.SOL_SOCKET, force, SOCKET_BUFFER)
+            sock.setsockopt(socket.SOL_SOCKET, force, size)
         except OSError:
-            sock.setsockopt(socket.SOL_SOCKET, plain, SOCKET_BUFFER)
+            sock.setsockopt(socket.SOL_SOCKET, plain, size)
 
 
 class DatagramSocket:
@@ -58,12 +58,21 @@ class DatagramSocket:
         errors: Datagrams or batches that the system refused, by name of the error (``EMSGSIZE``).
     """
 
-    def __init__(self, bind: tuple[str, int], *, batches: bool = True) -> None:
+    def __init__(
+        self,
+        bind: tuple[str, int],
+        *,
+        batches: bool = True,
+        kernel_buffer: int = SOCKET_BUFFER,
+        scratch: memoryview | None = None,
+    ) -> None:
         """Open and bind.
 
         Args:
             bind: Host (name or address, IPv4 or IPv6) and port; port 0 takes any free one.
             batches: False leaves the kernel's batching alone.
+            kernel_buffer: Bytes that the kernel may hold, each way.
+            scratch: 64 KiB to receive into, for sockets of one thread that share it; None: its own.
 
         Raises:
             OSError: The name cannot be resolved, the port is taken, or the address is not this machine's.
@@ -74,7 +83,7 @@ class DatagramSocket:
         self._socket = socket.socket(family, kind, protocol)
         try:
             self._socket.setblocking(False)
-            grow_buffers(self._socket)
+            grow_buffers(self._socket, kernel_buffer)
             self._never_fragment()
             self.segmentation = batches and self._kernel_has(UDP_SEGMENT, 0)
             self.coalescing = batches and self._kernel_has(UDP_GRO, 1)
@@ -85,7 +94,7 @@ class DatagramSocket:
         name = self._socket.getsockname()
         self.address: tuple[str, int] = (name[0], name[1])
         self.errors: Counter[str] = Counter()
-        self._buffer = memoryview(bytearray(65_536))
+        self._buffer = memoryview(bytearray(65_536)) if scratch is None else scratch
 
     def fileno(self) -> int:
         """For a selector."""

@@ -38,7 +38,8 @@ def bridge(
     Sources in the configuration publish made-up messages, so that a network can be measured before a robot
     depends on it.
     """
-    from .bridge_config import ConfigError, load_config, load_key, write_new_key
+    from .bridge_config import load_config, load_key, write_new_key
+    from .config_file import ConfigError
 
     try:
         if new_key is not None:

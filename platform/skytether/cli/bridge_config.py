@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import base64
-import difflib
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from skytether.api.manifest import ANY_TOPIC, Strict, TopicSpec
 from skytether.bridge.spec import KEY_BYTES, parse_key
 from skytether.wire.topic import Direction, Role
 
-MAX_CONFIG_BYTES = 1024 * 1024
-
-
-class ConfigError(Exception):
-    """A mistake in the configuration; the text names the key and what it may be."""
-
-
-class Endpoint(Strict):
-    """A UDP endpoint."""
-
-    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
-    """Name or address, IPv4 or IPv6; to bind to: ``0.0.0.0`` or ``::`` for every interface."""
-    port: Annotated[int, Field(ge=0, le=65_535)] = 0
-    """To bind to: 0 takes any free one."""
+from .config_file import ConfigError, Endpoint, read_config
 
 
 class Source(Strict):
@@ -111,25 +96,7 @@ def load_config(path: Path) -> BridgeConfig:
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key is wrong.
     """
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_CONFIG_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    if len(text) > MAX_CONFIG_BYTES:
-        raise ConfigError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; that is no configuration")
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{path} is no YAML{where}: {getattr(error, 'problem', None) or 'unreadable'}") from error
-    if not isinstance(document, dict):
-        raise ConfigError(f"{path} must hold keys: {', '.join(BridgeConfig.model_fields)}")
-    try:
-        return BridgeConfig.model_validate(document)
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {_explain(error)}") from error
+    return read_config(path, BridgeConfig)
 
 
 def load_key(path: Path) -> bytes:
@@ -170,29 +137,3 @@ def write_new_key(path: Path) -> None:
         raise ConfigError(f"{path} exists already and is not overwritten; name another file") from error
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _explain(error: ValidationError) -> str:
-    """The first mistake, by its key."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    key = ".".join(str(step) for step in first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(first["loc"][:-1])
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        return f"{key}: unknown key{f', did you mean {near[0]!r}?' if near else ''}; allowed are {', '.join(known)}"
-    if first["type"] == "missing":
-        return f"{key}: is missing"
-    says = str(first["msg"]).removeprefix("Value error, ")
-    return f"{key}: {says[:1].lower()}{says[1:]}" if key else says
-
-
-def _known_keys(place: tuple[int | str, ...]) -> list[str]:
-    """Keys that the schema has at one place of the document."""
-    schema: dict[str, Any] = BridgeConfig.model_json_schema()
-    here = schema
-    for step in place:
-        here = here["items"] if isinstance(step, int) else here["properties"][step]
-        here = next((a for a in here.get("anyOf", ()) if a.get("type") != "null"), here)
-        if "$ref" in here:
-            here = schema["$defs"][here["$ref"].rsplit("/", 1)[1]]
-    return list(here["properties"])

@@ -9,7 +9,7 @@ import typer
 
 from skytether import __version__
 
-from . import bridge, demo, lab, orchestrator, replay, resources
+from . import bridge, demo, lab, orchestrator, relay, replay, resources
 
 app = typer.Typer(
     help="Cloud robotics: services for robots at the edge or in the cloud, and a bridge that holds.",
@@ -20,6 +20,7 @@ app = typer.Typer(
 app.command()(demo.demo)
 app.command()(replay.replay)
 app.command()(bridge.bridge)
+app.command()(relay.relay)
 app.command()(resources.apply)
 app.add_typer(orchestrator.app, name="orchestrator")
 app.add_typer(resources.service_app, name="service")

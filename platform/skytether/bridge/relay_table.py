@@ -1,0 +1,351 @@
+"""What a relay forwards, and where to (rule 9): pure, with time as an argument. The sockets are in `relay`.
+
+A relay holds no key and opens no packet. It reads the session id, which every packet carries in clear, and looks for
+the route of that id: where the service's end (or the next relay) is. Every address on the robot's side has a *leg*, a
+port of its own towards that target, as behind a NAT. So the two ends themselves decide who is who: the service's
+end answers to the leg from which authentic packets come, and whoever else has seen the id gets nothing.
+
+A leg begins as a newcomer. Newcomers of a route are few and share a budget of their own, so that no flood of
+them touches a session that runs. What goes back to one is bounded by what came from it, until it speaks again after
+the target answered it; then it is admitted to its session. To a session that runs it is admitted with the target's
+first answer: that is a robot on the move, and must not be held up. Targets answer to authentic packets only, and at
+most three times as much to a handshake, so who holds no key cannot have an address flooded through a relay; who holds
+one is bounded by the session's rate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from skytether.wire.packet import HEADER_SIZE, peek_session_id
+
+from .datagrams import Address
+
+ID_DIGITS = 16
+AMPLIFICATION = 3
+"""Bytes sent to an address for each byte from it, until it is admitted (as in RFC 9000, section 8)."""
+NEWCOMER_IDLE = 10.0
+"""Seconds of silence after which a newcomer is forgotten."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelayLimits:
+    """Bounds of everything that packets can make a relay hold."""
+
+    sessions: int = 1024
+    """Sessions at a time. Beyond that the robots of further ones stay newcomers."""
+    addresses: int = 8
+    """Legs of a session: addresses of its robot, over several interfaces and before and after a move."""
+    newcomers: int = 64
+    """Legs of a route that are not admitted yet, and how many may begin in a second."""
+    rate_bps: float = 100e6
+    """Bits per second of UDP payload, of a session in each direction; newcomers of a route together get the same."""
+    burst: float = 0.05
+    """Seconds of that rate that may come at once."""
+    idle: float = 60.0
+    """Seconds of silence after which an address of a robot is forgotten; it begins anew when it speaks again."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work.
+
+        Raises:
+            ValueError: The text names the setting and its range.
+        """
+        for name in ("sessions", "addresses", "newcomers"):
+            if not getattr(self, name) >= 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("rate_bps", "burst", "idle"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+
+
+class Prefix(NamedTuple):
+    """Session ids that begin with the same hexadecimal digits; all 16 digits name one session, none every one."""
+
+    digits: int
+    value: int
+
+    @classmethod
+    def parse(cls, text: str) -> Prefix:
+        """Read ``0123456789abcdef`` (one session), ``0123*`` (all that begin so) or ``*`` (all).
+
+        Raises:
+            ValueError: It is none of these.
+        """
+        match = re.fullmatch(r"([0-9a-fA-F]{0,16})(\*?)", text)
+        if match is None or bool(match[2]) == (len(match[1]) == ID_DIGITS):
+            raise ValueError(f"'{text}' must be a session's 16 hexadecimal digits, or its first ones and a '*'")
+        return cls(len(match[1]), int(match[1] or "0", 16))
+
+    def holds(self, session_id: int) -> bool:
+        """Whether an id begins so."""
+        return session_id >> 4 * (ID_DIGITS - self.digits) == self.value
+
+
+class Bucket:
+    """Tokens of bytes; open while there are any, so that a batch passes whole."""
+
+    __slots__ = ("_capacity", "_rate", "_tokens", "_updated")
+
+    def __init__(self, rate: float, capacity: float, now: float) -> None:
+        self._rate = rate
+        self._capacity = self._tokens = capacity
+        self._updated = now
+
+    def take(self, amount: float, now: float) -> bool:
+        """Take ``amount``, if there is anything left."""
+        if now > self._updated:
+            self._tokens = min(self._capacity, self._tokens + (now - self._updated) * self._rate)
+            self._updated = now
+        if self._tokens <= 0:
+            return False
+        self._tokens -= amount
+        return True
+
+
+class Flow:
+    """Both directions of a session, or of a route's newcomers: budgets and counters."""
+
+    __slots__ = ("bytes_down", "bytes_up", "down", "dropped", "packets_down", "packets_up", "up")
+
+    def __init__(self, limits: RelayLimits, now: float) -> None:
+        rate = limits.rate_bps / 8
+        self.up, self.down = (Bucket(rate, rate * limits.burst, now) for _ in range(2))
+        self.packets_up = self.packets_down = self.bytes_up = self.bytes_down = 0
+        self.dropped = 0
+        """Packets above the rate."""
+
+
+class Route:
+    """Where packets of some sessions go."""
+
+    __slots__ = ("flow", "newcomers", "openings", "prefix", "target")
+
+    def __init__(self, prefix: Prefix, target: Address, limits: RelayLimits, now: float) -> None:
+        self.prefix = prefix
+        self.target = target
+        self.newcomers: dict[tuple[int, Address], Leg] = {}
+        """Oldest first."""
+        self.flow = Flow(limits, now)
+        """Of the newcomers together."""
+        self.openings = Bucket(limits.newcomers, limits.newcomers, now)
+
+
+class SessionFlow(Flow):
+    """A session whose robot was answered."""
+
+    __slots__ = ("legs",)
+
+    def __init__(self, limits: RelayLimits, now: float) -> None:
+        super().__init__(limits, now)
+        self.legs: dict[Address, Leg] = {}
+
+
+class Leg:
+    """One address of a robot, and the port towards the target that stands for it there."""
+
+    __slots__ = (
+        "answered_at",
+        "bytes_down",
+        "bytes_up",
+        "heard_at",
+        "port",
+        "route",
+        "session",
+        "session_id",
+        "source",
+    )
+
+    def __init__(self, session_id: int, source: Address, route: Route) -> None:
+        self.session_id = session_id
+        self.source = source
+        """The robot's address."""
+        self.route = route
+        self.session: SessionFlow | None = None
+        """None: a newcomer."""
+        self.bytes_up = self.bytes_down = 0
+        self.heard_at = 0.0
+        self.answered_at: float | None = None
+        self.port: Any = None
+        """Whatever its owner keeps with it; nothing here looks at it."""
+
+
+class RelayTable:
+    """Routes, and the legs that packets opened.
+
+    Attributes:
+        closed: Legs that ended; the owner takes them and closes their ports.
+        rejected: Packets not forwarded, by bounded reason.
+    """
+
+    def __init__(self, limits: RelayLimits) -> None:
+        self._limits = limits
+        self._routes: dict[Prefix, Route] = {}
+        self._lengths: list[int] = []
+        """Digits of the prefixes, longest first."""
+        self._legs: dict[tuple[int, Address], Leg] = {}
+        self.sessions: dict[int, SessionFlow] = {}
+        self.closed: deque[Leg] = deque()
+        self.rejected: Counter[str] = Counter()
+
+    @property
+    def legs(self) -> list[Leg]:
+        """All legs, newcomers included."""
+        return list(self._legs.values())
+
+    @property
+    def routes(self) -> list[Route]:
+        """All routes."""
+        return list(self._routes.values())
+
+    def add(self, prefix: Prefix, target: Address, now: float) -> None:
+        """Route these sessions there, instead of where they were routed before; the longest prefix counts."""
+        known = self._routes.get(prefix)
+        if known is not None:
+            known.target = target
+        else:
+            self._routes[prefix] = Route(prefix, target, self._limits, now)
+            self._rerouted()
+
+    def remove(self, prefix: Prefix) -> bool:
+        """Forward these sessions no longer; False if there is no such route."""
+        if self._routes.pop(prefix, None) is None:
+            return False
+        self._rerouted()
+        return True
+
+    def up(self, data: memoryview | bytes, source: Address, now: float, packets: int = 1) -> Leg | None:
+        """A packet, or several of one session, came to the public port.
+
+        Returns:
+            The leg through which to send it to ``leg.route.target``; None (counted): to be dropped.
+        """
+        session_id = peek_session_id(data)
+        if session_id is None:
+            self.rejected["short"] += packets
+            return None
+        leg = self._legs.get((session_id, source))
+        route = leg.route if leg is not None else self._find(session_id)
+        if route is None:
+            self.rejected["unknown"] += packets
+            return None
+        flow = route.flow if leg is None or leg.session is None else leg.session
+        if leg is None and not route.openings.take(1, now):
+            self.rejected["newcomers"] += packets
+            return None
+        if not flow.up.take(len(data), now):
+            flow.dropped += packets
+            self.rejected["rate"] += packets
+            return None
+        if leg is None:
+            leg = self._open(session_id, source, route)
+        leg.heard_at = now
+        leg.bytes_up += len(data)
+        flow.packets_up += packets
+        flow.bytes_up += len(data)
+        if leg.session is None and leg.answered_at is not None:
+            self._admit(leg, now)
+        return leg
+
+    def down(self, leg: Leg, data: memoryview | bytes, source: Address, now: float, packets: int = 1) -> bool:
+        """The same for what came to a leg's port: whether to send it to ``leg.source``."""
+        if source != leg.route.target:
+            self.rejected["stranger"] += packets
+            return False
+        if peek_session_id(data) != leg.session_id:
+            self.rejected["session"] += packets
+            return False
+        leg.answered_at = now
+        if leg.session is None and leg.session_id in self.sessions:
+            self._admit(leg, now)
+        flow: Flow = leg.route.flow if leg.session is None else leg.session
+        if flow is leg.route.flow and leg.bytes_down + len(data) > AMPLIFICATION * leg.bytes_up:
+            self.rejected["amplification"] += packets
+            return False
+        if not flow.down.take(len(data), now):
+            flow.dropped += packets
+            self.rejected["rate"] += packets
+            return False
+        leg.bytes_down += len(data)
+        flow.packets_down += packets
+        flow.bytes_down += len(data)
+        return True
+
+    def expire(self, now: float) -> None:
+        """Forget addresses that were silent for too long; to be called about once a second."""
+        idle = self._limits.idle
+        for leg in list(self._legs.values()):
+            if leg.heard_at + (idle if leg.session is not None else min(idle, NEWCOMER_IDLE)) <= now:
+                self.close(leg)
+
+    def close(self, leg: Leg) -> None:
+        """Forget an address."""
+        key = leg.session_id, leg.source
+        if self._legs.pop(key, None) is None:
+            return
+        if leg.session is None:
+            del leg.route.newcomers[key]
+        else:
+            del leg.session.legs[leg.source]
+            if not leg.session.legs:
+                del self.sessions[leg.session_id]
+        self.closed.append(leg)
+
+    def _find(self, session_id: int) -> Route | None:
+        for digits in self._lengths:
+            route = self._routes.get(Prefix(digits, session_id >> 4 * (ID_DIGITS - digits)))
+            if route is not None:
+                return route
+        return None
+
+    def _rerouted(self) -> None:
+        self._lengths = sorted({prefix.digits for prefix in self._routes}, reverse=True)
+        for leg in list(self._legs.values()):
+            if self._find(leg.session_id) is not leg.route:
+                self.close(leg)
+
+    def _open(self, session_id: int, source: Address, route: Route) -> Leg:
+        if len(route.newcomers) >= self._limits.newcomers:
+            self.close(next(iter(route.newcomers.values())))
+        leg = Leg(session_id, source, route)
+        self._legs[session_id, source] = route.newcomers[session_id, source] = leg
+        return leg
+
+    def _admit(self, leg: Leg, now: float) -> None:
+        session = self.sessions.get(leg.session_id)
+        if session is None:
+            if len(self.sessions) >= self._limits.sessions:
+                self.rejected["sessions_full"] += 1
+                return
+            session = self.sessions[leg.session_id] = SessionFlow(self._limits, now)
+        del leg.route.newcomers[leg.session_id, leg.source]
+        leg.session = session
+        session.legs[leg.source] = leg
+        if len(session.legs) > self._limits.addresses:
+            # The target speaks to where the robot is, so the one that it left long ago is no loss.
+            self.close(min(session.legs.values(), key=lambda one: one.answered_at or 0.0))
+
+
+def same_session(data: memoryview, segment: int | None) -> Iterator[tuple[memoryview, int | None, int]]:
+    """Split a batch into what can be forwarded whole.
+
+    Args:
+        data: One datagram, or several of ``segment`` bytes (the last may be shorter) from one address.
+        segment: Size of each; None for one.
+
+    Yields:
+        Data of one session, size of its datagrams (None for one), and how many they are.
+    """
+    if segment is None or segment >= len(data):
+        yield data, None, 1
+        return
+    ids = [bytes(data[at + 1 : at + 9]) for at in range(0, len(data), segment)]
+    if ids.count(ids[0]) == len(ids) and (len(data) % segment or segment) >= HEADER_SIZE:
+        yield data, segment, len(ids)
+        return
+    for at in range(0, len(data), segment):
+        yield data[at : at + segment], None, 1
