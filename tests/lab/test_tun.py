@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -94,10 +94,10 @@ def test_a_cut_stops_what_is_under_way(link: TunEmulator) -> None:
 def test_nothing_stays_behind(netns: None) -> None:
     with TunEmulator() as link:
         path = link.robot.path
+        inode = os.stat(path).st_ino
         assert link.robot.run(_devices) == {"lo", "link0"}
-    assert not Path(path).exists() or Path(path).resolve().name[:4] != "net:"
-    with pytest.raises(NetworkError, match="gone"):
-        Namespace.run(link.robot, _devices)
+    # the descriptor's number may be in use again by now, but not for that namespace
+    assert not os.path.exists(path) or os.stat(path).st_ino != inode
     assert "link0" not in _devices()
 
 

@@ -93,71 +93,54 @@ class _End:
         for arrivals in self._received.values():
             arrivals.clear()
         cpu: list[float] = []
-        sent = publish(
-            order.flows,
-            self._spec.sends,
-            order.begin,
-            order.end,
-            self.transport.publish,
-            marks=(order.start,),
-            on_mark=lambda: cpu.append(_cpu_seconds()),
-        )
+        sent = publish(order, self._spec.sends, self.transport.publish, lambda: cpu.append(_cpu_seconds()))
         used = _cpu_seconds() - cpu[0]
         time.sleep(max(0.0, order.end + _DRAIN_S - time.monotonic()))
         return Notes(sent, {i: list(arrivals) for i, arrivals in self._received.items()}, used)
 
 
 def publish(
-    flows: Sequence[Flow],
-    indices: Sequence[int],
-    begin: float,
-    end: float,
-    send: Callable[[int, bytes], None],
-    *,
-    marks: Sequence[float] = (),
-    on_mark: Callable[[], None] = lambda: None,
+    order: Order, indices: Sequence[int], send: Callable[[int, bytes], None], on_start: Callable[[], None]
 ) -> dict[int, list[float]]:
-    """Send flows on their schedules; a message that is late is sent late, and none is left out.
+    """Send flows on their schedules from ``order.begin`` to ``order.end``.
+
+    A message that is late is sent late, and none is left out while there is time.
 
     Args:
-        flows: All flows.
-        indices: Which of them to send.
-        begin: Start of the first periods, monotonic seconds.
-        end: When to stop.
+        order: What to send, and when.
+        indices: Which of its flows to send.
         send: Called with index and payload.
-        marks: Times, rising, at which `on_mark` is called, before `end`.
-        on_mark: Called in between.
+        on_start: Called at ``order.start``.
 
     Returns:
         When each message was handed over, by flow and sequence.
     """
     keep_time()
+    flows = order.flows
     bodies = {i: os.urandom(flows[i].size - HEADER_BYTES) for i in indices}
     sent: dict[int, list[float]] = {i: [] for i in indices}
     # The first messages are spread over the period, so that the topics do not march in step.
-    count = max(len(flows), 1)
-    starts = {i: begin + i / count / flows[i].hz for i in indices}
-    schedule: list[tuple[float, int]] = [(starts[i], i) for i in indices]
-    schedule += [(mark, -1) for mark in marks]
-    schedule.append((end, -2))
+    first = {i: order.begin + i / len(flows) / flows[i].hz for i in indices}
+    schedule = [(first[i], i) for i in indices]
     heapq.heapify(schedule)
+    started = False
     while True:
-        due, index = schedule[0]
-        wait = due - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
-        if index == -2:
+        now = time.monotonic()
+        if not started and now >= order.start:
+            started = True
+            on_start()
+        if now >= order.end:
             return sent
-        if index == -1:
-            heapq.heappop(schedule)
-            on_mark()
+        wake = order.end if started else order.start
+        due, index = schedule[0] if schedule else (wake, -1)
+        if due > now or index < 0:
+            time.sleep(min(due, wake) - now)
             continue
         times = sent[index]
-        now = time.monotonic()
         payload = _HEADER.pack(len(times), now) + bodies[index]
         times.append(now)
         send(index, payload)
-        heapq.heapreplace(schedule, (starts[index] + len(times) / flows[index].hz, index))
+        heapq.heapreplace(schedule, (first[index] + len(times) / flows[index].hz, index))
 
 
 def _cpu_seconds() -> float:

@@ -10,7 +10,9 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from .bridge import Plan
+from .figures import draw
 from .rows import Row
+from .transports import load
 
 COLUMNS = ("condition", "transport", "topic", "sent", "lost %", "p50", "p95", "p99", "max", "overhead %", "CPU %")
 """Of a complete table; delays in milliseconds, processor time in percent of one core: robot's end / service's end."""
@@ -59,7 +61,7 @@ def markdown_table(rows: Sequence[Row]) -> str:
 
 
 def write_report(plan: Plan, rows: Sequence[Row], failures: Sequence[str], folder: Path) -> None:
-    """Write ``report.md`` and ``rows.json``.
+    """Write ``report.md``, ``rows.json`` and the pictures.
 
     Args:
         plan: What was measured.
@@ -69,7 +71,16 @@ def write_report(plan: Plan, rows: Sequence[Row], failures: Sequence[str], folde
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "rows.json").write_text(json.dumps([row.document() for row in rows], indent=1) + "\n")
-    remarks = [*plan.notes, *(f"not measured: {sentence}" for sentence in failures)]
+    late = [row.emulator_late_ms for row in rows if row.emulator_late_ms is not None]
+    remarks = [
+        *plan.notes,
+        *(f"{name}: {load(name).ABOUT}" for name in dict.fromkeys(row.transport for row in rows)),
+        *(f"not measured: {sentence}" for sentence in failures),
+        "overhead: bytes of IP packets in both directions beyond payload, over payload; "
+        "CPU: percent of one core, robot's end / service's end, making and checking the messages included",
+        *([f"the emulator was at most {max(late):.1f} ms late with a packet"] if late else []),
+        *(f"![{file.stem}]({file.name})" for file in draw(plan.suite, rows, folder)),
+    ]
     lines = [f"# {plan.title[0].upper()}{plan.title[1:]}", "", *(f"- {remark}" for remark in remarks), ""]
     (folder / "report.md").write_text("\n".join(lines) + "\n" + markdown_table(rows))
 

@@ -77,4 +77,21 @@ FRAME_RATES_HZ = (15.0, 30.0, 60.0)
 
 def fig26(topics: int, size_kb: float, hz: float) -> tuple[Flow, ...]:
     """One cell of figure 26: the rate is divided among the topics (thesis, section 4.3.4)."""
-    return tuple(Flow(f"flow{i + 1}", int(size_kb * KB), hz / topics, rank=i + 1, depth=10) for i in range(topics))
+    return tuple(Flow(f"flow{i + 1}", int(size_kb * KB), hz / topics, rank=i + 1) for i in range(topics))
+
+
+def stream(size: int, hz: float) -> tuple[Flow, ...]:
+    """One topic of which no message may be dropped for want of room in a queue."""
+    return (Flow("stream", size, hz, depth=10_000, lifespan=10.0),)
+
+
+COMMANDS = (
+    Flow("/cmd_vel", 80, 50.0, Direction.OUT),
+    Flow("/teleop/cmd_vel", 80, 50.0),
+)
+"""Velocity commands both ways: the second shares the camera's direction."""
+LATENCY = (
+    Flow("80 B", 80, 200.0),
+    Flow("2,222 B", 2_222, 50.0, rank=2),
+    Flow("47,611 B", 47_611, 5.0, rank=3),
+)

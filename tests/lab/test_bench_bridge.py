@@ -1,0 +1,108 @@
+"""The bridge's benchmark for real, for a second: processes, emulators, every transport that is installed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from skytether.lab.bench import conditions
+from skytether.lab.bench.pair import BenchError, Pair
+from skytether.lab.bench.traffic import COMMANDS, TABLE2
+from skytether.lab.bench.transports import NAMES, load
+from skytether.lab.bench.transports.base import TransportError
+from skytether.lab.link_model import LinkConditions
+
+pytestmark = pytest.mark.slow
+
+BASE = ("skytether", "udp")
+
+
+def _skip_missing(name: str) -> None:
+    try:
+        load(name)
+    except TransportError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("name", BASE)
+def test_user_space_emulator_delays_and_counts(name: str) -> None:
+    link = LinkConditions(delay=0.02)
+    with Pair(name, COMMANDS, condition="20ms", link=link, emulator="user", congestion="cubic") as pair:
+        rows = pair.measure(0.5, warm_up=0.2)
+    for row in rows:
+        assert 20 <= row.sent <= 25
+        assert row.delivered == row.sent
+        assert row.delay_p50_ms is not None
+        assert row.delay_p50_ms >= 20
+        assert row.overhead is not None
+        assert row.overhead >= 28 / 80  # headers of IP and UDP at least
+        assert (row.emulator, row.congestion) == ("user", None)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_transport_carries_the_traffic_between_namespaces(name: str, netns: None) -> None:
+    _skip_missing(name)
+    ideal = conditions.find(["ideal"])[0]
+    with Pair(name, TABLE2, condition="ideal", link=ideal.link, emulator="tun", congestion="cubic") as pair:
+        rows = pair.measure(1.0, warm_up=0.3)
+    assert [row.topic for row in rows] == [flow.name for flow in TABLE2]
+    for row in rows:
+        assert row.sent > 0
+        assert row.delivered >= 0.7 * row.sent  # a busy machine may be late; a topic that does not work has none
+    assert rows[0].overhead is not None
+    assert rows[0].overhead > 0
+    assert rows[0].congestion == ("cubic" if load(name).TCP else None)
+
+
+def test_the_same_ends_measure_other_traffic() -> None:
+    with Pair("udp", COMMANDS, condition="loopback", link=None, emulator="user", congestion="cubic") as pair:
+        first = pair.measure(0.3, warm_up=0.1)
+        second = pair.measure(
+            0.3, flows=tuple(replace(flow, size=500) for flow in COMMANDS), condition="again", warm_up=0.1
+        )
+    assert {row.condition for row in first} == {"loopback"}
+    assert {row.condition for row in second} == {"again"}
+    assert all(row.delivered == row.sent > 0 for row in (*first, *second))
+    assert ({row.size for row in first}, {row.size for row in second}) == ({80}, {500})
+    assert {row.emulator for row in first} == {"none"}
+
+
+def test_what_the_emulator_s_process_cannot_do_is_a_sentence(netns: None) -> None:
+    with pytest.raises(BenchError, match=r"udp, here: sysctl net\.ipv4\.tcp_congestion_control=fast failed"):
+        Pair("udp", COMMANDS, condition="here", link=LinkConditions(), emulator="tun", congestion="fast")
+
+
+def test_what_an_end_cannot_do_is_a_sentence() -> None:
+    with pytest.raises(BenchError, match=r"skytether, loopback: .*'no_such_setting'"):
+        Pair(
+            "skytether",
+            COMMANDS,
+            condition="loopback",
+            link=None,
+            emulator="user",
+            congestion="cubic",
+            options={"no_such_setting": 1},
+        )
+
+
+def test_command_prints_rows_and_writes_a_report(tmp_path: Path) -> None:
+    command = "lab bench bridge --transport udp --condition ideal --seconds 0.5 --emulator user --json --output"
+    done = subprocess.run(
+        [sys.executable, "-m", "skytether.cli", *command.split(), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    rows = json.loads(done.stdout)
+    assert [row["topic"] for row in rows] == [flow.name for flow in TABLE2]
+    assert rows == json.loads((tmp_path / "rows.json").read_text())
+    report = (tmp_path / "report.md").read_text()
+    assert "| ideal | udp | /cmd_vel |" in report
+    assert "![ideal](ideal.png)" in report
+    assert (tmp_path / "ideal.png").read_bytes().startswith(b"\x89PNG")
