@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.wire.control import (
+    PING_SIZE,
     Goodbye,
     Ping,
     ReceiverRow,
@@ -23,13 +24,21 @@ senders = st.builds(SenderRow, st.integers(0, 65_535), st.integers(0, 2**32 - 1)
 receivers = st.builds(ReceiverRow, st.integers(0, 65_535), *[counter] * 7, *[seconds] * 8)
 
 
-@given(st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**32 - 1))
-def test_pings_travel(echo, hold):
-    assert pull_control(push_ping(Ping(echo, hold))) == Ping(echo, hold)
+@given(
+    st.builds(
+        Ping, st.integers(0, 255), st.integers(0, 255), st.booleans(), st.integers(0, 65_535),
+        st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**32 - 1),
+    ),
+    st.integers(0, 1400),
+)  # fmt: skip
+def test_pings_travel(ping, padding):
+    data = push_ping(ping, padding)
+    assert pull_control(data) == ping
+    assert len(data) == PING_SIZE + padding
 
 
 def test_a_hold_beyond_all_bounds_is_cut():
-    assert pull_control(push_ping(Ping(1, 2**40))) == Ping(1, 2**32 - 1)
+    assert pull_control(push_ping(Ping(0, 0, True, 0, 1, 2**40))) == Ping(0, 0, True, 0, 1, 2**32 - 1)
 
 
 def test_goodbye_travels():
@@ -38,12 +47,13 @@ def test_goodbye_travels():
 
 @given(seconds, seconds, st.lists(senders, max_size=60), st.lists(receivers, max_size=60))
 def test_reports_travel_in_packets(loss, burst, sent, received):
-    messages = list(push_reports(loss, burst, sent, received))
+    messages = list(push_reports(3, loss, burst, sent, received))
     assert all(len(m) < 1024 for m in messages)
     reports = [pull_control(m) for m in messages]
     assert all(isinstance(r, Report) for r in reports)
     assert [row for r in reports for row in r.senders] == sent
     assert [row for r in reports for row in r.receivers] == received
+    assert all(r.path == 3 for r in reports)
     assert reports[0].loss == loss or math.isnan(reports[0].loss)
 
 

@@ -82,7 +82,7 @@ conditions = st.builds(
 @settings(max_examples=15)
 def test_on_any_link_only_what_was_published_arrives_and_at_most_once(make_world, topics, up, down, corrupt, mtu, seed):
     world = make_world(seed)
-    config = {"config": Config(mtu=mtu)}
+    config = {"config": Config(mtu=mtu, max_mtu=mtu)}
     link = world.link(
         connect=False, robot=config, service=config, up=up, down=down, corrupt=corrupt, seed=seed, mtu=9000, record=True
     )

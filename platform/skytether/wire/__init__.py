@@ -5,12 +5,12 @@ Nothing here opens a socket, reads a clock, starts a thread or draws a random nu
 """
 
 from .config import Config
-from .events import Connected, Disconnected, Event, MessageReceived, PeerMoved, Refused
+from .events import Connected, Disconnected, Event, MessageReceived, PathSwitched, PeerMoved, Refused
 from .packet import peek_session_id
 from .path import Transmit
 from .session import Session
 from .stats import PathStats, SessionStats, TopicStats
-from .topic import Direction, Role, Topic
+from .topic import Direction, PathUse, Role, Topic
 
 __all__ = [
     "Config",
@@ -20,6 +20,8 @@ __all__ = [
     "Event",
     "MessageReceived",
     "PathStats",
+    "PathSwitched",
+    "PathUse",
     "PeerMoved",
     "Refused",
     "Role",

@@ -15,7 +15,10 @@ class Config:
     """Sizes in bytes, times in seconds. Both ends may differ: nothing here has to match the peer's."""
 
     mtu: int = 1200
-    """Largest UDP payload sent. 1,200 passes every path in use (QUIC relies on it too), so IP never fragments."""
+    """Largest UDP payload sent until probes show what passes a path. 1,200 passes nearly every path in use (QUIC relies
+    on it too), and IP never fragments: where it does not pass, a probe finds out (`mtu`)."""
+    max_mtu: int = 1400
+    """Largest UDP payload that is tried; not above ``mtu``: none larger."""
     rate_bps: float = 50e6
     """Pacing budget of a path, bits per second of UDP payload (rule 6)."""
     burst: int = 19_200
@@ -35,6 +38,10 @@ class Config:
     enough for that, and costs one packet; a restarted service is found within one more ``probe_interval``."""
     probe_interval: float = 0.1
     """Time between attempts to reach a silent peer at first; 2 % of the silence later, at most ``hello_retry_max``."""
+    path_stable: float = 2.0
+    """A cheaper or better path is switched to once it has been so for this long."""
+    path_overlap: float = 0.3
+    """Time for which traffic goes over both paths when it is switched from one to the other."""
     silence: float = 1.0
     """A peer not heard for this long is reported as disconnected; its keys stay valid."""
     hello_retry: float = 0.05
@@ -59,8 +66,11 @@ class Config:
         """
         if not MIN_MTU <= self.mtu <= MAX_MTU:
             raise ValueError(f"mtu must be {MIN_MTU} to {MAX_MTU} bytes, not {self.mtu}")
-        if self.burst < self.mtu:
-            raise ValueError(f"burst must be at least the mtu ({self.mtu} bytes), not {self.burst}")
+        if not MIN_MTU <= self.max_mtu <= MAX_MTU:
+            raise ValueError(f"max_mtu must be {MIN_MTU} to {MAX_MTU} bytes, not {self.max_mtu}")
+        largest = max(self.mtu, self.max_mtu)
+        if self.burst < largest:
+            raise ValueError(f"burst must be at least mtu and max_mtu ({largest} bytes), not {self.burst}")
         if not 0 < self.max_message <= 2**30:
             raise ValueError(f"max_message must be 1 to {2**30} bytes, not {self.max_message}")
         if self.queue_limit < self.max_message:
@@ -78,3 +88,5 @@ class Config:
             raise ValueError(
                 "max_copies must be at least 1; max_parity, copy_spacing and old_keys must not be negative"
             )
+        if self.path_stable < 0 or self.path_overlap < 0:
+            raise ValueError("path_stable and path_overlap must not be negative")

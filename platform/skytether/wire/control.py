@@ -11,8 +11,8 @@ PING = 1
 REPORT = 2
 GOODBYE = 3
 
-_PING = struct.Struct(">BQI")
-_REPORT = struct.Struct(">BffHH")
+_PING = struct.Struct(">BBBBHQI")
+_REPORT = struct.Struct(">BBffHH")
 _SENDER = struct.Struct(">HIQQQQQ")
 _RECEIVER = struct.Struct(">HQQQQQQQffffffff")
 NO_ECHO = 2**64 - 1
@@ -21,8 +21,16 @@ ROWS_SIZE = 1000
 
 
 class Ping(NamedTuple):
-    """Keepalive and clock exchange. The time of sending is the message's own time of publishing."""
+    """Keepalive, clock exchange, path probe. The time of sending is the message's own time of publishing."""
 
+    path: int
+    """What it is sent by: authentic, as the header's is not."""
+    cost: int
+    """The sender's preference among paths; only the robot's end counts."""
+    ask: bool
+    """An answer is wanted at once, by the same path."""
+    size: int
+    """Size of the datagram that asks, or of the one that is answered, if that was padded; else 0."""
     echo: int | None
     """The peer's latest time stamp (microseconds of its clock); None if it sent none yet."""
     hold: int
@@ -66,6 +74,8 @@ class ReceiverRow(NamedTuple):
 class Report(NamedTuple):
     """What one end counted."""
 
+    path: int
+    """That the next two are of."""
     loss: float
     """Share of packets from the peer that did not arrive; NaN if unknown."""
     burst: float
@@ -77,9 +87,14 @@ class Goodbye(NamedTuple):
     """The peer ends the session."""
 
 
-def push_ping(ping: Ping) -> bytes:
-    """Encode."""
-    return _PING.pack(PING, NO_ECHO if ping.echo is None else ping.echo, min(max(ping.hold, 0), 2**32 - 1))
+PING_SIZE = _PING.size
+
+
+def push_ping(ping: Ping, padding: int = 0) -> bytes:
+    """Encode, with that many zeros more."""
+    echo = NO_ECHO if ping.echo is None else ping.echo
+    hold = min(max(ping.hold, 0), 2**32 - 1)
+    return _PING.pack(PING, ping.path, ping.cost, ping.ask, ping.size, echo, hold) + bytes(padding)
 
 
 def push_goodbye() -> bytes:
@@ -87,13 +102,15 @@ def push_goodbye() -> bytes:
     return bytes([GOODBYE])
 
 
-def push_reports(loss: float, burst: float, senders: list[SenderRow], receivers: list[ReceiverRow]) -> Iterator[bytes]:
+def push_reports(
+    path: int, loss: float, burst: float, senders: list[SenderRow], receivers: list[ReceiverRow]
+) -> Iterator[bytes]:
     """Encode as many messages of one packet as the rows need, at least one."""
     while True:
         count_s = min(len(senders), ROWS_SIZE // _SENDER.size)
         count_r = min(len(receivers), (ROWS_SIZE - count_s * _SENDER.size) // _RECEIVER.size)
         rows = [_SENDER.pack(*row) for row in senders[:count_s]] + [_RECEIVER.pack(*row) for row in receivers[:count_r]]
-        yield _REPORT.pack(REPORT, loss, burst, count_s, count_r) + b"".join(rows)
+        yield _REPORT.pack(REPORT, path, loss, burst, count_s, count_r) + b"".join(rows)
         senders, receivers = senders[count_s:], receivers[count_r:]
         if not senders and not receivers:
             return
@@ -104,17 +121,17 @@ def pull_control(data: bytes) -> Ping | Report | Goodbye | None:
     try:
         kind = data[0]
         if kind == PING:
-            _, echo, hold = _PING.unpack_from(data)
-            return Ping(None if echo == NO_ECHO else echo, hold)
+            _, path, cost, ask, size, echo, hold = _PING.unpack_from(data)
+            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, hold)
         if kind == REPORT:
-            _, loss, burst, count_s, count_r = _REPORT.unpack_from(data)
+            _, path, loss, burst, count_s, count_r = _REPORT.unpack_from(data)
             at = _REPORT.size
             end = at + count_s * _SENDER.size
             senders = tuple(SenderRow(*row) for row in _SENDER.iter_unpack(data[at:end]))
             receivers = tuple(
                 ReceiverRow(*row) for row in _RECEIVER.iter_unpack(data[end : end + count_r * _RECEIVER.size])
             )
-            return Report(loss if math.isfinite(loss) else math.nan, burst, senders, receivers)
+            return Report(path, loss if math.isfinite(loss) else math.nan, burst, senders, receivers)
         if kind == GOODBYE:
             return Goodbye()
     except (IndexError, struct.error):

@@ -7,9 +7,9 @@ from collections import deque
 from .crypto import Ciphers
 from .measure import Inbound, Outbound, SequenceTracker
 from .replay import ReplayWindow
-from .topic import Direction, Topic
+from .topic import Direction, PathUse, Topic
 
-CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9)
+CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)
 """Pings, reports and goodbye: sealed and numbered like a topic, both ways."""
 CONTROL_PRIORITY = 128
 """Above every topic's."""
@@ -22,8 +22,8 @@ class SendTopic:
     """A topic that this end sends, during one epoch."""
 
     __slots__ = (
-        "counters", "delivery", "depth", "index", "lifespan", "name", "priority", "ready", "sequence", "topic",
-        "waiting",
+        "counters", "delivery", "depth", "index", "lifespan", "name", "priority", "ready", "redundant", "sequence",
+        "topic", "waiting",
     )  # fmt: skip
 
     def __init__(self, index: int, topic: Topic, counters: Outbound, priority: int | None = None) -> None:
@@ -34,6 +34,7 @@ class SendTopic:
         self.lifespan = topic.lifespan
         self.depth = topic.depth
         self.delivery = topic.delivery
+        self.redundant = topic.paths is PathUse.REDUNDANT
         self.counters = counters
         self.waiting: deque[Waiting] = deque()
         self.ready = False

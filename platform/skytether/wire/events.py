@@ -49,6 +49,15 @@ class PeerMoved:
 
 
 @dataclass(frozen=True, slots=True)
+class PathSwitched:
+    """This end sends by another path from now on (rule 8)."""
+
+    path: int
+    reason: str
+    """Bounded: ``lost``, ``closed``, ``cheaper`` or ``better``."""
+
+
+@dataclass(frozen=True, slots=True)
 class Refused:
     """The peer proved it knows the key but its topic table cannot be joined with ours."""
 
@@ -56,4 +65,4 @@ class Refused:
     """One sentence naming the topic and both values."""
 
 
-Event = Connected | Disconnected | MessageReceived | PeerMoved | Refused
+Event = Connected | Disconnected | MessageReceived | PathSwitched | PeerMoved | Refused

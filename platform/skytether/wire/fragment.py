@@ -104,7 +104,7 @@ def _order(count: int, parity: int) -> Bytes:
 class Shards:
     """One sealed message on its way out. Packets are made as they are sent, parity when it is needed."""
 
-    __slots__ = ("_common", "_data", "_parity", "_sent", "_shape", "_tails", "packet_size", "remaining")
+    __slots__ = ("_common", "_data", "_parity", "_sent", "_shape", "_tails", "length", "packet_size", "remaining")
 
     def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int) -> None:
         """Take a sealed message.
@@ -121,6 +121,7 @@ class Shards:
         self._tails = _order(shape.shards, parity)
         self._parity: dict[tuple[int, int], bytes] = {}
         self._sent = 0
+        self.length = shape.length
         self.packet_size = HEADER_SIZE + shape.size
         self.remaining = len(self._tails)
         """Packets not yet taken."""
@@ -145,6 +146,12 @@ class Shards:
         self.remaining -= count
         return rows.reshape(-1).data
 
+    def again(self, room: int) -> Shards:
+        """All of the message once more, in shards of at most ``room`` bytes: of the same size if they fit."""
+        shape = self._shape if self._shape.size <= room else shape_for(self._shape.length, room)
+        parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
+        return shards_of(self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity)
+
     def _parity_shard(self, position: int) -> bytes:
         blocks, parity = self._shape.blocks, (len(self._tails) - self._shape.shards) // self._shape.blocks
         turn, block = divmod(position - self._shape.shards, blocks)
@@ -156,3 +163,10 @@ class Shards:
             made = encode(data, tuple(k + t for t in turns))
             self._parity.update(zip(((block, t) for t in turns), made, strict=True))
         return self._parity.pop((block, turn))
+
+
+def shards_of(common: bytes, sealed: memoryview | bytes, shape: Shape, parity: int) -> Shards:
+    """A sealed message in that layout."""
+    padded = memoryview(bytearray(shape.shards * shape.size))
+    padded[: shape.length] = sealed
+    return Shards(common, padded, shape, parity)

@@ -1,6 +1,6 @@
 """One path of a session: addresses, packet numbers, pacing, and what is known of losses on it.
 
-There is one path, number 0, for now; several (rule 8) will be several of these.
+Which of several paths is used when is decided in `paths`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .config import Config
+from .liveness import Liveness
 from .measure import Histogram
+from .mtu import MtuSearch
 from .pacer import Pacer
 
 NUMBERS = 2**32
@@ -115,15 +117,31 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "address", "arrivals", "burst_out", "bytes_received", "bytes_sent", "id", "loss_out", "next_number", "pacer",
-        "packets_received", "packets_sent", "rtt", "rtts",
+        "address", "arrivals", "burst_out", "bytes_received", "bytes_sent", "cost", "echo", "heard_at", "id", "large",
+        "liveness", "loss_out", "mtu", "newest", "next_number", "pacer", "packets_received", "packets_sent", "peer",
+        "ping_at", "pinged_at", "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
         self.id = path_id
+        self.cost = 0
+        """The robot's preference: of paths that are as good as each other the cheapest is used."""
+        self.peer: Hashable | None = None
+        """Where the robot's end was told that the service is."""
         self.address: Hashable | None = None
-        """Where to send; None while unknown."""
-        self.pacer = Pacer(config.rate_bps, config.mtu, config.burst, now)
+        """Where to send; None while unknown. Follows the peer's authentic messages."""
+        self.newest = -1
+        """Highest number of an authentic message of this epoch that came by this path."""
+        self.heard_at = now
+        self.echo: tuple[float, float] | None = None
+        """Peer's latest time stamp that came by this path, and when it arrived."""
+        self.ping_at = math.inf
+        self.pinged_at = -math.inf
+        self.liveness = Liveness()
+        self.mtu = MtuSearch(config.mtu, config.max_mtu)
+        self.large = False
+        """Whether packets of the largest size were sent since the last look."""
+        self.pacer = Pacer(config.rate_bps, max(config.mtu, config.max_mtu), config.burst, now)
         self.next_number = 0
         self.arrivals = LossMeter()
         self.packets_sent = self.packets_received = self.bytes_sent = self.bytes_received = 0
@@ -139,3 +157,13 @@ class Path:
         self.next_number = (first + count) % NUMBERS
         self.packets_sent += count
         return first
+
+    def start_epoch(self, now: float) -> None:
+        """Forget what belongs to a peer that was there before."""
+        self.newest = -1
+        self.echo = None
+        self.arrivals = LossMeter()
+        self.loss_out = self.burst_out = math.nan
+        self.liveness = Liveness()
+        self.mtu.restart(now)
+        self.ping_at = now

@@ -31,6 +31,10 @@ class SendQueue(Generic[Other]):
         self.used = 0
         """Payload bytes waiting."""
 
+    def __len__(self) -> int:
+        """Topics that have messages waiting, and other items."""
+        return len(self._heap)
+
     @property
     def priority(self) -> int:
         """Highest priority waiting; -1 if nothing waits."""

@@ -42,10 +42,10 @@ MIN_RUN = 3
 HANDSHAKE_LIFESPAN = 1.0
 """Seconds for the shards of one handshake message to arrive."""
 
-Accept = Callable[[Epoch, int, bytes, bool, Hashable, float], None]
-"""Epoch, topic index, plaintext, whether its number is the highest so far, address, time of arrival."""
-TakeHandshake = Callable[[int, bytes, bytes, Hashable, float], None]
-"""Type, common part of the header, message, address, time of arrival."""
+Accept = Callable[[Epoch, int, bytes, int, int, Hashable, float], None]
+"""Epoch, topic index, plaintext, message number, path, address, time of arrival."""
+TakeHandshake = Callable[[int, bytes, bytes, int, Hashable, float], None]
+"""Type, common part of the header, message, path, address, time of arrival."""
 
 
 class Receiver:
@@ -54,6 +54,7 @@ class Receiver:
     Args:
         session_id: Of the session.
         config: Bounds.
+        find_path: Path by its id, or None.
         find_epoch: Epoch by its id, or None.
         accept: Called with each authentic message, once.
         handshake: Called with each complete, not yet authenticated handshake message.
@@ -64,6 +65,7 @@ class Receiver:
         self,
         session_id: int,
         config: Config,
+        find_path: Callable[[int], Path | None],
         find_epoch: Callable[[int], Epoch | None],
         accept: Accept,
         handshake: TakeHandshake,
@@ -71,6 +73,7 @@ class Receiver:
     ) -> None:
         self._session_id = session_id
         self._max_length = config.max_message + OVERHEAD
+        self._find_path = find_path
         self._find_epoch = find_epoch
         self._accept = accept
         self._handshake = handshake
@@ -78,66 +81,78 @@ class Receiver:
         self.messages = Reassembly(config.reassembly_limit, on_expired)
         self._handshakes = Reassembly(2 * MAX_HANDSHAKE, _nothing)
 
-    def receive(self, data: memoryview, address: Hashable, path: Path, now: float, segment: int | None) -> None:
-        """Take a datagram, or a batch of datagrams of ``segment`` bytes (the last may be shorter)."""
+    def receive(self, data: memoryview, address: Hashable, path: int | None, now: float, segment: int | None) -> None:
+        """Take a datagram, or a batch of datagrams of ``segment`` bytes (the last may be shorter).
+
+        Args:
+            data: The bytes.
+            address: Where they came from.
+            path: By which path they came; None: the headers say it, and all of a batch came by the same.
+            now: Time.
+            segment: Size of the datagrams of a batch.
+        """
         total = len(data)
-        path.bytes_received += total
-        if segment is None or not 0 < segment < total:
-            path.packets_received += 1
-            self._packet(data, address, path, now)
+        by = path if path is not None else data[PATH_AT] if total > PATH_AT else 0
+        known = self._find_path(by)
+        several = segment is not None and 0 < segment < total
+        if known is not None:
+            known.bytes_received += total
+            known.packets_received += -(-total // segment) if several and segment else 1
+        if not several or segment is None:
+            self._packet(data, address, by, known, now)
             return
         whole = total // segment
-        path.packets_received += -(-total // segment)
         first = pull_header(data)
         if whole < MIN_RUN or first is None or segment <= HEADER_SIZE or first[5] == segment - HEADER_SIZE:
             for start in range(0, total, segment):
-                self._packet(data[start : start + segment], address, path, now)
+                self._packet(data[start : start + segment], address, by, known, now)
             return
         rows = np.frombuffer(data, np.uint8, whole * segment).reshape(whole, segment)
         change = (rows[1:, :BLOCK_END] != rows[:-1, :BLOCK_END]).any(axis=1)
         for start, end in pairwise([0, *(np.flatnonzero(change) + 1).tolist(), whole]):
-            if end - start < MIN_RUN or not self._run(rows[start:end], address, path, now):
+            if end - start < MIN_RUN or not self._run(rows[start:end], address, by, known, now):
                 for i in range(start, end):
-                    self._packet(data[i * segment : (i + 1) * segment], address, path, now)
+                    self._packet(data[i * segment : (i + 1) * segment], address, by, known, now)
         if total > whole * segment:
-            self._packet(data[whole * segment :], address, path, now)
+            self._packet(data[whole * segment :], address, by, known, now)
 
     def sweep(self, now: float) -> None:
         """Drop incomplete messages that are too old."""
         self.messages.expire_all(now)
         self._handshakes.expire_all(now)
 
-    def _packet(self, data: memoryview, address: Hashable, path: Path, now: float) -> None:
+    def _packet(self, data: memoryview, address: Hashable, by: int, path: Path | None, now: float) -> None:
         size = len(data) - HEADER_SIZE
         if size <= 0:
             self.rejected["short"] += 1
             return
         kind, session_id, epoch_id, high, low, topic, length, block, index, path_id, packet = HEADER.unpack_from(data)
         if kind != DATA or session_id != self._session_id:
-            self._other(data, kind, session_id, size, length, block, index, address, now)
+            self._other(data, kind, session_id, size, length, block, index, by, address, now)
             return
         epoch = self._find_epoch(epoch_id)
         if epoch is None:
             self.rejected["epoch"] += 1
             return
-        if path_id != path.id:
+        if path_id != by:
             self.rejected["path"] += 1
             return
-        path.arrivals.add(packet)
+        if path is not None:
+            path.arrivals.add(packet)
         number = high << 32 | low
         if length != size:
             entry = self._entry(epoch, number, topic, length, block, bytes(data[:COMMON_SIZE]), size, 1, now)
             if entry is not None:
                 sealed = self.messages.add(entry, block, index, data[HEADER_SIZE:])
                 if sealed is not None:
-                    self._open(epoch, number, topic, sealed, entry.key[0], address, now)
+                    self._open(epoch, number, topic, sealed, entry.key[0], by, address, now)
         elif not self._refused(epoch, number, topic, 1):
             if block or index:
                 self.rejected["shape"] += 1
             else:
-                self._open(epoch, number, topic, data[HEADER_SIZE:], data[:COMMON_SIZE], address, now)
+                self._open(epoch, number, topic, data[HEADER_SIZE:], data[:COMMON_SIZE], by, address, now)
 
-    def _run(self, rows: Bytes, address: Hashable, path: Path, now: float) -> bool:
+    def _run(self, rows: Bytes, address: Hashable, by: int, path: Path | None, now: float) -> bool:
         """Several packets of one block of a large message; False if they have to be looked at one by one."""
         fields = pull_header(rows[0].data)
         if fields is None or fields[0] != DATA or fields[1] != self._session_id:
@@ -145,16 +160,17 @@ class Receiver:
         _, _, epoch_id, number, topic, length, block, _, _, _ = fields
         epoch = self._find_epoch(epoch_id)
         size = rows.shape[1] - HEADER_SIZE
-        if epoch is None or length == size or (rows[:, PATH_AT] != path.id).any():
+        if epoch is None or length == size or (rows[:, PATH_AT] != by).any():
             return False
         numbers = np.ascontiguousarray(rows[:, NUMBER_AT:HEADER_SIZE]).view(">u4")
-        path.arrivals.add_all(numbers.astype(np.uint32).tobytes())
+        if path is not None:
+            path.arrivals.add_all(numbers.astype(np.uint32).tobytes())
         common = rows[0, :COMMON_SIZE].tobytes()
         entry = self._entry(epoch, number, topic, length, block, common, size, len(rows), now)
         if entry is not None:
             sealed = self.messages.add_rows(entry, block, rows.copy())
             if sealed is not None:
-                self._open(epoch, number, topic, sealed, common, address, now)
+                self._open(epoch, number, topic, sealed, common, by, address, now)
         return True
 
     def _entry(
@@ -206,6 +222,7 @@ class Receiver:
         topic: int,
         sealed: memoryview,
         common: memoryview | bytes,
+        by: int,
         address: Hashable,
         now: float,
     ) -> None:
@@ -213,9 +230,8 @@ class Receiver:
         if plaintext is None or len(plaintext) < INNER.size:
             self.rejected["forged"] += 1
             return
-        newest = number > epoch.replay.highest
         if epoch.replay.accept(number):
-            self._accept(epoch, topic, plaintext, newest, address, now)
+            self._accept(epoch, topic, plaintext, number, by, address, now)
 
     def _other(
         self,
@@ -226,6 +242,7 @@ class Receiver:
         length: int,
         block: int,
         index: int,
+        by: int,
         address: Hashable,
         now: float,
     ) -> None:
@@ -241,7 +258,7 @@ class Receiver:
         else:
             common = bytes(data[:COMMON_SIZE])
             if length == size:
-                self._handshake(kind, common, bytes(data[HEADER_SIZE:]), address, now)
+                self._handshake(kind, common, bytes(data[HEADER_SIZE:]), by, address, now)
                 return
             entry = self._handshakes.entry(common, size, length, 0, block, HANDSHAKE_LIFESPAN, now)
             if entry is None:
@@ -249,7 +266,7 @@ class Receiver:
                 return
             message = self._handshakes.add(entry, block, index, data[HEADER_SIZE:])
             if message is not None:
-                self._handshake(kind, common, bytes(message), address, now)
+                self._handshake(kind, common, bytes(message), by, address, now)
 
 
 def _nothing(_topic: int) -> None:

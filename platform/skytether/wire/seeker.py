@@ -32,8 +32,8 @@ class Seeker:
         self._entropy = entropy
         self._wait = config.hello_retry
         self._proposal = entropy(1)[0]
-        self.peer: Hashable | None = None
-        """Where the service should be."""
+        self.peers: set[Hashable] = set()
+        """Where the service should be, seen from all paths."""
         self.hello: Hello | None = None
         """The one that is to be answered."""
         self.due = math.inf
@@ -41,9 +41,9 @@ class Seeker:
         self._elsewhere = False
         """Told to look in another place, from which no answer came yet."""
 
-    def look_at(self, peer: Hashable, connected: bool) -> None:
+    def look_at(self, peers: set[Hashable], connected: bool) -> None:
         """Look there at once, even if somebody is heard from another place."""
-        self.peer = peer
+        self.peers = peers
         self.hello = None
         self.due = 0.0
         self._wait = self._config.hello_retry
@@ -51,7 +51,7 @@ class Seeker:
 
     def counts(self, address: Hashable) -> bool:
         """Whether a message from there tells that the service is found."""
-        return not self._elsewhere or address == self.peer
+        return not self._elsewhere or address in self.peers
 
     def found(self, now: float, epoch: int) -> None:
         """The service is heard; ``epoch`` is the one in use, so that the next HELLO proposes another."""
@@ -59,7 +59,7 @@ class Seeker:
         self._elsewhere = False
         self._wait = self._config.hello_retry
         self._proposal = epoch
-        self.due = now + self._config.probe_after if self.peer is not None else math.inf
+        self.due = now + self._config.probe_after if self.peers else math.inf
 
     def rest(self, until: float) -> None:
         """Ask again, anew, at that time."""

@@ -12,22 +12,21 @@ from .config import Config
 from .control import Goodbye, Ping, Report
 from .crypto import KEY_SIZE
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
-from .events import Connected, Disconnected, Event, MessageReceived, PeerMoved, Refused
+from .events import Connected, Disconnected, Event, MessageReceived, PathSwitched, PeerMoved, Refused
 from .handshake import NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
 from .ledger import Ledger
 from .measure import Outbound
 from .packet import HEADER_SIZE, HELLO, WELCOME
-from .path import LossMeter, Path, Transmit
+from .path import Path, Transmit
+from .paths import Choice, Paths
 from .receiver import Receiver
 from .redundancy import FixedRedundancy
-from .seeker import Seeker, patience
+from .seeker import Seeker
 from .sender import INNER, Sender
-from .stats import PathStats, SessionStats
+from .stats import SessionStats
 from .table import ANY, index_topics
 from .topic import Role, Topic
 
-PING_SPACING = 0.02
-"""Least time between pings sent as answers, so that replayed packets cannot ask for many."""
 GOODBYES = 3
 """Nobody asks for a lost goodbye."""
 COPY_BELOW = 4096
@@ -77,12 +76,14 @@ class Session:
         self._table = index_topics(topics)
         self._config = config or Config()
         self._events: deque[Event] = deque()
-        self._path = Path(0, self._config, now)
+        self._paths = Paths(self._config, self._say_by, self._on_choice, now)
+        self._peer: Hashable | None = None
         self._redundancy = FixedRedundancy(self._config)
-        self._sender = Sender(session_id, self._config, self._redundancy)
+        self._sender = Sender(session_id, self._config, self._redundancy, self._paths.choice.active)
         self._receiver = Receiver(
-            session_id, self._config, self._find_epoch, self._on_message, self._on_handshake, self._on_expired
-        )
+            session_id, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
+            self._on_expired,
+        )  # fmt: skip
         self._ledger = Ledger(role)
         self._clock = ClockOffset()
         self._raw: deque[Transmit] = deque()
@@ -96,10 +97,7 @@ class Session:
         self._closed = False
         self._handshakes = 0
         self._last_heard = math.nan
-        self._echo: tuple[float, float] | None = None
-        """Peer's latest time stamp, and when it arrived."""
-        self._ping_at = math.inf
-        self._pinged_at = -math.inf
+        self._sweep_at = math.inf
         self._report_at = math.inf
         self._check_at = math.inf
         self._control = SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
@@ -138,11 +136,55 @@ class Session:
         self._sender.put(sender, payload, now)
         return True
 
-    def set_peer(self, address: Hashable) -> None:
-        """Where the robot's end speaks to from now on (the service was restarted elsewhere)."""
+    def set_peer(self, address: Hashable, path: int | None = None) -> None:
+        """Where the robot's end speaks to from now on (the service was restarted elsewhere).
+
+        Args:
+            address: Of the service's end.
+            path: As seen from this path only; None: from all, those to come included.
+        """
+        if path is None:
+            self._peer = address
+        for each in self._paths:
+            if path in (None, each.id):
+                each.peer = each.address = address
         if self._door is None and not self._closed:
-            self._seeker.look_at(address, connected=self._epoch is not None)
-        self._path.address = address
+            self._seeker.look_at({p.peer for p in self._paths}, connected=self._epoch is not None)
+
+    def open_path(self, path: int, now: float, *, cost: int = 0, peer: Hashable | None = None) -> None:
+        """Add a path from the robot's end, or change its cost; path 0 is there from the beginning.
+
+        Raising the cost of the path in use is a planned switch: traffic goes over both paths for a while.
+
+        Args:
+            path: 0 to 255; an id used before should not come again soon.
+            now: Time.
+            cost: 0 to 255; of paths that are as good as each other the cheapest is used.
+            peer: Where the service is, seen from this path, if not where `set_peer` says.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        if not (0 <= path < 256 and 0 <= cost < 256):
+            raise ValueError(f"path and cost must be 0 to 255, not {path} and {cost}")
+        known = self._paths.get(path) is not None
+        opened = self._paths.open(path, cost, now)
+        if not known:
+            opened.peer = opened.address = self._peer if peer is None else peer
+            self._seeker.peers.add(opened.peer)
+        for each in self._paths:
+            self._paths.ping(each, now)
+        self._paths.choose(now)
+
+    def close_path(self, path: int, now: float) -> None:
+        """The path is gone. The last one stays until another is opened."""
+        self._paths.close(path, now)
+
+    def shrink(self, path: int, size: int, now: float) -> None:
+        """The system refused to send a datagram of ``size`` bytes: too large for the path."""
+        known = self._paths.get(path)
+        if known is not None:
+            known.mtu.refuse(size, now)
 
     def close(self, now: float) -> None:
         """Say goodbye. Call `transmit` once more to send it; then the session is over."""
@@ -158,7 +200,7 @@ class Session:
 
     def stats(self, now: float) -> SessionStats:
         """A snapshot of all counters, both directions."""
-        path, clock = self._path, self._clock
+        clock = self._clock
         table = dict(self._table)
         if self._epoch is not None:
             for receiver in self._epoch.receive.values():
@@ -168,31 +210,36 @@ class Session:
         rejected = Counter(self._receiver.rejected)
         if self._receiver.messages.evicted:
             rejected["evicted"] = self._receiver.messages.evicted
-        paths = PathStats(
-            path.id, path.address, path.rtt, path.rtts.minimum, path.rtts.quantile(0.5), path.loss_out,
-            path.arrivals.loss, path.arrivals.burst, path.packets_sent, path.packets_received, path.bytes_sent,
-            path.bytes_received, path.pacer.rate * 8, self._ledger.overhead(),
-        )  # fmt: skip
+        paths = self._paths.stats(self._ledger.overhead(), now)
         return SessionStats(
-            self._connected, self._ledger.stats(table), (paths,), dict(rejected), clock.offset,
+            self._connected, self._ledger.stats(table), paths, dict(rejected), clock.offset,
             clock.error, self._handshakes, now - self._last_heard,
         )  # fmt: skip
 
     # --- what the owner of the socket calls
 
     def receive(
-        self, data: memoryview | bytes, address: Hashable, now: float, *, segment: int | None = None, path: int = 0
+        self,
+        data: memoryview | bytes,
+        address: Hashable,
+        now: float,
+        *,
+        segment: int | None = None,
+        path: int | None = None,
     ) -> None:
         """Take one datagram, or a batch of datagrams of ``segment`` bytes each (the last may be shorter).
 
-        Never raises, whatever the bytes. ``data`` may be reused after the call.
+        Never raises, whatever the bytes. ``data`` may be reused after the call. ``path`` is that of the socket; None
+        (the service's end has one socket for all) takes the packets' word for it.
         """
-        if not self._closed and path == self._path.id:
-            self._receiver.receive(memoryview(data), address, self._path, now, segment)
+        if not self._closed:
+            self._receiver.receive(memoryview(data), address, path, now, segment)
 
     def transmit(self, now: float) -> list[Transmit]:
         """What may be sent now, at most a burst; call again until it returns nothing."""
-        sent = self._sender.transmit(self._path, now)
+        sent: list[Transmit] = []
+        for path in self._paths:
+            sent += self._sender.transmit(path, now)
         if self._raw:
             sent = [*self._raw, *sent]
             self._raw.clear()
@@ -206,7 +253,10 @@ class Session:
         """When to call `handle_timer` and `transmit`, if nothing happens before; None: not by itself."""
         if self._closed:
             return None
-        due = min(self._sender.next_timer(), self._seeker.due, self._ping_at, self._report_at, self._check_at)
+        due = min(
+            self._sender.next_timer(), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
+            self._check_at,
+        )  # fmt: skip
         return due if due < math.inf else None
 
     def handle_timer(self, now: float) -> None:
@@ -217,13 +267,11 @@ class Session:
             self._check(now)
         if now >= self._seeker.due:
             self._seek(now)
-        if now >= self._ping_at:
-            self._ping(now)
+        self._paths.handle_timer(now, now - self._last_heard, self._connected)
+        if now >= self._sweep_at:
             self._receiver.sweep(now)
-            quiet = patience(self._config, now - self._last_heard)
-            self._ping_at = now + (self._config.keepalive if self._connected else quiet)
+            self._sweep_at = now + self._config.keepalive
         if now >= self._report_at:
-            self._path.arrivals.evaluate()
             self._report(now)
             self._report_at = now + self._config.report_interval
 
@@ -234,15 +282,17 @@ class Session:
         held = None if self._epoch is None else self._epoch.ciphers
         hello = self._seeker.seek(held, self._last_heard, now)
         if hello is not None:
-            self._send_raw(hello.common, hello.message, self._seeker.peer)
-            if held is not None:
-                self._ping(now)
+            for path in self._paths:
+                if path.peer is not None:
+                    self._send_raw(hello.common, hello.message, path, path.peer)
+                if held is not None:
+                    self._paths.ping(path, now)
 
-    def _on_handshake(self, kind: int, common: bytes, message: bytes, address: Hashable, now: float) -> None:
+    def _on_handshake(self, kind: int, common: bytes, message: bytes, path: int, address: Hashable, now: float) -> None:
         if kind == HELLO and self._door is not None:
             self._on_hello(self._door, common, message, address, now)
         elif kind == WELCOME and self._seeker.hello is not None:
-            self._on_welcome(self._seeker.hello, common, message, address, now)
+            self._on_welcome(self._seeker.hello, common, message, path, address, now)
         else:
             self._receiver.rejected["unasked"] += 1
 
@@ -253,16 +303,18 @@ class Session:
         if isinstance(answer, str):
             self._receiver.rejected[answer] += 1
         elif isinstance(answer, Resume):
-            if now >= self._pinged_at + PING_SPACING:
-                self._ping(now)
+            for path in self._paths:
+                self._paths.ping_soon(path, now)
         else:
             if answer.outcome is not None and answer.epoch is None:
                 answer.epoch = self._make_epoch(answer.outcome)
             if answer.reason and answer.reason != self._refusal:
                 self._refuse(answer.reason)
-            self._send_raw(answer.common, answer.message, address)
+            self._send_raw(answer.common, answer.message, self._paths.choice.active, address)
 
-    def _on_welcome(self, hello: Hello, common: bytes, message: bytes, address: Hashable, now: float) -> None:
+    def _on_welcome(
+        self, hello: Hello, common: bytes, message: bytes, path: int, address: Hashable, now: float
+    ) -> None:
         welcome = hello.open(common, message)
         if welcome is None:
             self._receiver.rejected["welcome_forged"] += 1
@@ -272,12 +324,17 @@ class Session:
                 self._refuse(welcome.reason)
             self._seeker.rest(now + self._config.hello_retry_max)
             return
-        self._start_epoch(self._make_epoch(welcome.outcome), address, now)
+        self._start_epoch(self._make_epoch(welcome.outcome), now)
+        came_by = self._paths.get(path)
+        if came_by is not None:
+            came_by.address = address
         if hello.sent == 1:  # else nobody knows which one was answered, and the first ping will tell more
             t1, t2, t3 = welcome.times
             self._clock.exchange(t1, t2, t3, now)
-            self._echo = t3, now
-        self._ping(now)
+            if came_by is not None:
+                came_by.echo = t3, now
+        for each in self._paths:
+            self._paths.ping(each, now)
 
     def _refuse(self, reason: str) -> None:
         self._refusal = reason
@@ -295,7 +352,7 @@ class Session:
             return self._previous
         return self._door.pending(epoch_id) if self._door is not None else None
 
-    def _start_epoch(self, epoch: Epoch, address: Hashable, now: float) -> None:
+    def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
         self._drop_previous()
         if self._epoch is not None:
@@ -305,15 +362,11 @@ class Session:
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
         self._clock = ClockOffset()
-        self._echo = None
-        path = self._path
-        path.address = address
-        path.arrivals = LossMeter()
-        path.loss_out = path.burst_out = math.nan
+        self._paths.start_epoch(now)
         self._handshakes += 1
         self._refusal = ""
         self._last_heard = now
-        self._ping_at = now
+        self._sweep_at = now + self._config.keepalive
         self._report_at = now + self._config.report_interval
         self._seeker.found(now, epoch.id)
         self._connect(epoch.topics, now)
@@ -323,7 +376,8 @@ class Session:
         self._drop_previous()
         self._epoch = None
         self._sender.start_epoch(None)
-        self._ping_at = self._report_at = math.inf
+        self._paths.end_epoch()
+        self._sweep_at = self._report_at = math.inf
         if self._door is None:
             self._seeker.rest(now + self._config.hello_retry)
         if self._connected:
@@ -364,25 +418,27 @@ class Session:
     # --- messages
 
     def _on_message(
-        self, epoch: Epoch, index: int, plaintext: bytes, newest: bool, address: Hashable, now: float
+        self, epoch: Epoch, index: int, plaintext: bytes, number: int, path: int, address: Hashable, now: float
     ) -> None:
         """One authentic message, the first time that it is complete."""
         if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
             if self._door is not None:
                 self._door.confirm()
-            self._start_epoch(epoch, address, now)
+            self._start_epoch(epoch, now)
+        came_by = self._paths.get(path)
+        if came_by is None:
+            came_by = self._on_new_path(index, plaintext, path, now)
         if epoch is self._epoch and self._seeker.counts(address):
             self._last_heard = now
-            if newest and address != self._path.address:
-                self._path.address = address
-                self._events.append(PeerMoved(address))
+            if came_by is not None:
+                self._on_heard(came_by, number, address, now)
             if not self._connected:
                 self._connect(epoch.topics, now)
             if self._seeker.hello is not None:
                 self._seeker.found(now, epoch.id)
         sequence, micros = INNER.unpack_from(plaintext)
         if index == 0:
-            self._on_control(epoch, plaintext[INNER.size :], micros, now)
+            self._on_control(epoch, plaintext[INNER.size :], micros, came_by, now)
             return
         topic, clock = epoch.receive[index], self._clock
         if epoch is self._epoch and clock.known:
@@ -394,6 +450,33 @@ class Session:
             payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
             self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, error, now))
 
+    def _on_new_path(self, index: int, plaintext: bytes, path: int, now: float) -> Path | None:
+        """The robot speaks by a path that is not known yet: its ping says so, or there is none other."""
+        if self._door is None:
+            return None
+        ping = control.pull_control(plaintext[INNER.size :]) if index == 0 else None
+        if self._paths.addressed and not (isinstance(ping, Ping) and ping.path == path):
+            return None
+        return self._paths.open(path, 0, now)
+
+    def _on_heard(self, path: Path, number: int, address: Hashable, now: float) -> None:
+        """A path is alive; of its messages the newest tells where the peer is."""
+        if number > path.newest:
+            path.newest = number
+            if address != path.address:
+                moved = path.address is not None
+                path.address = address
+                if moved:
+                    path.mtu.restart(now)
+                    self._events.append(PeerMoved(address))
+                self._paths.choose(now)
+        self._paths.heard(path, now)
+
+    def _on_choice(self, choice: Choice, reason: str, now: float) -> None:
+        self._sender.use(self._paths, choice.active, choice.other, choice.doubled, now)
+        if reason:
+            self._events.append(PathSwitched(choice.active.id, reason))
+
     def _outdated(self, epoch: Epoch, index: int) -> bool:
         """Whether a message of the keys before comes after a newer one under the present keys."""
         if epoch is self._epoch or self._epoch is None:
@@ -401,34 +484,26 @@ class Session:
         present = self._epoch.receive.get(index)
         return present is not None and present.newest >= 0
 
-    def _on_control(self, epoch: Epoch, data: bytes, micros: int, now: float) -> None:
+    def _on_control(self, epoch: Epoch, data: bytes, micros: int, path: Path | None, now: float) -> None:
         message = control.pull_control(data)
         if message is None:
             self._receiver.rejected["control"] += 1
         elif epoch is not self._epoch:
             return
         elif isinstance(message, Ping):
-            self._on_ping(message, micros / 1e6, now)
+            if path is not None and path.id == message.path:
+                if self._door is not None:
+                    path.cost = message.cost
+                exchange = self._paths.take(message, path, micros / 1e6, now)
+                if exchange is not None:
+                    self._clock.exchange(*exchange, now)
         elif isinstance(message, Report):
             self._ledger.take(message, epoch, now)
-            self._path.loss_out, self._path.burst_out = message.loss, message.burst
+            reported = self._paths.get(message.path)
+            if reported is not None:
+                reported.loss_out, reported.burst_out = message.loss, message.burst
         elif isinstance(message, Goodbye):
             self._end_epoch(now)
-
-    def _on_ping(self, ping: Ping, sent_at: float, now: float) -> None:
-        first = self._echo is None
-        if self._echo is None or sent_at > self._echo[0]:
-            self._echo = sent_at, now
-        if first and now >= self._pinged_at + PING_SPACING:
-            self._ping(now)  # so that the peer need not wait for its first exchange of time stamps
-        if ping.echo is None:
-            return
-        t1, hold = ping.echo / 1e6, ping.hold / 1e6
-        rtt = now - t1 - hold
-        if rtt >= 0:
-            self._clock.exchange(t1, sent_at - hold, sent_at, now)
-            self._path.rtt = rtt
-            self._path.rtts.add(rtt)
 
     def _on_expired(self, index: int) -> None:
         topic = self._epoch.receive.get(index) if self._epoch is not None else None
@@ -437,32 +512,28 @@ class Session:
 
     # --- sending of our own accord
 
-    def _ping(self, now: float) -> None:
-        self._pinged_at = now
-        if self._echo is None:
-            ping = Ping(None, 0)
-        else:
-            sent_at, arrived_at = self._echo
-            ping = Ping(round(sent_at * 1e6), int((now - arrived_at) * 1e6))
-        self._say(control.push_ping(ping), now)
-
     def _report(self, now: float) -> None:
         if self._epoch is None:
             return
-        meter = self._path.arrivals
         rows = self._ledger.rows(self._epoch, now)
-        for message in control.push_reports(meter.loss, meter.burst, *rows):
-            self._say(message, now)
+        for path in self._paths:
+            path.arrivals.evaluate()
+            for message in control.push_reports(path.id, path.arrivals.loss, path.arrivals.burst, *rows):
+                self._say(message, now)
+            rows = [], []
 
     def _say(self, message: bytes, now: float) -> None:
         """Queue a control message, once: the next one of its kind makes up for its loss."""
         self._sender.put(self._control, message, now, extra=0)
 
-    def _send_raw(self, common: bytes, message: bytes, address: Hashable) -> None:
+    def _say_by(self, path: Path, message: bytes, now: float) -> None:
+        """Send a control message by one path, at once."""
+        self._sender.say(self._control, message, path, now)
+
+    def _send_raw(self, common: bytes, message: bytes, path: Path, address: Hashable) -> None:
         if len(self._raw) >= MAX_RAW:
             return
         packets, size = cut(common, message, self._config.mtu - HEADER_SIZE, self._redundancy)
-        path = self._path
         path.pacer.spend(len(packets))
         path.packets_sent += -(-len(packets) // size)
         path.bytes_sent += len(packets)

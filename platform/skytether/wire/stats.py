@@ -79,7 +79,15 @@ class PathStats:
     rate: float = float("nan")
     """Pacing budget, bits per second."""
     overhead: float = float("nan")
-    """Bytes sent beyond payload, as a share of payload."""
+    """Bytes sent beyond payload, as a share of payload; of all paths together."""
+    active: bool = True
+    """Whether this end sends by it."""
+    health: str = "live"
+    """``live``, ``suspect`` (an answer is overdue), ``new`` (none came yet) or ``dead``, for what this end sends. Only
+    asked where there are several paths."""
+    cost: int = 0
+    mtu: int = 0
+    """Largest datagram sent by it."""
 
 
 @dataclass(frozen=True, slots=True)

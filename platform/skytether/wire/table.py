@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from .topic import Direction, Topic
+from .topic import Direction, PathUse, Topic
 
 ANY = "*"
 """Name and type of a service's row that takes every topic the robot offers."""
@@ -94,7 +94,7 @@ def pull_offer(data: bytes) -> list[Topic]:
 
 def push_answer(agreed: Sequence[tuple[int, Topic]]) -> bytes:
     """The agreed topics as they travel in WELCOME: the robot knows the rest by index."""
-    return _push([[i, t.priority, t.period, t.lifespan, t.depth, t.delivery] for i, t in agreed])
+    return _push([[i, t.priority, t.period, t.lifespan, t.depth, t.delivery, t.paths.value] for i, t in agreed])
 
 
 def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]]:
@@ -105,9 +105,9 @@ def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]
     """
     agreed = []
     for row in _pull(data):
-        if not isinstance(row, list) or len(row) != 6 or not all(isinstance(row[i], int) for i in (0, 1, 4)):
+        if not isinstance(row, list) or len(row) != 7 or not all(isinstance(row[i], int) for i in (0, 1, 4)):
             raise ValueError("not a row of an agreed table")
-        index, priority, period, lifespan, depth, delivery = row
+        index, priority, period, lifespan, depth, delivery, paths = row
         if not 1 <= index <= len(offered):
             raise ValueError("not a row of an agreed table")
         try:
@@ -118,6 +118,7 @@ def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]
                 lifespan=float(lifespan),
                 depth=depth,
                 delivery=float(delivery),
+                paths=PathUse(paths),
             )
         except (TypeError, OverflowError) as error:
             raise ValueError("not a row of an agreed table") from error

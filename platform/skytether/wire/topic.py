@@ -27,6 +27,15 @@ class Direction(StrEnum):
         return Role.ROBOT if self is Direction.IN else Role.SERVICE
 
 
+class PathUse(StrEnum):
+    """How a topic uses a session's paths where there are several (rule 8)."""
+
+    FAILOVER = "failover"
+    """One path; both while that is in doubt or being left."""
+    REDUNDANT = "redundant"
+    """Every message by two paths: losing one of them loses nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """One topic and its quality of service.
@@ -46,6 +55,7 @@ class Topic:
             waiting one, and at the receiver an older message after a newer one is superseded.
             More than 1: every message is delivered, in order of arrival.
         delivery: Share of messages that should arrive, in (0, 1); sets the redundancy (rule 5).
+        paths: Whether each message goes by two paths where there are several.
     """
 
     name: str
@@ -58,6 +68,7 @@ class Topic:
     lifespan: float = 0.1
     depth: int = 1
     delivery: float = 0.99
+    paths: PathUse = PathUse.FAILOVER
 
     def __post_init__(self) -> None:
         """Refuse what no endpoint could honour.
