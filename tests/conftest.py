@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import NoReturn
 
@@ -39,3 +40,11 @@ def netns() -> None:
     trouble = why_unavailable()
     if trouble is not None:
         require("netns", trouble)
+
+
+@pytest.fixture(scope="session")
+def nftables(netns: None) -> None:
+    """The programs of a router that translates addresses, for network namespaces."""
+    for program in ("nft", "conntrack"):
+        if shutil.which(program) is None:
+            require("nftables", f"the program '{program}' is missing: install nftables and conntrack")

@@ -1,0 +1,235 @@
+"""Sessions through the NAT that Linux routers use: three network namespaces, nftables masquerade, conntrack.
+
+    robot 10.0.1.2 ── 10.0.1.1 router 203.0.113.1 ── 203.0.113.9 cloud
+
+The cloud has no way to 10.0.1.0: what reaches the robot went through the router's table of bindings.
+"""
+
+import contextlib
+import socket
+import subprocess
+import threading
+import time
+
+import pytest
+
+from skytether.bridge import Relay
+from skytether.lab.netns import Namespace
+from skytether.wire.events import Connected, Disconnected, PeerMoved
+from skytether.wire.topic import Role
+
+pytestmark = pytest.mark.slow
+
+ROBOT, ROUTER_IN, ROUTER_OUT, CLOUD = "10.0.1.2", "10.0.1.1", "203.0.113.1", "203.0.113.9"
+PERIOD = 0.01
+
+
+class Nat:
+    """The three namespaces."""
+
+    def __init__(self, stack):
+        self.robot, self.router, self.cloud = (stack.enter_context(Namespace()) for _ in range(3))
+        self._join(self.robot, ROBOT, "lan", ROUTER_IN)
+        self._join(self.cloud, CLOUD, "wan", ROUTER_OUT)
+        self.robot.ip("route", "add", "default", "via", ROUTER_IN)
+        self.router.sysctl("net.ipv4.ip_forward", "1")
+        self.masquerade(20_000)
+
+    def _join(self, end, address, name, router_address):
+        self.router.ip("link", "add", name, "type", "veth", "peer", "name", "eth0", "netns", end.path)
+        self.router.ip("address", "add", f"{router_address}/24", "dev", name)
+        self.router.ip("link", "set", name, "up")
+        end.ip("address", "add", f"{address}/24", "dev", "eth0")
+        end.ip("link", "set", "eth0", "up")
+
+    def masquerade(self, first_port):
+        """Bind outgoing flows to ports from here on; forgets all bindings that there are."""
+        self._nft(
+            f"""flush ruleset
+            table ip nat {{
+                chain post {{
+                    type nat hook postrouting priority srcnat; policy accept;
+                    oifname "wan" meta l4proto udp masquerade to :{first_port}-{first_port + 999};
+                }}
+            }}"""
+        )
+        self.run(self.router, "conntrack", "-F")
+
+    def _nft(self, rules):
+        self.run(self.router, "nft", "-f", "-", text=rules)
+
+    @staticmethod
+    def run(where, *command, text=""):
+        where.run(lambda: subprocess.run(command, input=text, check=True, capture_output=True, text=True))
+
+
+@pytest.fixture
+def nat(nftables):
+    with contextlib.ExitStack() as stack:
+        yield Nat(stack)
+
+
+class Stream:
+    """Publishes numbered messages at 100 Hz at one end, and keeps when."""
+
+    def __init__(self, end, topic):
+        self._end, self._topic = end, topic
+        self.published = {}
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        due = time.monotonic()
+        while not self._stopped.is_set():
+            number = len(self.published).to_bytes(4, "big")
+            self.published[number] = time.monotonic()
+            self._end.publish(self._topic, number)
+            due += PERIOD
+            self._stopped.wait(max(0.0, due - time.monotonic()))
+
+    def lost(self, receiver):
+        """When those messages were published that did not arrive."""
+        self._stopped.set()
+        self._thread.join()
+        last = max(self.published)
+        with contextlib.suppress(AssertionError):
+            receiver.graph.wait(lambda port: (self._topic, last) in port.messages, 1)
+        arrived = {payload for topic, payload in receiver.graph.messages if topic == self._topic}
+        return [when for number, when in self.published.items() if number not in arrived]
+
+
+@pytest.fixture
+def session(nat, ends):
+    """Service in the cloud and robot behind the router, connected."""
+    service = ends.make(Role.SERVICE, bind=(CLOUD, 0))
+    nat.cloud.run(service.start)
+    robot = ends.make(Role.ROBOT, bind=("0.0.0.0", 0), peer=service.address)
+    nat.robot.run(robot.start)
+    robot.graph.wait_connected()
+    service.graph.wait_connected()
+    return service, robot
+
+
+def peer_of(service):
+    return service.stats().paths[0].address[:2]
+
+
+def flow(service, robot, *events):
+    """Both directions at 100 Hz through some events, each given 0.4 s; returns what was lost, up and down, and when."""
+    up, down = Stream(robot, "force"), Stream(service, "cmd_vel")
+    times = []
+    time.sleep(0.2)
+    for event in events:
+        moved = service.graph.count(PeerMoved)
+        times.append(time.monotonic())
+        event()
+        service.graph.wait(lambda port, moved=moved: port.count(PeerMoved) > moved)
+        time.sleep(0.3)
+    return up.lost(service), down.lost(robot), times
+
+
+def test_a_robot_behind_a_masquerade_is_served_where_the_router_says(nat, session):
+    service, robot = session
+    up, down, _ = flow(service, robot)
+    assert up == down == []
+    host, port = peer_of(service)
+    assert host == ROUTER_OUT
+    assert 20_000 <= port < 21_000
+
+
+def test_bindings_changed_in_mid_stream_cost_what_was_in_flight_at_most(nat, session):
+    service, robot = session
+    changes = [lambda first=first: nat.masquerade(first) for first in (30_000, 40_000, 50_000)]
+    up, down, times = flow(service, robot, *changes)
+    assert peer_of(service)[1] // 1000 == 50
+    # The router's rules are gone for some milliseconds while they are exchanged; both programs take about 10.
+    for lost in (up, down):
+        assert all(any(0 <= when - t < 0.1 for t in times) for when in lost)
+        assert len(lost) <= 3 * 5
+    assert robot.graph.count(Connected) == service.graph.count(Connected) == 1
+    assert robot.graph.count(Disconnected) == service.graph.count(Disconnected) == 0
+
+
+def test_the_same_through_a_relay(nat, ends):
+    service = ends.make(Role.SERVICE, bind=(CLOUD, 0))
+    relay = Relay((CLOUD, 0))
+    nat.cloud.run(service.start)
+    nat.cloud.run(relay.start)
+    try:
+        relay.add("0000000000000007", *service.address)
+        robot = ends.make(Role.ROBOT, bind=("0.0.0.0", 0), peer=relay.address)
+        nat.robot.run(robot.start)
+        robot.graph.wait_connected()
+        service.graph.wait_connected()
+        up, down, (change,) = flow(service, robot, lambda: nat.masquerade(30_000))
+        for lost in (up, down):
+            assert all(0 <= when - change < 0.1 for when in lost)
+        (session,) = relay.stats().sessions.values()
+        assert len(session.addresses) == 2
+        assert session.addresses[1].startswith(f"{ROUTER_OUT}:30")
+        assert robot.graph.count(Connected) == service.graph.count(Connected) == 1
+    finally:
+        relay.stop()
+
+
+def test_a_router_that_restarts_costs_its_outage(nat, session):
+    service, robot = session
+    outage = 0.3
+
+    def restart():
+        nat.router.ip("link", "set", "wan", "down")
+        nat.masquerade(45_000)
+        time.sleep(outage)
+        nat.router.ip("link", "set", "wan", "up")
+
+    up, down, (start,) = flow(service, robot, restart)
+    assert up
+    assert down
+    for lost in (up, down):
+        assert all(0 <= when - start < outage + 0.2 for when in lost)
+    assert robot.graph.count(Connected) == service.graph.count(Connected) == 1
+
+
+def test_another_address_of_the_robots_interface_is_the_same_session(nat, session):
+    service, robot = session
+
+    def move():
+        nat.robot.ip("address", "add", "10.0.1.77/24", "dev", "eth0")
+        nat.robot.ip("address", "del", f"{ROBOT}/24", "dev", "eth0")
+        # Secondary addresses go with the first one, and routes with the last.
+        nat.robot.ip("address", "replace", "10.0.1.77/24", "dev", "eth0")
+        nat.robot.ip("route", "replace", "default", "via", ROUTER_IN)
+
+    up, down, (start,) = flow(service, robot, move)
+    for lost in (up, down):
+        assert all(0 <= when - start < 0.1 for when in lost)
+    assert robot.graph.count(Connected) == service.graph.count(Connected) == 1
+
+
+def test_an_idle_session_keeps_its_binding_where_others_lose_theirs(nat, session):
+    service, robot = session
+    nat.router.sysctl("net.netfilter.nf_conntrack_udp_timeout", "1")
+    nat.router.sysctl("net.netfilter.nf_conntrack_udp_timeout_stream", "1")
+    nat.masquerade(25_000)
+    service.graph.wait(lambda port: port.count(PeerMoved))
+
+    def open_socket(address):
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.bind((address, 0))
+        sock.settimeout(5)
+        return sock
+
+    with nat.cloud.run(lambda: open_socket(CLOUD)) as far, nat.robot.run(lambda: open_socket(ROBOT)) as near:
+        near.sendto(b"hello", far.getsockname())
+        seen = far.recvfrom(100)[1]
+        far.sendto(b"at once", seen)
+        assert near.recv(100) == b"at once"
+        time.sleep(3.5)  # twice what the router waits, which it rounds up
+        far.sendto(b"later", seen)
+        near.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            near.recv(100)
+    assert service.publish("cmd_vel", b"later")
+    robot.graph.wait(lambda port: ("cmd_vel", b"later") in port.messages)
+    assert service.graph.count(PeerMoved) == 1
