@@ -92,7 +92,7 @@ PING_SIZE = _PING.size
 
 def push_ping(ping: Ping, padding: int = 0) -> bytes:
     """Encode, with that many zeros more."""
-    echo = NO_ECHO if ping.echo is None else ping.echo
+    echo = NO_ECHO if ping.echo is None else min(max(ping.echo, 0), NO_ECHO - 1)  # a peer may claim any time
     hold = min(max(ping.hold, 0), 2**32 - 1)
     return _PING.pack(PING, ping.path, ping.cost, ping.ask, ping.size, echo, hold) + bytes(padding)
 

@@ -60,8 +60,8 @@ class Paths:
     Args:
         config: Settings.
         say: Sends a ping by a path, at once.
-        changed: Called with the choice and what became of the path before, whenever the choice is another one. The
-            reason is empty unless another path became the active one: ``lost``, ``closed``, ``cheaper`` or ``better``.
+        changed: Called with the choice whenever it is another one, and when paths came or went. The reason is empty
+            unless another path became the active one: ``lost``, ``closed``, ``cheaper`` or ``better``.
         now: Time.
     """
 
@@ -111,6 +111,7 @@ class Paths:
             path = self._paths[path_id] = Path(path_id, self._config, now)
             if self._up:
                 path.start_epoch(now)
+            self._changed(self.choice, "", now)
         path.cost = cost
         return path
 
@@ -125,6 +126,7 @@ class Paths:
         if path is self.choice.active:
             self._switch(self._best(self, now), "closed", now)
         self.choose(now)
+        self._changed(self.choice, "", now)
         if len(self._paths) == 1:  # nobody asks any more, so no answer can be missing
             self.choice.active.liveness.calm()
 

@@ -1,0 +1,62 @@
+"""An authentic peer may be hostile or mistaken: what it says is believed within bounds, and breaks nothing."""
+
+import pytest
+
+from skytether.wire import Role, control, packet
+from skytether.wire.paths import MAX_PATHS
+from skytether.wire.sender import INNER
+
+ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
+
+
+def say(link, role, message, *, stamp=None, path=0, address=None):
+    """Let an end hear a control message that its peer sealed, by any path and with any time stamp."""
+    receiver = SERVICE if role is ROBOT else ROBOT
+    epoch = link.sessions[role]._epoch
+    epoch.next_number += 1
+    number, stamp = epoch.next_number, round(link.now * 1e6) if stamp is None else stamp
+    plaintext = INNER.pack(0, stamp) + message
+    session = link.sessions[role].session_id
+    common = packet.push_common(packet.DATA, session, epoch.id, number, 0, len(plaintext) + 16)
+    sealed = epoch.ciphers.seal(number, plaintext, common)
+    epoch.next_number += 1
+    link.inject(receiver, common + packet.push_shard(0, 0, path, number) + sealed, address or link.addresses[role])
+
+
+def ping(path=0, **fields):
+    return control.push_ping(
+        control.Ping(**{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "hold": 0} | fields)
+    )
+
+
+@pytest.mark.parametrize("role", Role)
+@pytest.mark.parametrize("stamp", [0, 1, 2**63, 2**64 - 1])
+def test_any_time_stamp_is_echoed(world, role, stamp):
+    link = world.link()
+    say(link, role, ping(), stamp=stamp)
+    link.run(1.0)
+    assert all(end.stats(link.now).connected for end in link.sessions.values())
+
+
+def test_a_robot_with_many_paths(world):
+    """Each opens when it is first heard; beyond the most that there may be, one makes room."""
+    link = world.link()
+    for path in range(2 * MAX_PATHS):
+        say(link, ROBOT, ping(path), path=path, address=f"robot {path}")
+        link.run(0.05)
+        assert len(link.sessions[SERVICE].stats(link.now).paths) == min(path + 1, MAX_PATHS)
+    link.publish(SERVICE, "cmd_vel", b"x")
+    link.run(1.0)
+    assert link.sessions[ROBOT].stats(link.now).connected
+
+
+def test_a_path_that_was_left_wakes_nobody(world):
+    link = world.link()
+    for path in (1, 2):
+        say(link, ROBOT, ping(path), path=path, address=f"robot {path}")
+        link.run(0.05)
+    session = link.sessions[SERVICE]
+    choice = session._paths.choice
+    (idle,) = {0, 1, 2} - {choice.active.id, choice.other.id}
+    session._paths.close(idle, link.now)
+    assert set(session._sender._lanes) == {p.path for p in session.stats(link.now).paths}
