@@ -32,7 +32,7 @@ def _skip_missing(name: str) -> None:
 @pytest.mark.parametrize("name", BASE)
 def test_user_space_emulator_delays_and_counts(name: str) -> None:
     link = LinkConditions(delay=0.02)
-    with Pair(name, COMMANDS, condition="20ms", link=link, emulator="user", congestion="cubic") as pair:
+    with Pair(name, COMMANDS, condition="20ms", link=link, emulator="user", congestion="reno") as pair:
         rows = pair.measure(0.5, warm_up=0.2)
     for row in rows:
         assert 20 <= row.sent <= 25
@@ -48,7 +48,7 @@ def test_user_space_emulator_delays_and_counts(name: str) -> None:
 def test_every_transport_carries_the_traffic_between_namespaces(name: str, netns: None) -> None:
     _skip_missing(name)
     ideal = conditions.find(["ideal"])[0]
-    with Pair(name, TABLE2, condition="ideal", link=ideal.link, emulator="tun", congestion="cubic") as pair:
+    with Pair(name, TABLE2, condition="ideal", link=ideal.link, emulator="tun", congestion="reno") as pair:
         rows = pair.measure(1.0, warm_up=0.3)
     assert [row.topic for row in rows] == [flow.name for flow in TABLE2]
     for row in rows:
@@ -56,11 +56,11 @@ def test_every_transport_carries_the_traffic_between_namespaces(name: str, netns
         assert row.delivered >= 0.7 * row.sent  # a busy machine may be late; a topic that does not work has none
     assert rows[0].overhead is not None
     assert rows[0].overhead > 0
-    assert rows[0].congestion == ("cubic" if load(name).TCP else None)
+    assert rows[0].congestion == ("reno" if load(name).TCP else None)
 
 
 def test_the_same_ends_measure_other_traffic() -> None:
-    with Pair("udp", COMMANDS, condition="loopback", link=None, emulator="user", congestion="cubic") as pair:
+    with Pair("udp", COMMANDS, condition="loopback", link=None, emulator="user", congestion="reno") as pair:
         first = pair.measure(0.3, warm_up=0.1)
         second = pair.measure(
             0.3, flows=tuple(replace(flow, size=500) for flow in COMMANDS), condition="again", warm_up=0.1
@@ -85,7 +85,7 @@ def test_what_an_end_cannot_do_is_a_sentence() -> None:
             condition="loopback",
             link=None,
             emulator="user",
-            congestion="cubic",
+            congestion="reno",
             options={"no_such_setting": 1},
         )
 

@@ -7,10 +7,10 @@ import time
 import pytest
 
 from skytether.lab.bench import conditions, traffic
-from skytether.lab.bench.bridge import make_plan
+from skytether.lab.bench.bridge import BenchError, make_plan
 from skytether.lab.bench.process import Order, publish
 from skytether.lab.bench.report import cells, markdown_table
-from skytether.lab.bench.rows import Notes, Row, Run, make_rows, percentiles_ms
+from skytether.lab.bench.rows import Notes, Row, Run, arrival_rate, make_rows, percentiles_ms
 from skytether.lab.bench.suites import SUITES
 from skytether.lab.bench.traffic import Flow
 from skytether.lab.bench.transports import NAMES
@@ -76,6 +76,11 @@ def test_markdown_has_a_line_for_each_row() -> None:
     )
 
 
+def test_the_rate_of_arrival_counts_the_time_of_the_last() -> None:
+    row = Row("tcp", "x", "s", 100, 90, 1, 2, 3, 1000.0, None, 0.2, 0.1, 0.1, "bbr", "none", None, 180, 2.0)
+    assert arrival_rate(row) == 30.0
+
+
 def test_conditions_by_name_each_once() -> None:
     found = conditions.find(["burst", "sweep", "burst", "loss-5%"])
     assert [c.name for c in found] == ["burst", *(f"loss-{p}%" for p in conditions.SWEEP)]
@@ -107,6 +112,12 @@ def test_tcp_is_left_out_in_user_space_and_said_so() -> None:
 def test_a_suite_on_loopback_takes_tcp_and_has_no_link() -> None:
     plan = make_plan("latency", transport=["tcp"], emulator="user")
     assert (plan.setup.transports, plan.setup.emulator, plan.setup.conditions) == (("tcp",), "none", ())
+
+
+def test_congestion_control_of_loopback_is_the_machine_s() -> None:
+    assert make_plan("latency", transport=["tcp"]).setup.congestion
+    with pytest.raises(BenchError, match="congestion control 'fast' needs the TUN emulator"):
+        make_plan("latency", transport=["tcp"], congestion="fast")
 
 
 def test_all_transports_are_compared_by_default() -> None:

@@ -15,7 +15,7 @@ from .rows import Row
 from .suites import SUITES, Progress, Setup
 from .transports import NAMES, TransportError, load
 
-_CONGESTION = Path("/proc/sys/net/ipv4/tcp_available_congestion_control")
+_TCP = Path("/proc/sys/net/ipv4")
 
 __all__ = ["BenchError", "Plan", "make_plan", "run"]
 
@@ -58,7 +58,7 @@ def make_plan(
         transport: Names of transports; empty for those that the suite usually compares.
         seconds: Of each measurement; None for the suite's own.
         emulator: ``auto``, ``tun`` or ``user``.
-        congestion: Of TCP; None for bbr where the kernel has it, else cubic.
+        congestion: Of TCP; None for bbr where it may be used, else cubic, else the machine's default.
         camera_last: Rank the camera below everything, instead of second as in Table 2.
 
     Raises:
@@ -89,7 +89,7 @@ def make_plan(
         conditions=tuple(links),
         seconds=seconds if seconds is not None else kind.seconds,
         emulator=used,
-        congestion=_choose_congestion(congestion),
+        congestion=_choose_congestion(congestion, used),
         camera_last=camera_last,
     )
     return Plan(suite, setup, tuple(notes))
@@ -120,13 +120,25 @@ def _choose_emulator(wanted: str) -> tuple[str, str]:
     return "user", f"{user} ({trouble})"
 
 
-def _choose_congestion(wanted: str | None) -> str:
-    available = _CONGESTION.read_text().split() if _CONGESTION.exists() else ["cubic"]
+def _choose_congestion(wanted: str | None, emulator: str) -> str:
+    """Namespaces may use what the machine allows to everybody; without them there is the machine's default."""
+    default = _setting("tcp_congestion_control")
+    allowed = _setting("tcp_allowed_congestion_control").split() if emulator == "tun" else [default]
     if wanted is None:
-        return "bbr" if "bbr" in available else "cubic"
-    if wanted not in available:
-        raise BenchError(f"the kernel has no congestion control '{wanted}'; it has {', '.join(available)}")
+        return next((name for name in ("bbr", "cubic") if name in allowed), default)
+    if wanted not in allowed:
+        raise BenchError(
+            f"congestion control '{wanted}' may not be used here, only {', '.join(allowed)}; "
+            f"allow it with: sysctl -w net.ipv4.tcp_allowed_congestion_control='{' '.join([*allowed, wanted])}'"
+            if emulator == "tun"
+            else f"congestion control '{wanted}' needs the TUN emulator; without it there is this machine's, {default}"
+        )
     return wanted
+
+
+def _setting(name: str) -> str:
+    file = _TCP / name
+    return file.read_text().strip() if file.exists() else "unknown"
 
 
 def _usable(names: Sequence[str], emulator: str) -> tuple[tuple[str, ...], list[str]]:

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from . import traffic
-from .rows import Row
+from .rows import Row, arrival_rate
 from .suites import FIG26_TOPICS, fig26_cell
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#111111")
@@ -114,7 +114,7 @@ def _throughput(rows: Sequence[Row], file: Path) -> Path:
             chosen = [r for r in rows if r.transport == name and r.size == size]
             colour = _COLOURS[number % len(_COLOURS)]
             sent = [r.sent / r.seconds * scale for r in chosen]
-            axes.plot(sent, [r.delivered / r.seconds * scale for r in chosen], "o-", color=colour, label=name)
+            axes.plot(sent, [arrival_rate(r) * scale for r in chosen], "o-", color=colour, label=name)
         axes.axline((0, 0), slope=1, color="#bbbbbb", linestyle="dashed", zorder=1)
         axes.set_xlabel(f"sent [{unit}]")
         axes.set_ylabel(f"delivered [{unit}]")

@@ -154,6 +154,8 @@ def run_emulator(pipe: Connection, kind: str, link: LinkConditions, options: dic
     ``tun`` reports the paths of the robot's and the service's namespace, ``user`` its address.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(OSError):  # a link does not wait for a processor; without the privilege it sometimes must
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     with suppress(EOFError, BrokenPipeError):
         try:
             emulator: LinkEmulator | TunEmulator

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from .bridge import Plan
 from .figures import draw
@@ -16,6 +18,8 @@ from .transports import load
 
 COLUMNS = ("condition", "transport", "topic", "sent", "lost %", "p50", "p95", "p99", "max", "overhead %", "CPU %")
 """Of a complete table; delays in milliseconds, processor time in percent of one core: robot's end / service's end."""
+
+_WIDTHS = (20, 4, 6, 5, 5, 6, 6, 7, 9)
 
 
 def cells(row: Row) -> tuple[str, ...]:
@@ -32,25 +36,24 @@ def cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def console_table(rows: Sequence[Row], title: str) -> Table:
-    """For people at a terminal of 80 columns: what rows have in common stands above them."""
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    headers = (*COLUMNS[2:-2], "extra %", COLUMNS[-1])
-    for i, header in enumerate(headers):
-        table.add_column(header, justify="right" if i else "left", no_wrap=bool(i))
-    condition = transport = None
-    for row in rows:
-        _, named, topic, *numbers, extra, cpu = cells(row)
-        empty = [""] * len(numbers)
-        if condition != row.condition:
-            condition, transport = row.condition, None
-            table.add_section()
-            table.add_row(condition, *empty, "", "", style="bold underline")
-        if transport != row.transport:
-            transport = row.transport
-            table.add_row(named, *empty, extra, cpu, style="bold")
-        table.add_row(f"  {topic}", *numbers, "", "")
-    return table
+def console_table(rows: Sequence[Row], title: str) -> Group:
+    """For people at a terminal of 80 columns: a table for each condition, and what rows have in common above them."""
+    tables = []
+    for condition in dict.fromkeys(row.condition for row in rows):
+        table = Table(title=condition, box=SIMPLE_HEAD, padding=0, title_justify="left")
+        for i, header in enumerate((*COLUMNS[2:-2], "extra %", COLUMNS[-1])):
+            table.add_column(header, justify="right" if i else "left", no_wrap=bool(i), min_width=_WIDTHS[i])
+        transport = None
+        for row in rows:
+            if row.condition != condition:
+                continue
+            _, named, topic, *numbers, extra, cpu = cells(row)
+            if transport != row.transport:
+                transport = row.transport
+                table.add_row(named, *[""] * len(numbers), extra, cpu, style="bold")
+            table.add_row(f"  {topic}", *numbers, "", "")
+        tables.append(table)
+    return Group(Text(title, style="bold"), *tables)
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
