@@ -17,12 +17,48 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count, groupby
 from random import Random
+from typing import NamedTuple
 
 from skytether.lab.link_model import LinkConditions, LinkModel
 from skytether.wire import Event, MessageReceived, Role, Session, Transmit
 
-_STEPS = 1_000_000
+_STEPS = 200_000
 """Steps in one run beyond which the two ends are taken to be in an endless exchange."""
+
+
+class _Arrival(NamedTuple):
+    """A packet under way; ordered by time."""
+
+    time: float
+    order: int
+    receiver: Role
+    path: int
+    source: str
+    packet: bytes
+
+
+class Road:
+    """The network of one path.
+
+    Attributes:
+        address: Where the robot's packets come from; set it to make the robot move.
+        models: What happens to what each end sends; set ``conditions`` at any time.
+        mtu: Largest datagram that passes.
+    """
+
+    def __init__(self, address: str, up: LinkConditions | None, down: LinkConditions | None, mtu: int) -> None:
+        """Join nothing yet."""
+        self.address = address
+        self.models = {
+            Role.ROBOT: LinkModel(up or LinkConditions(), "up"),
+            Role.SERVICE: LinkModel(down or LinkConditions(), "down"),
+        }
+        self.mtu = mtu
+
+    def set(self, conditions: LinkConditions) -> None:
+        """Change both directions."""
+        for model in self.models.values():
+            model.conditions = conditions
 
 
 class LossyLink:
@@ -33,6 +69,7 @@ class LossyLink:
         sessions: The two ends.
         addresses: Where each end's packets come from; set it to make an end move.
         models: What happens to what each end sends; set ``conditions`` at any time.
+        roads: The network by path. `addresses`, `models` and ``mtu`` are those of path 0.
         events: What each end told, without messages: (time, event).
         messages: What each end received, payloads copied: (time, message).
         sent: Packets that each end sent, if ``record`` is set: (time, bytes).
@@ -71,24 +108,41 @@ class LossyLink:
         self.now = start
         self.sessions = {Role.ROBOT: robot, Role.SERVICE: service}
         self.addresses = {Role.ROBOT: "robot", Role.SERVICE: "service"}
-        self.models = {
-            Role.ROBOT: LinkModel(up or LinkConditions(), "up"),
-            Role.SERVICE: LinkModel(down or LinkConditions(), "down"),
-        }
+        self.roads = {0: Road("robot", up, down, mtu)}
+        self.models = self.roads[0].models
         self.events: dict[Role, list[tuple[float, Event]]] = {role: [] for role in Role}
         self.messages: dict[Role, list[tuple[float, MessageReceived]]] = {role: [] for role in Role}
         self.sent: dict[Role, list[tuple[float, bytes]]] = {role: [] for role in Role}
         self.dropped: Counter[Role] = Counter()
         self._corrupt = corrupt
-        self._mtu = mtu
         self._random = Random(seed)
         self._offset, self._drift = service_clock
         self._record = record
         self._order = count()
-        self._arrivals: list[tuple[float, int, Role, str, bytes]] = []
-        """Heap of time, order, receiver, sender's address, packet."""
+        self._arrivals: list[_Arrival] = []
         self._plan: list[tuple[float, int, Callable[[], None]]] = []
         robot.set_peer(self.addresses[Role.SERVICE])
+
+    def add_path(
+        self,
+        path: int,
+        *,
+        up: LinkConditions | None = None,
+        down: LinkConditions | None = None,
+        mtu: int = 1472,
+        cost: int = 0,
+    ) -> Road:
+        """Give the robot another network."""
+        road = self.roads[path] = Road(f"robot-{path}", up, down, mtu)
+        self.sessions[Role.ROBOT].open_path(path, self.now, cost=cost)
+        self._drain(Role.ROBOT)
+        return road
+
+    def close_path(self, path: int) -> None:
+        """Take a network away, as when its interface vanishes."""
+        del self.roads[path]
+        self.sessions[Role.ROBOT].close_path(path, self.now)
+        self._drain(Role.ROBOT)
 
     def service_time(self, now: float) -> float:
         """The service's clock."""
@@ -147,7 +201,7 @@ class LossyLink:
         raise RuntimeError(f"the two ends never come to rest at {self.now} s")
 
     def _next(self) -> float:
-        times = [self._arrivals[0][0] if self._arrivals else math.inf, self._plan[0][0] if self._plan else math.inf]
+        times = [self._arrivals[0].time if self._arrivals else math.inf, self._plan[0][0] if self._plan else math.inf]
         robot_due = self.sessions[Role.ROBOT].next_timer()
         service_due = self.sessions[Role.SERVICE].next_timer()
         if robot_due is not None:
@@ -169,20 +223,28 @@ class LossyLink:
                 self._send(role, batch)
 
     def _send(self, role: Role, batch: Transmit) -> None:
-        receiver = Role.SERVICE if role is Role.ROBOT else Role.ROBOT
+        if 0 in self.roads:
+            self.roads[0].address = self.addresses[Role.ROBOT]
+        if role is Role.ROBOT:
+            receiver, path = Role.SERVICE, batch.path if batch.address == self.addresses[Role.SERVICE] else None
+        else:
+            receiver = Role.ROBOT
+            path = next((i for i, road in self.roads.items() if road.address == batch.address), None)
+        road = None if path is None else self.roads.get(path)
         data = bytes(batch.data)
         size = batch.segment or len(data)
         for start in range(0, len(data), size):
             packet = data[start : start + size]
             if self._record:
                 self.sent[role].append((self.now, packet))
-            if len(packet) > self._mtu:
+            if road is None or path is None:
+                continue
+            if len(packet) > road.mtu:
                 self.dropped[role] += 1
                 continue
-            if batch.address != self.addresses[receiver]:
-                continue
-            for arrival in self.models[role].decide(len(packet), self.now):
-                entry = arrival, next(self._order), receiver, self.addresses[role], self._damage(packet)
+            source = road.address if role is Role.ROBOT else self.addresses[role]
+            for arrival in road.models[role].decide(len(packet), self.now):
+                entry = _Arrival(arrival, next(self._order), receiver, path, source, self._damage(packet))
                 heapq.heappush(self._arrivals, entry)
 
     def _damage(self, packet: bytes) -> bytes:
@@ -196,20 +258,21 @@ class LossyLink:
 
     def _deliver(self, role: Role) -> None:
         """Hand over what has arrived, some of it in batches, as a kernel would."""
-        arrived: list[tuple[float, int, Role, str, bytes]] = []
-        others: list[tuple[float, int, Role, str, bytes]] = []
-        while self._arrivals and self._arrivals[0][0] <= self.now:
+        arrived: list[_Arrival] = []
+        others: list[_Arrival] = []
+        while self._arrivals and self._arrivals[0].time <= self.now:
             entry = heapq.heappop(self._arrivals)
-            (arrived if entry[2] is role else others).append(entry)
+            (arrived if entry.receiver is role else others).append(entry)
         for entry in others:
             heapq.heappush(self._arrivals, entry)
         session, now = self.sessions[role], self.time_of(role)
-        for (address, _), group in groupby(arrived, key=lambda e: (e[3], len(e[4]))):
-            packets = [entry[4] for entry in group]
+        for (path, source, _), group in groupby(arrived, key=lambda e: (e.path, e.source, len(e.packet))):
+            packets = [entry.packet for entry in group]
             while packets:
                 taken = min(len(packets), self._random.choice((1, 4, 16, 64)))
                 segment = len(packets[0]) if taken > 1 else None
-                session.receive(b"".join(packets[:taken]), address, now, segment=segment)
+                known = path if role is Role.ROBOT else None
+                session.receive(b"".join(packets[:taken]), source, now, segment=segment, path=known)
                 del packets[:taken]
         if arrived:
             self._drain(role)

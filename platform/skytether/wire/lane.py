@@ -52,12 +52,14 @@ class Copy:
 class Flight:
     """A large message of which some packets are still to be sent."""
 
-    __slots__ = ("deadline", "shards", "topic")
+    __slots__ = ("deadline", "sent_at", "shards", "topic")
 
     def __init__(self, topic: SendTopic, shards: Shards, deadline: float) -> None:
         self.topic = topic
         self.shards = shards
         self.deadline = deadline
+        self.sent_at = -math.inf
+        """When its latest packet was sent."""
 
     @property
     def size(self) -> int:
@@ -173,8 +175,9 @@ class Lane:
         """Have another path send what may not have arrived by this one, and is not too old."""
         since = self.path.liveness.confirmed_at
         for sent_at, message in self._recent:
-            under_way = isinstance(message, Flight) and message.shards.remaining > 0
-            if (sent_at >= since or under_way) and message.deadline >= now:
+            if isinstance(message, Flight):
+                sent_at = now if message.shards.remaining else message.sent_at
+            if sent_at >= since and message.deadline >= now:
                 other.take(message, now)
         self._recent.clear()
         self._recent_bytes = 0

@@ -90,13 +90,13 @@ class Liveness:
 
     def health(self, now: float) -> Health:
         """What the path is good for."""
-        silence = now - self.age
-        if self._dead or silence >= DEAD_AFTER * self.patience:
+        patience = self.patience  # the sums are those of `next_change`, so that a timer never comes just too early
+        if self._dead or now >= self.age + DEAD_AFTER * patience:
             self._dead = True
             return Health.DEAD
         if not self._answered:
             return Health.NEW
-        return Health.SUSPECT if silence >= self.patience else Health.LIVE
+        return Health.SUSPECT if now >= self.age + patience else Health.LIVE
 
     def next_change(self, now: float) -> float:
         """When the health gets worse if no answer comes; inf if it does not."""

@@ -65,9 +65,7 @@ class Sender:
             now: Time.
         """
         before, already = self._active, self._doubled
-        limit = self._config.queue_limit
-        lanes = self._lanes
-        self._lanes = {p.id: lanes[p.id] if p.id in lanes and lanes[p.id].path is p else Lane(p, limit) for p in paths}
+        self._lanes = {p.id: self._lane(p) for p in paths}
         self._active = self._lanes[active.id]
         self._other = self._lanes[other.id] if other is not None else None
         self._doubled = doubled
@@ -90,14 +88,20 @@ class Sender:
 
     def say(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> None:
         """Send a message of one packet by that path, once and at once, however large the packet."""
-        epoch, lane = self.epoch, self._lanes.get(path.id)
-        if epoch is None or lane is None:
+        epoch = self.epoch
+        if epoch is None:
             return
         number, common, plaintext = self._next(epoch, topic, payload, now)
         sealed = epoch.ciphers.seal(number, plaintext, common)
         packet = b"".join((common, push_shard(0, 0, path.id, path.number()), sealed))
         topic.counters.bytes_sent += len(packet)
-        lane.say(packet)
+        self._lane(path).say(packet)
+
+    def _lane(self, path: Path) -> Lane:
+        lane = self._lanes.get(path.id)
+        if lane is None or lane.path is not path:
+            lane = self._lanes[path.id] = Lane(path, self._config.queue_limit)
+        return lane
 
     def next_timer(self) -> float:
         """When `transmit` will have something to send; 0 for at once, inf for never."""
@@ -110,7 +114,7 @@ class Sender:
         epoch, address = self.epoch, path.address
         if epoch is None or address is None:
             return []
-        lane = self._lanes[path.id]
+        lane = self._lane(path)
         queue, flights, copies = lane.queue, lane.flights, lane.copies
         while copies and copies[0].due <= now:
             copy = heapq.heappop(copies)
@@ -139,6 +143,7 @@ class Sender:
                     lane.wake = pacer.ready_at(need)
                     break
                 path.large = True
+                flight.sent_at = now
                 count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
                 batches.add_run(shards.take(count, path.id, path.number(count)), size)
                 sent = count * size
