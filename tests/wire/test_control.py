@@ -20,7 +20,7 @@ from skytether.wire.control import (
 
 counter = st.integers(0, 2**64 - 1)
 seconds = st.floats(0, 1e6, width=32) | st.just(math.inf)
-senders = st.builds(SenderRow, st.integers(0, 65_535), st.integers(0, 2**32 - 1), *[counter] * 5)
+senders = st.builds(SenderRow, st.integers(0, 65_535), st.integers(0, 2**32 - 1), *[counter] * 6)
 receivers = st.builds(ReceiverRow, st.integers(0, 65_535), *[counter] * 7, *[seconds] * 8)
 
 

@@ -13,6 +13,8 @@ NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", description="lower-case letters, digits and '-'")]
 Tier = Literal["robot", "edge", "cloud"]
 ANY_TOPIC = "*"
+RELIABLE_LIFESPAN_MS = 60_000
+"""How long a reliable topic tries by default."""
 
 
 class Strict(BaseModel):
@@ -37,6 +39,25 @@ class TopicSpec(Strict):
     lifespan_ms: Annotated[float, Field(gt=0, le=3_600_000)] = 100
     depth: Annotated[int, Field(ge=1, le=10_000)] = 1
     delivery: Annotated[float, Field(gt=0, lt=1)] = 0.99
+    reliable: bool = False
+    """Every message arrives once and in order, unless it is older than ``lifespan_ms`` (then a minute by default)."""
+    latched: bool = False
+    """The newest message of a reliable topic is kept and sent to whoever comes later."""
+    compression: Literal["none", "zstd"] = "none"
+    """Not for what is compressed already, such as camera images."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _reliable_lives_long(cls, row: Any) -> Any:
+        if isinstance(row, dict) and row.get("reliable") and "lifespan_ms" not in row:
+            return {**row, "lifespan_ms": RELIABLE_LIFESPAN_MS}
+        return row
+
+    @model_validator(mode="after")
+    def _latched_is_reliable(self) -> TopicSpec:
+        if self.latched and not self.reliable:
+            raise ValueError("latched: true needs reliable: true")
+        return self
 
     @model_validator(mode="after")
     def _any_topic_comes_in(self) -> TopicSpec:

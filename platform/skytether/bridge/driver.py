@@ -13,6 +13,7 @@ from typing import Any, cast
 from skytether.wire import Session
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived
 from skytether.wire.stats import SessionStats
+from skytether.wire.topic import Topic
 
 from .datagrams import Address, DatagramSocket
 from .port import Port
@@ -27,12 +28,12 @@ class Driver:
     """Drives a session: feed what came in, pass on events, send what may be sent, set the timer again.
 
     Attributes:
-        agreed: Names of the topics that both ends know; empty while no session is up. May be read from any thread.
+        agreed: Topics that both ends know, by name; empty while no session is up. May be read from any thread.
     """
 
     def __init__(self, session: Session, sock: DatagramSocket, port: Port, loop: asyncio.AbstractEventLoop) -> None:
         """Prepare; `begin` starts the session in the loop's thread."""
-        self.agreed: frozenset[str] = frozenset()
+        self.agreed: dict[str, Topic] = {}
         self._session = session
         self._socket = sock
         self._port = port
@@ -61,7 +62,7 @@ class Driver:
         """Say goodbye and leave the loop."""
         self._session.close(time.monotonic())
         self._advance()
-        self.agreed = frozenset()
+        self.agreed = {}
         if self._timer is not None:
             self._timer.cancel()
         self._loop.remove_reader(self._socket)
@@ -104,9 +105,9 @@ class Driver:
                 self._call(self._port.deliver, event)
                 continue
             if isinstance(event, Connected):
-                self.agreed = frozenset(topic.name for topic in event.topics)
+                self.agreed = {topic.name: topic for topic in event.topics}
             elif isinstance(event, Disconnected):
-                self.agreed = frozenset()
+                self.agreed = {}
             self._call(self._port.notify, event)
 
     def _call(self, method: Callable[[Any], None], event: Event) -> None:

@@ -20,6 +20,7 @@ from dataclasses import replace
 from types import TracebackType
 
 from skytether.wire import Config, Session
+from skytether.wire.compression import compress
 from skytether.wire.stats import SessionStats
 
 from .datagrams import Address, DatagramSocket
@@ -72,7 +73,7 @@ class Bridge:
         self._port = port
         self._peer = peer
         self._config = config or Config()
-        self._sends = frozenset(t.name for t in spec.topics if t.direction.sender is spec.role)
+        self._sends = {t.name: t for t in spec.topics if t.direction.sender is spec.role}
         self._handover: deque[tuple[str, bytes, float]] = deque()
         self._handover_bytes = 0
         self._overrun: Counter[str] = Counter()
@@ -125,12 +126,19 @@ class Bridge:
             raise ValueError(
                 f"topic '{topic}': {size} bytes are more than a message may have, {self._config.max_message}"
             )
-        if self._thread is None or topic not in self._driver.agreed:
+        if self._thread is None:
             return False
+        agreed = self._driver.agreed
+        row = agreed.get(topic) or self._sends[topic]
+        if topic not in agreed and (agreed or not row.reliable):
+            return False
+        # The caller may use its buffer again, so anything but bytes is copied; it compresses in its own time.
+        payload = bytes(payload)
+        if row.compression:
+            payload = compress(payload)
         with self._lock:
-            # The caller may use its buffer again, so anything but bytes is copied.
-            self._handover.append((topic, bytes(payload), time.monotonic()))
-            self._handover_bytes += size + _ENTRY_BYTES
+            self._handover.append((topic, payload, time.monotonic()))
+            self._handover_bytes += len(payload) + _ENTRY_BYTES
             while self._handover_bytes > self._config.queue_limit and len(self._handover) > 1:
                 oldest, dropped, _ = self._handover.popleft()
                 self._handover_bytes -= len(dropped) + _ENTRY_BYTES

@@ -18,7 +18,7 @@ class Publisher(Protocol):
         """Hand over one serialised message; safe from any thread, never blocks.
 
         Returns:
-            False if it was dropped because no session is up.
+            False if it was dropped because no session is up. Messages of reliable topics wait for one.
 
         Raises:
             KeyError: The topic is not in this end's table, or this end does not send it.

@@ -102,4 +102,7 @@ def topic_from_api(spec: TopicSpec) -> Topic:
         lifespan=spec.lifespan_ms / 1000,
         depth=spec.depth,
         delivery=spec.delivery,
+        reliable=spec.reliable,
+        latched=spec.latched,
+        compression="" if spec.compression == "none" else spec.compression,
     )

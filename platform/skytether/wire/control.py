@@ -10,14 +10,21 @@ from typing import NamedTuple
 PING = 1
 REPORT = 2
 GOODBYE = 3
+ACK = 4
+MISSING = 5
+FORWARD = 6
 
 _PING = struct.Struct(">BBBBHQI")
 _REPORT = struct.Struct(">BBffHH")
-_SENDER = struct.Struct(">HIQQQQQ")
+_SENDER = struct.Struct(">HIQQQQQQ")
 _RECEIVER = struct.Struct(">HQQQQQQQffffffff")
+_ACK = struct.Struct(">BHQ")
+_MISSING = struct.Struct(">BHQH")
+_MISSING_ROW = struct.Struct(">H13s")
 NO_ECHO = 2**64 - 1
 ROWS_SIZE = 1000
 """Bytes of rows in one report, so that it is one packet whatever the mtu is."""
+MISSING_ROWS = ROWS_SIZE // _MISSING_ROW.size
 
 
 class Ping(NamedTuple):
@@ -47,6 +54,7 @@ class SenderRow(NamedTuple):
     sent: int
     expired: int
     replaced: int
+    retransmitted: int
     bytes_sent: int
 
 
@@ -87,6 +95,38 @@ class Goodbye(NamedTuple):
     """The peer ends the session."""
 
 
+class Ack(NamedTuple):
+    """What the receiver of a reliable topic has."""
+
+    topic: int
+    expected: int
+    """It has all below this sequence number, or knows that they will not come."""
+    held: bytes
+    """Bit i (from the lowest of the first byte) is set if it has number ``expected + 1 + i``."""
+
+
+class Missing(NamedTuple):
+    """What the receiver of a reliable topic lacks of one large message."""
+
+    topic: int
+    number: int
+    """Of the message, as in its packets' header."""
+    until: int
+    """Nothing is said of this block and those after it; blocks before it that are not among the rows are complete."""
+    rows: tuple[tuple[int, bytes], ...]
+    """Blocks, and data shards missing in them: bit i (from the lowest of the first byte) is shard i."""
+
+
+class Forward(NamedTuple):
+    """The sender of a reliable topic will not send numbers below this one any more."""
+
+    topic: int
+    base: int
+
+
+Control = Ping | Report | Goodbye | Ack | Missing | Forward
+
+
 PING_SIZE = _PING.size
 
 
@@ -100,6 +140,22 @@ def push_ping(ping: Ping, padding: int = 0) -> bytes:
 def push_goodbye() -> bytes:
     """Encode."""
     return bytes([GOODBYE])
+
+
+def push_ack(ack: Ack) -> bytes:
+    """Encode."""
+    return _ACK.pack(ACK, ack.topic, ack.expected) + ack.held
+
+
+def push_missing(missing: Missing) -> bytes:
+    """Encode; at most `MISSING_ROWS` rows."""
+    head = _MISSING.pack(MISSING, missing.topic, missing.number, missing.until)
+    return head + b"".join(_MISSING_ROW.pack(*row) for row in missing.rows)
+
+
+def push_forward(forward: Forward) -> bytes:
+    """Encode."""
+    return _ACK.pack(FORWARD, forward.topic, forward.base)
 
 
 def push_reports(
@@ -116,7 +172,7 @@ def push_reports(
             return
 
 
-def pull_control(data: bytes) -> Ping | Report | Goodbye | None:
+def pull_control(data: bytes) -> Control | None:
     """Decode any of them; None if it is none. Longer messages of later versions are cut to what is known."""
     try:
         kind = data[0]
@@ -134,6 +190,16 @@ def pull_control(data: bytes) -> Ping | Report | Goodbye | None:
             return Report(path, loss if math.isfinite(loss) else math.nan, burst, senders, receivers)
         if kind == GOODBYE:
             return Goodbye()
+        if kind == ACK:
+            _, topic, expected = _ACK.unpack_from(data)
+            return Ack(topic, expected, data[_ACK.size :])
+        if kind == MISSING:
+            _, topic, number, until = _MISSING.unpack_from(data)
+            body = data[_MISSING.size :]
+            return Missing(topic, number, until, tuple(_MISSING_ROW.iter_unpack(body)))
+        if kind == FORWARD:
+            _, topic, base = _ACK.unpack_from(data)
+            return Forward(topic, base)
     except (IndexError, struct.error):
         pass
     return None

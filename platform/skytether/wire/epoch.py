@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import TYPE_CHECKING
 
 from .crypto import Ciphers
 from .measure import Inbound, Outbound, SequenceTracker
 from .replay import ReplayWindow
 from .topic import Direction, PathUse, Topic
+
+if TYPE_CHECKING:
+    from .reliable import Inbox, Outbox
 
 CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)
 """Pings, reports and goodbye: sealed and numbered like a topic, both ways."""
@@ -22,7 +26,8 @@ class SendTopic:
     """A topic that this end sends, during one epoch."""
 
     __slots__ = (
-        "counters", "delivery", "depth", "index", "lifespan", "name", "priority", "ready", "redundant", "sequence",
+        "counters", "delivery", "depth", "index", "lifespan", "name", "outbox", "priority", "ready", "redundant",
+        "sequence",
         "topic", "waiting",
     )  # fmt: skip
 
@@ -37,6 +42,8 @@ class SendTopic:
         self.redundant = topic.paths is PathUse.REDUNDANT
         self.counters = counters
         self.waiting: deque[Waiting] = deque()
+        self.outbox: Outbox | None = None
+        """Of a reliable topic, as long as its epoch is in use."""
         self.ready = False
         """Whether the send queue has it in its heap."""
         self.sequence = 0
@@ -46,7 +53,9 @@ class SendTopic:
 class ReceiveTopic:
     """A topic that the peer sends, during one epoch."""
 
-    __slots__ = ("counters", "index", "lifespan", "name", "newest", "newest_only", "settled", "topic", "tracker")
+    __slots__ = (
+        "counters", "inbox", "index", "lifespan", "name", "newest", "newest_only", "settled", "topic", "tracker",
+    )  # fmt: skip
 
     def __init__(self, index: int, topic: Topic, counters: Inbound) -> None:
         self.index = index
@@ -54,6 +63,8 @@ class ReceiveTopic:
         self.name = topic.name
         self.lifespan = topic.lifespan
         self.newest_only = topic.depth == 1
+        self.inbox: Inbox | None = None
+        """Of a reliable topic, as long as its peer is the one in use."""
         self.newest = -1
         """Highest sequence that arrived."""
         self.tracker = SequenceTracker(topic.lifespan)
@@ -88,8 +99,17 @@ class ReceiveTopic:
         counters.bytes_delivered += size
         return True
 
+    def delivered(self, size: int, delay: float, error: float, now: float) -> None:
+        """Count a message of a reliable topic that is its turn; parameters as of `arrived`."""
+        self.counters.arrived(delay, error, True, now)
+        self.counters.delivered += 1
+        self.counters.bytes_delivered += size
+
     def settle(self, now: float) -> None:
         """Bring the counters' losses up to date."""
+        if self.inbox is not None:
+            self.counters.lost += self.inbox.skipped
+            self.inbox.skipped = 0
         tracker = self.tracker
         tracker.settle(now)
         self.counters.lost += tracker.lost - self.settled
@@ -99,7 +119,7 @@ class ReceiveTopic:
 class Epoch:
     """The state that a handshake begins and the next one ends."""
 
-    __slots__ = ("ciphers", "id", "next_number", "receive", "replay", "send", "topics")
+    __slots__ = ("ciphers", "id", "life", "next_number", "receive", "replay", "send", "topics")
 
     def __init__(
         self,
@@ -108,6 +128,7 @@ class Epoch:
         topics: tuple[Topic, ...],
         send: list[SendTopic],
         receive: list[ReceiveTopic],
+        life: bytes,
     ) -> None:
         self.id = epoch_id
         """One byte that tells its packets from those of the epochs before and after."""
@@ -116,5 +137,7 @@ class Epoch:
         """Of the next message sealed, whatever its topic: the nonce."""
         self.replay = ReplayWindow()
         self.topics = topics
+        self.life = life
+        """The peer's (see `handshake`)."""
         self.send = {t.name: t for t in send}
         self.receive = {t.index: t for t in receive}

@@ -13,6 +13,8 @@ class Connected:
 
     topics: tuple[Topic, ...]
     """The agreed topic table: the robot's names, types and encodings, the service's quality of service."""
+    restarted: bool = False
+    """Whether this is another peer than before: it knows nothing of what the one before was told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +33,7 @@ class MessageReceived:
     payload: bytes | memoryview
     """Read-only; a view into memory of its own for large messages."""
     sequence: int
-    """Per topic and handshake, from 0, without gaps at the sender."""
+    """Per topic and handshake (of a reliable topic: per life of the sender), from 0, without gaps at the sender."""
     sent_at: float
     """When the peer's application published it, in this end's monotonic seconds; see ``sent_at_error``.
     ``received_at`` while the clock offset is unknown."""

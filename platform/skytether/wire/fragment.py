@@ -17,6 +17,8 @@ import zfec
 from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT
 
 Bytes = npt.NDArray[np.uint8]
+Positions = npt.NDArray[np.intp]
+"""Of data shards in their message."""
 
 BLOCK_SHARDS = 100
 """Data shards of a block: the cost of coding grows with k times m, and one block may have 256 shards in all."""
@@ -129,12 +131,7 @@ class Shards:
     def take(self, count: int, path: int, first_number: int) -> memoryview:
         """The next ``count`` packets, one after the other, each of ``packet_size`` bytes."""
         start, end, shards = self._sent, self._sent + count, self._shape.shards
-        rows = np.empty((count, self.packet_size), np.uint8)
-        rows[:, :COMMON_SIZE] = self._common
-        rows[:, COMMON_SIZE:HEADER_SIZE] = self._tails[start:end]
-        rows[:, NUMBER_AT - 1] = path
-        numbers = np.arange(first_number, first_number + count).astype(">u4")
-        rows[:, NUMBER_AT:HEADER_SIZE] = numbers.view(np.uint8).reshape(count, 4)
+        rows = self._headers(self._tails[start:end], path, first_number)
         data_end = min(end, shards)
         if start < data_end:
             rows[: data_end - start, HEADER_SIZE:] = self._data[start:data_end]
@@ -146,11 +143,34 @@ class Shards:
         self.remaining -= count
         return rows.reshape(-1).data
 
+    def sent(self, count: int, now: float) -> None:
+        """The last ``count`` packets taken were sent now."""
+
+    def land(self, now: float) -> None:
+        """Nothing is left to be taken."""
+
     def again(self, room: int) -> Shards:
         """All of the message once more, in shards of at most ``room`` bytes: of the same size if they fit."""
         shape = self._shape if self._shape.size <= room else shape_for(self._shape.length, room)
         parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
         return shards_of(self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity)
+
+    def pick(self, positions: Positions, path: int, first_number: int) -> memoryview:
+        """Packets of any data shards, by their positions in the message, as `take` returns them."""
+        rows = self._headers(self._tails[positions], path, first_number)
+        rows[:, HEADER_SIZE:] = self._data[positions]
+        return rows.reshape(-1).data
+
+    def _headers(self, tails: Bytes, path: int, first_number: int) -> Bytes:
+        """Rows for packets, without the shards."""
+        count = len(tails)
+        rows = np.empty((count, self.packet_size), np.uint8)
+        rows[:, :COMMON_SIZE] = self._common
+        rows[:, COMMON_SIZE:HEADER_SIZE] = tails
+        rows[:, NUMBER_AT - 1] = path
+        numbers = np.arange(first_number, first_number + count).astype(">u4")
+        rows[:, NUMBER_AT:HEADER_SIZE] = numbers.view(np.uint8).reshape(count, 4)
+        return rows
 
     def _parity_shard(self, position: int) -> bytes:
         blocks, parity = self._shape.blocks, (len(self._tails) - self._shape.shards) // self._shape.blocks

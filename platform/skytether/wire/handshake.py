@@ -2,8 +2,10 @@
 
 Messages (each is 32 clear random bytes, then a text sealed under a key derived from them and the session key)::
 
-    HELLO    robot -> service   X25519 key, epoch proposed, name of keys still held, time t1, topics offered
-    WELCOME  service -> robot   X25519 key, epoch chosen, times t1, t2, t3, topics agreed or why they are refused
+    HELLO    robot -> service   X25519 key, life, epoch proposed, name of keys still held, time t1, topics offered
+    WELCOME  service -> robot   X25519 key, life, epoch chosen, times t1, t2, t3, topics agreed or why they are refused
+
+A life is 8 random bytes that name one end from its start to its end, so that the peer knows a restarted one.
 
 WELCOME's key depends on HELLO, so it answers this one only. HELLO is padded so that WELCOME is at most three
 times as long. The service answers a repeated HELLO with the same WELCOME and keeps its old keys until a
@@ -26,10 +28,11 @@ from .packet import HEADER_SIZE, HELLO, WELCOME, push_common, push_shard
 from .table import TablesDifferError, join, pull_answer, pull_offer, push_answer, push_offer
 from .topic import Topic
 
-_HELLO = struct.Struct(">32s8sBQI")
-"""Public key, name of keys held, epoch proposed, t1, length of the table."""
-_WELCOME = struct.Struct(">32sBBQQQI")
-"""Public key, epoch, refused, t1, t2, t3, length of what follows."""
+_HELLO = struct.Struct(">32s8s8sBQI")
+"""Public key, name of keys held, life of the robot's end, epoch proposed, t1, length of the table."""
+_WELCOME = struct.Struct(">32s8sBBQQQI")
+"""Public key, life of the service's end, epoch, refused, t1, t2, t3, length of what follows."""
+LIFE_SIZE = 8
 MIN_HELLO = 400
 """Length of HELLO's text at least, so that the answer is at most three times as long."""
 ROW_HELLO = 32
@@ -73,6 +76,8 @@ class Outcome:
     ciphers: crypto.Ciphers
     topics: list[tuple[int, Topic]]
     """Agreed topics by index."""
+    life: bytes
+    """The peer's."""
 
 
 class Hello:
@@ -85,6 +90,7 @@ class Hello:
         topics: Sequence[Topic],
         epoch: int,
         held: bytes,
+        life: bytes,
         entropy: Entropy,
         now: float,
     ) -> None:
@@ -96,6 +102,7 @@ class Hello:
             topics: The robot's table.
             epoch: Proposed; not the one in use.
             held: Name of the keys still held, or `NO_KEYS`.
+            life: Of this end.
             entropy: Source of random bytes.
             now: t1.
         """
@@ -107,7 +114,7 @@ class Hello:
         self.sent = 0
         """How many times it was sent."""
         offer = push_offer(topics)
-        plaintext = _HELLO.pack(crypto.public_of(self._private), held, epoch, _micros(now), len(offer)) + offer
+        plaintext = _HELLO.pack(crypto.public_of(self._private), held, life, epoch, _micros(now), len(offer)) + offer
         plaintext = plaintext.ljust(max(MIN_HELLO, ROW_HELLO * len(topics)), b"\0")
         self.common, self.message = _pack(HELLO, session_id, salt, _key(key, salt, b"hello"), plaintext)
 
@@ -119,7 +126,7 @@ class Hello:
         )
         if plaintext is None or len(plaintext) < _WELCOME.size:
             return None
-        public, epoch, refused, t1, t2, t3, length = _WELCOME.unpack_from(plaintext)
+        public, life, epoch, refused, t1, t2, t3, length = _WELCOME.unpack_from(plaintext)
         text = plaintext[_WELCOME.size : _WELCOME.size + length]
         times = (t1 / 1e6, t2 / 1e6, t3 / 1e6)
         if refused:
@@ -132,7 +139,7 @@ class Hello:
         except ValueError:
             return None
         to_service, to_robot, name = crypto.data_keys(self._key, shared, self.message, message)
-        return Welcome(Outcome(epoch, crypto.Ciphers(to_service, to_robot, name), topics), "", times)
+        return Welcome(Outcome(epoch, crypto.Ciphers(to_service, to_robot, name), topics, life), "", times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +187,7 @@ class Doorkeeper:
         self._key = key
         self._topics = topics
         self._entropy = entropy
+        self._life = entropy(LIFE_SIZE)
         self._pending: OrderedDict[bytes, Pending] = OrderedDict()
         self._used: OrderedDict[bytes, None] = OrderedDict()
 
@@ -209,7 +217,7 @@ class Doorkeeper:
             return "hello_forged"
         if len(plaintext) < MIN_HELLO:
             return "hello_malformed"
-        public, robot_holds, proposed, t1, length = _HELLO.unpack_from(plaintext)
+        public, robot_holds, life, proposed, t1, length = _HELLO.unpack_from(plaintext)
         if robot_holds == held != NO_KEYS:
             return Resume()
         try:
@@ -230,14 +238,16 @@ class Doorkeeper:
         except TablesDifferError as error:
             reason = str(error)[:MAX_REASON]
         text = reason.encode()[:MAX_REASON] if reason else push_answer(agreed)
-        head = _WELCOME.pack(crypto.public_of(private), epoch, bool(reason), t1, _micros(now), _micros(now), len(text))
+        head = _WELCOME.pack(
+            crypto.public_of(private), self._life, epoch, bool(reason), t1, _micros(now), _micros(now), len(text)
+        )
         salt = self._entropy(crypto.SALT_SIZE)
         key = _key(self._key, salt, b"welcome", message)
         welcome_common, welcome = _pack(WELCOME, self._session_id, salt, key, head + text)
         outcome = None
         if not reason:
             to_service, to_robot, resume = crypto.data_keys(self._key, shared, message, welcome)
-            outcome = Outcome(epoch, crypto.Ciphers(to_robot, to_service, resume), agreed)
+            outcome = Outcome(epoch, crypto.Ciphers(to_robot, to_service, resume), agreed, life)
         pending = Pending(welcome_common, welcome, outcome, reason, now)
         self._pending[name] = pending
         return pending

@@ -10,8 +10,10 @@ from collections.abc import Hashable
 from .epoch import SendTopic
 from .fragment import Shards, shape_for, shards_of
 from .packet import HEADER_SIZE
+from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
+from .reliable import Outbox
 
 MAX_SEGMENTS = 64
 """Datagrams in one UDP_SEGMENT batch that every kernel takes."""
@@ -112,7 +114,7 @@ class Lane:
 
     def __init__(self, path: Path, queue_limit: int) -> None:
         self.path = path
-        self.queue: SendQueue[Copy] = SendQueue(queue_limit)
+        self.queue: SendQueue[Copy | Outbox] = SendQueue(queue_limit)
         """Copies that are due, and of the active path the messages that are not sealed yet."""
         self.flights: list[Flight] = []
         """Rising priority: the last is sent first."""
@@ -162,6 +164,13 @@ class Lane:
         insort_left(self.flights, Flight(topic, shards, deadline), key=_priority)
         del self.flights[:-MAX_FLIGHTS]
         self.wake = now
+
+    def land_parcels(self, now: float) -> None:
+        """This path is not the active one any more: what is reliable goes on by another, as its timers say."""
+        parcels = [f.shards for f in self.flights if isinstance(f.shards, Parcel)]
+        self.flights = [f for f in self.flights if not isinstance(f.shards, Parcel)]
+        for parcel in parcels:
+            parcel.land(now)
 
     def remember(self, message: Copy | Flight, now: float) -> None:
         """Keep a message that was sent just now."""

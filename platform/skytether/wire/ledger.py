@@ -26,12 +26,16 @@ class Ledger:
         self._peer_in: dict[str, ReceiverRow] = {}
         self._turn = 0
 
+    def outbound(self, name: str) -> Outbound:
+        """Counters of a topic that this end sends."""
+        return self._out.setdefault(name, Outbound())
+
     def topics(self, agreed: Iterable[tuple[int, Topic]]) -> tuple[list[SendTopic], list[ReceiveTopic]]:
         """State of an epoch's topics, on the counters they always had."""
         send, receive = [], []
         for index, topic in agreed:
             if topic.direction.sender is self._role:
-                send.append(SendTopic(index, topic, self._out.setdefault(topic.name, Outbound())))
+                send.append(SendTopic(index, topic, self.outbound(topic.name)))
             else:
                 receive.append(ReceiveTopic(index, topic, self._in.setdefault(topic.name, Inbound())))
         return send, receive
@@ -79,7 +83,9 @@ class Ledger:
     @staticmethod
     def _sender_row(topic: SendTopic) -> SenderRow:
         c = topic.counters
-        return SenderRow(topic.index, topic.sequence, c.offered, c.sent, c.expired, c.replaced, c.bytes_sent)
+        return SenderRow(
+            topic.index, topic.sequence, c.offered, c.sent, c.expired, c.replaced, c.retransmitted, c.bytes_sent
+        )
 
     @staticmethod
     def _receiver_row(topic: ReceiveTopic, now: float) -> ReceiverRow:
@@ -97,7 +103,7 @@ class Ledger:
             out = self._out.get(topic.name, Outbound())
             base = replace(
                 base, offered=out.offered, sent=out.sent, expired=out.expired, replaced=out.replaced,
-                bytes_sent=out.bytes_sent,
+                bytes_sent=out.bytes_sent, retransmitted=out.retransmitted,
             )  # fmt: skip
             row = self._peer_in.get(topic.name)
             if row is None:
@@ -122,7 +128,7 @@ class Ledger:
             return base
         return replace(
             base, offered=sender.offered, sent=sender.sent, expired=c.expired + sender.expired,
-            replaced=sender.replaced, bytes_sent=sender.bytes_sent,
+            replaced=sender.replaced, bytes_sent=sender.bytes_sent, retransmitted=sender.retransmitted,
         )  # fmt: skip
 
 

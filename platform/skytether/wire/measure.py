@@ -120,10 +120,10 @@ class SequenceTracker:
 class Outbound:
     """Counters of a topic at its sender, since the session object was made; names as in `stats.TopicStats`."""
 
-    __slots__ = ("bytes_sent", "expired", "offered", "payload_sent", "replaced", "sent")
+    __slots__ = ("bytes_sent", "expired", "offered", "payload_sent", "replaced", "retransmitted", "sent")
 
     def __init__(self) -> None:
-        self.offered = self.sent = self.expired = self.replaced = self.bytes_sent = 0
+        self.offered = self.sent = self.expired = self.replaced = self.retransmitted = self.bytes_sent = 0
         self.payload_sent = 0
 
 

@@ -58,6 +58,13 @@ def push_shard(block: int, index: int, path: int, packet: int) -> bytes:
     return SHARD.pack(block, index, path, packet)
 
 
+def pull_number(common: memoryview | bytes) -> int:
+    """Message number in the common part of a header."""
+    _, _, _, high, low, _, _ = COMMON.unpack_from(common)
+    number: int = high << 32 | low
+    return number
+
+
 def pull_header(data: memoryview | bytes) -> Fields | None:
     """Both parts; None if the packet is shorter than a header. Values are not checked."""
     if len(data) < HEADER_SIZE:

@@ -105,6 +105,26 @@ class Entry:
         self.cost = 0
         self.alive = True
 
+    def gaps(self, limit: int) -> tuple[int, list[tuple[int, bytes]]]:
+        """Data shards that are missing, up to the highest block of which something arrived.
+
+        Returns:
+            Block at which this account ends, and at most ``limit`` incomplete blocks before it with one bit for each
+            data shard, set for a missing one.
+        """
+        rows: list[tuple[int, bytes]] = []
+        end = max(self.blocks, default=-1) + 1
+        for number in range(end):
+            block = self.blocks.get(number)
+            if block is not None and block.data is not None:
+                continue
+            if len(rows) == limit:
+                return number, rows
+            k = self.shape.block_k(number)
+            seen = np.zeros(k, np.uint8) if block is None else np.frombuffer(block.seen, np.uint8, k)
+            rows.append((number, np.packbits(seen == 0, bitorder="little").tobytes()))
+        return end, rows
+
     def assemble(self) -> memoryview:
         """The sealed message."""
         parts = [block.data for _, block in sorted(self.blocks.items()) if block.data is not None]

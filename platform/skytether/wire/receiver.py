@@ -146,7 +146,7 @@ class Receiver:
                 sealed = self.messages.add(entry, block, index, data[HEADER_SIZE:])
                 if sealed is not None:
                     self._open(epoch, number, topic, sealed, entry.key[0], by, address, now)
-        elif not self._refused(epoch, number, topic, 1):
+        elif not self._refused(epoch, number, topic, 1, now):
             if block or index:
                 self.rejected["shape"] += 1
             else:
@@ -186,7 +186,7 @@ class Receiver:
         now: float,
     ) -> Entry | None:
         """The incomplete message that packets of a large message claim to belong to; None (counted) if none can be."""
-        if self._refused(epoch, number, topic, packets):
+        if self._refused(epoch, number, topic, packets, now):
             return None
         if length > self._max_length:
             self.rejected["too_large"] += packets
@@ -198,9 +198,11 @@ class Receiver:
         entry = self.messages.entry(common, size, length, topic, block, lifespan, now)
         if entry is None:
             self.rejected["shape"] += packets
+        elif topic and (inbox := epoch.receive[topic].inbox) is not None:
+            inbox.touch(now, entry)
         return entry
 
-    def _refused(self, epoch: Epoch, number: int, topic: int, packets: int) -> bool:
+    def _refused(self, epoch: Epoch, number: int, topic: int, packets: int, now: float) -> bool:
         """Whether a message cannot be wanted: already accepted, too old, or of no topic."""
         receiver = epoch.receive.get(topic)
         if receiver is None and topic:
@@ -213,6 +215,8 @@ class Receiver:
             self.rejected["old"] += packets
         elif receiver is not None:
             receiver.counters.duplicate += packets
+            if receiver.inbox is not None:  # the sender does not know that it arrived
+                receiver.inbox.touch(now)
         return True
 
     def _open(

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Sequence
 
 from .config import Config
 from .crypto import Ciphers
-from .handshake import NO_KEYS, Entropy, Hello
+from .handshake import LIFE_SIZE, NO_KEYS, Entropy, Hello
 from .topic import Topic
 
 HELLO_LIFE = 5.0
@@ -30,6 +30,7 @@ class Seeker:
         self._topics = topics
         self._config = config
         self._entropy = entropy
+        self._life = entropy(LIFE_SIZE)
         self._wait = config.hello_retry
         self._proposal = entropy(1)[0]
         self.peers: set[Hashable] = set()
@@ -84,7 +85,9 @@ class Seeker:
         if self.hello is None or self.hello.made_at + HELLO_LIFE < now:
             self._proposal = (self._proposal + 1) % 256
             name = NO_KEYS if held is None else held.resume
-            self.hello = Hello(self._session_id, self._key, self._topics, self._proposal, name, self._entropy, now)
+            self.hello = Hello(
+                self._session_id, self._key, self._topics, self._proposal, name, self._life, self._entropy, now
+            )
         self.hello.sent += 1
         if held is None:
             self.due = now + self._wait

@@ -11,19 +11,24 @@ import heapq
 import math
 import struct
 from collections.abc import Iterable
+from functools import partial
 
+from .compression import FLAG, Compressed, original_size
 from .config import Config
 from .crypto import TAG_SIZE
 from .epoch import CONTROL_PRIORITY, Epoch, SendTopic
-from .fragment import Shards, shape_for
+from .fragment import Shape, Shards, shape_for
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
-from .packet import DATA, push_common, push_shard
+from .packet import DATA, HEADER_SIZE, push_common, push_shard
+from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
 from .redundancy import RedundancyPolicy
+from .reliable import NUMBER_SPAN, Outbox
 
 INNER = struct.Struct(">IQ")
-"""Start of the plaintext: topic sequence, time of publishing in microseconds of the sender's clock."""
+"""Start of the plaintext: topic sequence, time of publishing in microseconds of the sender's clock with the highest
+bit set if the payload is compressed."""
 OVERHEAD = INNER.size + TAG_SIZE
 MAX_BATCH = 65_507
 """Bytes of such a batch: it is one IP packet to the kernel until it is cut."""
@@ -50,7 +55,7 @@ class Sender:
         self._doubled = False
 
     @property
-    def queue(self) -> SendQueue[Copy]:
+    def queue(self) -> SendQueue[Copy | Outbox]:
         """Messages that are not sealed yet."""
         return self._active.queue
 
@@ -71,6 +76,7 @@ class Sender:
         self._doubled = doubled
         if self._active is not before:
             before.queue, self._active.queue = self._active.queue, before.queue
+            before.land_parcels(now)
             if not already:
                 before.repeat(self._active, now)
         elif self._other is not None and doubled and not already:
@@ -85,6 +91,11 @@ class Sender:
     def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
         self._active.queue.put(topic, payload, published_at, extra)
+
+    def put_outbox(self, outbox: Outbox) -> None:
+        """Queue a reliable topic that has something to send."""
+        outbox.queued = True
+        self._active.queue.put_other(outbox.topic.priority, outbox)
 
     def say(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> None:
         """Send a message of one packet by that path, once and at once, however large the packet."""
@@ -137,6 +148,10 @@ class Sender:
                     flights.pop()
                     flight.topic.counters.expired += 1
                     continue
+                if not shards.remaining:  # delivered or given up meanwhile
+                    flights.pop()
+                    shards.land(now)
+                    continue
                 size = shards.packet_size
                 need = min(shards.remaining * size, max(size, pacer.quantum // size * size))
                 if left < need:
@@ -146,10 +161,12 @@ class Sender:
                 flight.sent_at = now
                 count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
                 batches.add_run(shards.take(count, path.id, path.number(count)), size)
+                shards.sent(count, now)
                 sent = count * size
                 flight.topic.counters.bytes_sent += sent
                 if not shards.remaining:
                     flights.pop()
+                    shards.land(now)
             elif left <= 0 and priority < CONTROL_PRIORITY:
                 lane.wake = pacer.ready_at(1)
                 break
@@ -157,6 +174,8 @@ class Sender:
                 item = queue.pop(now)
                 if isinstance(item, Copy):
                     sent = self._send_copy(item, lane, batches, now)
+                elif isinstance(item, Outbox):
+                    sent = self._send_letter(epoch, item, lane, batches, now)
                 elif item is not None:
                     sent = self._send_first(epoch, *item, lane, batches, now)
                 else:
@@ -179,48 +198,102 @@ class Sender:
         now: float,
     ) -> int:
         """Seal a message; send it if it is one shard, else put it on top of the flights. Returns bytes sent."""
-        length = len(payload) + OVERHEAD
         number, common, plaintext = self._next(epoch, topic, payload, published_at)
-        room, other = lane.room, self._other
-        twice = other is not None and (self._doubled or topic.redundant)
-        if length <= room:
-            sealed = epoch.ciphers.seal(number, plaintext, common)
-            if extra is None:
-                extra = self._redundancy(1, 1, topic.delivery)
-            spacing, deadline = self._config.copy_spacing, published_at + topic.lifespan
-            if other is not None:
-                message = Copy(topic, common, sealed, 0, 0.0, deadline)
-                lane.remember(message, now)
-                if twice or (extra and length <= other.room):  # every second copy goes by the other path, one at once
-                    there = max(1, (extra + 1) // 2)
-                    other.take(message, now, there)
-                    extra = max(0, extra - there)
-            if extra:
-                heapq.heappush(lane.copies, Copy(topic, common, sealed, extra, now + spacing, deadline))
-            return self._send_shard(topic, common, sealed, lane.path, batches)
-        shape = shape_for(length, room)
-        sealed_shards = memoryview(bytearray(shape.shards * shape.size))
-        epoch.ciphers.seal_into(number, plaintext, common, sealed_shards[:length])
+        if len(plaintext) + TAG_SIZE <= lane.room:
+            deadline = published_at + topic.lifespan
+            return self._send_small(epoch, topic, number, common, plaintext, deadline, extra, lane, batches, now)
+        shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
         parity = self._redundancy(shape.block_k(0), shape.blocks, topic.delivery)
-        flight = Flight(topic, Shards(common, sealed_shards, shape, parity), now + topic.lifespan)
+        flight = Flight(topic, Shards(common, sealed, shape, parity), now + topic.lifespan)
         lane.flights.append(flight)
-        if other is not None:
+        if self._other is not None:
             lane.remember(flight, now)
-            if twice:
-                other.take(flight, now)
+            if self._doubled or topic.redundant:
+                self._other.take(flight, now)
+        return 0
+
+    def _send_letter(self, epoch: Epoch, outbox: Outbox, lane: Lane, batches: Batches, now: float) -> int:
+        """The next of a reliable topic: seal it, or go on with the shards of a large one. Returns bytes sent."""
+        outbox.queued = False
+        letter, topic = outbox.next(now), outbox.send
+        if outbox.ready:
+            self.put_outbox(outbox)
+        if letter is None or topic is None:
+            return 0
+        parcel = letter.parcel
+        if parcel is not None and (
+            parcel.number + NUMBER_SPAN < epoch.next_number or parcel.packet_size > lane.room + HEADER_SIZE
+        ):
+            parcel.cancel()
+            parcel = letter.parcel = None
+        if parcel is None:
+            plaintext = _inner(letter.sequence, letter.published_at, letter.payload)
+            plaintext += outbox.prefix(letter) + letter.payload
+            number, common = self._name(epoch, topic, len(plaintext))
+            if len(plaintext) + TAG_SIZE <= lane.room:
+                outbox.sent(letter, now)
+                deadline = letter.deadline
+                return self._send_small(epoch, topic, number, common, plaintext, deadline, None, lane, batches, now)
+            shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
+            parcel = letter.parcel = Parcel(number, common, sealed, shape, partial(outbox.landed, letter))
+        if not parcel.flying:
+            parcel.flying = True
+            lane.flights.append(Flight(topic, parcel, math.inf))
         return 0
 
     def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> tuple[int, bytes, bytes]:
         """Message number, common part of the header and plaintext of a topic's next message."""
-        number = epoch.next_number
-        epoch.next_number = number + 1
-        plaintext = INNER.pack(topic.sequence, int(published_at * 1e6)) + payload
+        plaintext = _inner(topic.sequence, published_at, payload) + payload
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         counters = topic.counters
         counters.sent += 1
-        counters.payload_sent += len(payload)
-        length = len(payload) + OVERHEAD
-        return number, push_common(DATA, self._session_id, epoch.id, number, topic.index, length), plaintext
+        counters.payload_sent += original_size(payload)
+        return *self._name(epoch, topic, len(plaintext)), plaintext
+
+    def _name(self, epoch: Epoch, topic: SendTopic, size: int) -> tuple[int, bytes]:
+        """Claim a message number; returns it and the common part of the header for a plaintext of that size."""
+        number = epoch.next_number
+        epoch.next_number = number + 1
+        return number, push_common(DATA, self._session_id, epoch.id, number, topic.index, size + TAG_SIZE)
+
+    def _send_small(
+        self,
+        epoch: Epoch,
+        topic: SendTopic,
+        number: int,
+        common: bytes,
+        plaintext: bytes,
+        deadline: float,
+        extra: int | None,
+        lane: Lane,
+        batches: Batches,
+        now: float,
+    ) -> int:
+        """Seal and send a message of one shard, and plan its copies. Returns bytes sent."""
+        sealed, other = epoch.ciphers.seal(number, plaintext, common), self._other
+        if extra is None:
+            extra = self._redundancy(1, 1, topic.delivery)
+        if other is not None:
+            message = Copy(topic, common, sealed, 0, 0.0, deadline)
+            lane.remember(message, now)
+            # every second copy goes by the other path, one at once
+            if self._doubled or topic.redundant or (extra and len(sealed) <= other.room):
+                there = max(1, (extra + 1) // 2)
+                other.take(message, now, there)
+                extra = max(0, extra - there)
+        if extra:
+            due = now + self._config.copy_spacing
+            heapq.heappush(lane.copies, Copy(topic, common, sealed, extra, due, deadline))
+        return self._send_shard(topic, common, sealed, lane.path, batches)
+
+    @staticmethod
+    def _seal_large(epoch: Epoch, number: int, common: bytes, plaintext: bytes, room: int) -> tuple[Shape, memoryview]:
+        """Seal a message of several shards; returns its layout and the padded bytes."""
+        length = len(plaintext) + TAG_SIZE
+        shape = shape_for(length, room)
+        sealed = memoryview(bytearray(shape.shards * shape.size))
+        epoch.ciphers.seal_into(number, plaintext, common, sealed[:length])
+        return shape, sealed
 
     def _send_copy(self, copy: Copy, lane: Lane, batches: Batches, now: float) -> int:
         if copy.deadline < now:
@@ -237,3 +310,9 @@ class Sender:
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)
         return len(packet)
+
+
+def _inner(sequence: int, published_at: float, payload: bytes) -> bytes:
+    """Start of a plaintext."""
+    flag = FLAG if isinstance(payload, Compressed) else 0
+    return INNER.pack(sequence & 0xFFFFFFFF, int(published_at * 1e6) | flag)

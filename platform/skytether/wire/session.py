@@ -8,10 +8,11 @@ from collections.abc import Callable, Hashable, Sequence
 
 from . import control
 from .clock import ClockOffset
+from .compression import FLAG, Compressed, compress, decompress
 from .config import Config
-from .control import Goodbye, Ping, Report
+from .control import Forward, Goodbye, Ping, Report
 from .crypto import KEY_SIZE
-from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
+from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, ReceiveTopic, SendTopic
 from .events import Connected, Disconnected, Event, MessageReceived, PathSwitched, PeerMoved, Refused
 from .handshake import NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
 from .ledger import Ledger
@@ -24,6 +25,7 @@ from .redundancy import FixedRedundancy
 from .seeker import Seeker
 from .sender import INNER, Sender
 from .stats import SessionStats
+from .streams import Streams
 from .table import ANY, index_topics
 from .topic import Role, Topic
 
@@ -85,6 +87,7 @@ class Session:
             self._on_expired,
         )  # fmt: skip
         self._ledger = Ledger(role)
+        self._streams = Streams(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
         self._clock = ClockOffset()
         self._raw: deque[Transmit] = deque()
         """Handshake packets and goodbye, on their way before everything else."""
@@ -112,8 +115,11 @@ class Session:
     def publish(self, topic: str, payload: bytes | memoryview, now: float) -> bool:
         """Queue one message; ``now`` is its time of publishing.
 
+        A message of a reliable topic is kept until the peer has it or its lifespan is over, also when no session is up.
+
         Returns:
-            False if it was dropped: no session is up, or the peer's table does not have the topic.
+            False if it was dropped: no session is up, the peer's table does not have the topic, or a reliable
+            topic is full of messages that the peer has not acknowledged.
 
         Raises:
             KeyError: The topic is not in this end's table, or this end does not send it.
@@ -121,7 +127,8 @@ class Session:
         """
         epoch = self._epoch
         sender = epoch.send.get(topic) if epoch is not None else None
-        if sender is None or not self._connected:
+        outbox = self._streams.outbox(topic) if epoch is None else sender.outbox if sender is not None else None
+        if self._closed or (outbox is None and (sender is None or not self._connected)):
             ours = self._table.get(topic)
             if ours is None or ours.direction.sender is not self.role:
                 raise KeyError(f"topic '{topic}' is not one that this end ({self.role}) sends")
@@ -132,8 +139,14 @@ class Session:
             raise ValueError(
                 f"topic '{topic}': {len(payload)} bytes are more than a message may have, {self._config.max_message}"
             )
-        sender.counters.offered += 1
-        self._sender.put(sender, payload, now)
+        row = sender or outbox
+        if row is not None and row.topic.compression and not isinstance(payload, Compressed):
+            payload = compress(payload)
+        if outbox is not None:
+            return self._streams.put(outbox, payload, now)
+        if sender is not None:
+            sender.counters.offered += 1
+            self._sender.put(sender, payload, now)
         return True
 
     def set_peer(self, address: Hashable, path: int | None = None) -> None:
@@ -255,7 +268,7 @@ class Session:
             return None
         due = min(
             self._sender.next_timer(), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
-            self._check_at,
+            self._check_at, self._streams.due,
         )  # fmt: skip
         return due if due < math.inf else None
 
@@ -271,6 +284,9 @@ class Session:
         if now >= self._sweep_at:
             self._receiver.sweep(now)
             self._sweep_at = now + self._config.keepalive
+        if now >= self._streams.due:
+            for message in self._streams.handle_timer(now):
+                self._say(message, now)
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
@@ -342,7 +358,7 @@ class Session:
 
     def _make_epoch(self, outcome: Outcome) -> Epoch:
         send, receive = self._ledger.topics(outcome.topics)
-        return Epoch(outcome.epoch, outcome.ciphers, tuple(t for _, t in outcome.topics), send, receive)
+        return Epoch(outcome.epoch, outcome.ciphers, tuple(t for _, t in outcome.topics), send, receive, outcome.life)
 
     def _find_epoch(self, epoch_id: int) -> Epoch | None:
         epoch = self._epoch
@@ -361,6 +377,7 @@ class Session:
         self._control = SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
+        restarted = self._streams.start_epoch(epoch, now)
         self._clock = ClockOffset()
         self._paths.start_epoch(now)
         self._handshakes += 1
@@ -369,13 +386,14 @@ class Session:
         self._sweep_at = now + self._config.keepalive
         self._report_at = now + self._config.report_interval
         self._seeker.found(now, epoch.id)
-        self._connect(epoch.topics, now)
+        self._connect(epoch.topics, now, restarted)
 
     def _end_epoch(self, now: float) -> None:
         """The peer said goodbye."""
         self._drop_previous()
         self._epoch = None
         self._sender.start_epoch(None)
+        self._streams.start_epoch(None, now)
         self._paths.end_epoch()
         self._sweep_at = self._report_at = math.inf
         if self._door is None:
@@ -391,10 +409,11 @@ class Session:
 
     # --- connection
 
-    def _connect(self, topics: tuple[Topic, ...], now: float) -> None:
+    def _connect(self, topics: tuple[Topic, ...], now: float, restarted: bool = False) -> None:
         self._connected = True
         self._check_at = now + self._config.silence
-        self._events.append(Connected(topics))
+        self._events.append(Connected(topics, restarted))
+        self._streams.resume(now)
 
     def _disconnect(self, reason: str) -> None:
         self._connected = False
@@ -436,19 +455,41 @@ class Session:
                 self._connect(epoch.topics, now)
             if self._seeker.hello is not None:
                 self._seeker.found(now, epoch.id)
-        sequence, micros = INNER.unpack_from(plaintext)
+        sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
-            self._on_control(epoch, plaintext[INNER.size :], micros, came_by, now)
+            self._on_control(epoch, plaintext[INNER.size :], stamp, came_by, now)
             return
-        topic, clock = epoch.receive[index], self._clock
+        topic = epoch.receive[index]
+        if not topic.topic.reliable:
+            size = len(plaintext) - INNER.size
+            payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
+            self._deliver(epoch, topic, sequence, stamp, payload, now)
+        elif topic.inbox is None:
+            self._receiver.rejected["epoch"] += 1
+        else:
+            for delivery in topic.inbox.take(plaintext[INNER.size :], stamp, now):
+                self._deliver(epoch, topic, *delivery, now)
+
+    def _deliver(
+        self, epoch: Epoch, topic: ReceiveTopic, sequence: int, stamp: int, payload: bytes | memoryview, now: float
+    ) -> None:
+        if stamp & FLAG:
+            whole = decompress(payload, self._config.max_message)
+            if whole is None:
+                self._receiver.rejected["compressed"] += 1
+                return
+            payload = whole
+        micros, clock = stamp & ~FLAG, self._clock
         if epoch is self._epoch and clock.known:
             sent_at, error = micros / 1e6 - clock.offset, clock.error
         else:
             sent_at, error = now, math.inf
-        size = len(plaintext) - INNER.size
-        if topic.arrived(sequence, size, now - sent_at, error, self._outdated(epoch, index), now):
-            payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
-            self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, error, now))
+        if topic.topic.reliable:
+            # How long ago a latched message was published tells nothing of the link.
+            topic.delivered(len(payload), now - sent_at, math.inf if topic.topic.latched else error, now)
+        elif not topic.arrived(sequence, len(payload), now - sent_at, error, self._outdated(epoch, topic.index), now):
+            return
+        self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, error, now))
 
     def _on_new_path(self, index: int, plaintext: bytes, path: int, now: float) -> Path | None:
         """The robot speaks by a path that is not known yet: its ping says so, or there is none other."""
@@ -496,6 +537,8 @@ class Session:
                     path.cost = message.cost
                 exchange = self._paths.take(message, path, micros / 1e6, now)
                 if exchange is not None:
+                    if path is self._paths.choice.active:
+                        self._streams.round_trip.add(path.rtt)
                     self._clock.exchange(*exchange, now)
         elif isinstance(message, Report):
             self._ledger.take(message, epoch, now)
@@ -504,6 +547,17 @@ class Session:
                 reported.loss_out, reported.burst_out = message.loss, message.burst
         elif isinstance(message, Goodbye):
             self._end_epoch(now)
+        elif isinstance(message, Forward):
+            self._on_forward(message, epoch, now)
+        else:
+            self._streams.on_control(message, epoch, now)
+
+    def _on_forward(self, message: Forward, epoch: Epoch, now: float) -> None:
+        topic = epoch.receive.get(message.topic)
+        if topic is not None and topic.inbox is not None:
+            topic.inbox.touch(now)
+            for delivery in topic.inbox.forward(message.base):
+                self._deliver(epoch, topic, *delivery, now)
 
     def _on_expired(self, index: int) -> None:
         topic = self._epoch.receive.get(index) if self._epoch is not None else None

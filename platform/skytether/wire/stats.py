@@ -17,13 +17,14 @@ class TopicStats:
     direction: str
     priority: int
     offered: int = 0
-    """Handed to ``publish`` while connected."""
+    """Handed to ``publish`` while connected; on reliable topics at any time."""
     sent: int = 0
     """First shard handed to the network."""
     delivered: int = 0
     """Complete and authentic at the receiver, and given to its graph."""
     lost: int = 0
-    """Sent, never completed: gaps in the topic's sequence that are older than its lifespan. When nothing is under
+    """Sent, never completed: gaps in the topic's sequence that are older than its lifespan (of a reliable topic: that
+    the sender gave up). When nothing is under
     way any more, ``sent == delivered + superseded + lost`` (of one peer's life: what was sent to a peer just before
     it was restarted is in ``sent`` only)."""
     late: int = 0
@@ -32,7 +33,10 @@ class TopicStats:
     """Dropped for age in the sender's queue or on its way out, or partly arrived and dropped in the receiver's
     reassembly (those are among the lost too)."""
     replaced: int = 0
-    """Dropped in the sender's queue because newer ones filled it."""
+    """Dropped in the sender's queue because newer ones filled it; of a reliable topic of more depth than 1: refused
+    because it was full of messages that are not acknowledged."""
+    retransmitted: int = 0
+    """Packets of a reliable topic sent again because nobody acknowledged them in time."""
     superseded: int = 0
     """Arrived complete after a newer one of a newest-value topic; neither lost nor delivered."""
     duplicate: int = 0

@@ -94,7 +94,11 @@ def pull_offer(data: bytes) -> list[Topic]:
 
 def push_answer(agreed: Sequence[tuple[int, Topic]]) -> bytes:
     """The agreed topics as they travel in WELCOME: the robot knows the rest by index."""
-    return _push([[i, t.priority, t.period, t.lifespan, t.depth, t.delivery, t.paths.value] for i, t in agreed])
+    rows: list[list[Any]] = []
+    for i, t in agreed:
+        reliability = t.reliable, t.latched, t.compression
+        rows.append([i, t.priority, t.period, t.lifespan, t.depth, t.delivery, t.paths.value, *reliability])
+    return _push(rows)
 
 
 def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]]:
@@ -105,9 +109,9 @@ def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]
     """
     agreed = []
     for row in _pull(data):
-        if not isinstance(row, list) or len(row) != 7 or not all(isinstance(row[i], int) for i in (0, 1, 4)):
+        if not isinstance(row, list) or len(row) != 10 or not all(isinstance(row[i], int) for i in (0, 1, 4, 7, 8)):
             raise ValueError("not a row of an agreed table")
-        index, priority, period, lifespan, depth, delivery, paths = row
+        index, priority, period, lifespan, depth, delivery, paths, reliable, latched, compression = row
         if not 1 <= index <= len(offered):
             raise ValueError("not a row of an agreed table")
         try:
@@ -119,6 +123,9 @@ def pull_answer(data: bytes, offered: Sequence[Topic]) -> list[tuple[int, Topic]
                 depth=depth,
                 delivery=float(delivery),
                 paths=PathUse(paths),
+                reliable=bool(reliable),
+                latched=bool(latched),
+                compression=compression,
             )
         except (TypeError, OverflowError) as error:
             raise ValueError("not a row of an agreed table") from error

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 MAX_PRIORITY = 127
+COMPRESSIONS = ("", "zstd")
 
 
 class Role(StrEnum):
@@ -56,6 +57,12 @@ class Topic:
             More than 1: every message is delivered, in order of arrival.
         delivery: Share of messages that should arrive, in (0, 1); sets the redundancy (rule 5).
         paths: Whether each message goes by two paths where there are several.
+        reliable: Send until the peer has it (rule 7): every message once and in order. ``lifespan`` is then the time
+            after which the sender gives up, and ``depth`` bounds the messages not yet acknowledged: with 1 a new
+            message replaces the one that waits behind the one under way; with more, one too many is refused.
+        latched: A reliable topic whose newest message is kept (it does not expire) and sent to every newcomer, also
+            when it was published before there was a session.
+        compression: ``zstd``, or empty for none. Messages that it does not make smaller travel as they are.
     """
 
     name: str
@@ -69,6 +76,9 @@ class Topic:
     depth: int = 1
     delivery: float = 0.99
     paths: PathUse = PathUse.FAILOVER
+    reliable: bool = False
+    latched: bool = False
+    compression: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what no endpoint could honour.
@@ -88,3 +98,7 @@ class Topic:
             raise ValueError(f"topic {self.name}: depth must be 1 to 10000, not {self.depth}")
         if not 0 < self.delivery < 1:
             raise ValueError(f"topic {self.name}: delivery must be between 0 and 1, not {self.delivery}")
+        if self.latched and not self.reliable:
+            raise ValueError(f"topic {self.name}: latched needs reliable")
+        if self.compression not in COMPRESSIONS:
+            raise ValueError(f"topic {self.name}: compression must be 'zstd' or empty, not '{self.compression}'")
