@@ -330,3 +330,38 @@ def test_a_folder_that_cannot_be_written_is_a_failure_in_words(open_runtime: Ope
     with contextlib.suppress(FileNotFoundError):
         (tmp_path / "instances/i1").unlink()
     assert runtime.observe() == {}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"rubbish",
+        b"[1]",
+        b"\xff\xfe",
+        b"[" * 60_000,
+        b'{"port": "x"}',
+        b'{"port": true}',
+        b'{"port": 0}',
+        b'{"port": -5}',
+        b'{"port": 65536}',
+        b'{"port": 1e300}',
+        b'{"port": {"a": 1}}',
+        b'{"port": 1' + b" " * (1 << 20) + b"}",
+    ],
+)
+def test_a_ready_file_with_rubbish_in_it_is_no_ready_file(tmp_path: Path, open_runtime: Open, content: bytes) -> None:
+    runtime = open_runtime()
+    runtime.start(launch(entrypoint="this"))
+    (tmp_path / "instances/i1/ready.json").write_bytes(content)
+    assert runtime.observe()["i1"].port is None
+    assert until(runtime, Phase.EXITED).port is None
+    runtime.start(launch(attempt=2, entrypoint="this"))  # it is read once more, for the port to keep
+
+
+def test_of_a_log_no_more_is_told_than_is_kept(tmp_path: Path, open_runtime: Open) -> None:
+    runtime = open_runtime(log_bytes=1024)
+    runtime.start(launch(entrypoint="this"))
+    until(runtime, Phase.EXITED)
+    (tmp_path / "instances/i1/log").write_bytes(b"x" * 100_000 + b"\nlast\n")
+    assert runtime.logs("i1", 1) == "last\n"
+    assert len(runtime.logs("i1", 5)) == 1024

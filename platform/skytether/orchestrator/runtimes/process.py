@@ -33,6 +33,8 @@ from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, sessio
 
 _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
+_NOTE_BYTES = 64 << 10
+"""Of a ready file or note that are read; they have some hundred."""
 _LAST_LINE = 300
 """Characters of a log's last line that are told."""
 
@@ -127,7 +129,7 @@ class ProcessRuntime(Runtime):
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
-            port = _read_json(folder / "ready.json").get("port") or _read_json(folder / "run.json").get("port")
+            port = _port(folder / "ready.json") or _port(folder / "run.json")
             self._prepare(launch, folder, data, port)
             note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port}
             _write_private(folder / "run.json", json.dumps(note))
@@ -138,7 +140,7 @@ class ProcessRuntime(Runtime):
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
         self._runs[launch.instance] = _Run(launch.attempt, process, str(data), child)
 
-    def _prepare(self, launch: Launch, folder: Path, data: Path, port: Any) -> None:
+    def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None) -> None:
         ready = folder / "ready.json"
         grant = launch.grant.model_copy(
             update={
@@ -185,7 +187,7 @@ class ProcessRuntime(Runtime):
             # Remembered, for it cannot change any more; nothing on the machine does.
             run.ended = Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(folder / "log"))
             return run.ended
-        port = _read_json(folder / "ready.json").get("port")
+        port = _port(folder / "ready.json")
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
         return Observation(run.attempt, phase, host, port, cpu_s=stat.cpu_s, memory_bytes=stat.memory_bytes)
@@ -217,8 +219,9 @@ class ProcessRuntime(Runtime):
         # Ids come from the store; the check keeps a mistake elsewhere from reading other folders.
         if instance not in self._runs:
             return ""
-        with contextlib.suppress(FileNotFoundError), (self._folder / instance / "log").open(errors="replace") as log:
-            return "".join(deque(log, maxlen=lines))
+        with contextlib.suppress(FileNotFoundError), (self._folder / instance / "log").open("rb") as log:
+            log.seek(max(0, os.fstat(log.fileno()).st_size - self._options.log_bytes))
+            return b"".join(deque(log, maxlen=lines)).decode(errors="replace")
         return ""
 
     def close(self) -> None:
@@ -272,9 +275,9 @@ def _last_line(log: Path) -> str:
     return ""
 
 
-def _free_or_zero(host: str, port: Any) -> int:
+def _free_or_zero(host: str, port: int | None) -> int:
     """The port of the run before, so that its robot finds the next one where it was; 0 if another has it now."""
-    if not isinstance(port, int):
+    if port is None:
         return 0
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
@@ -285,11 +288,18 @@ def _free_or_zero(host: str, port: Any) -> int:
     return port
 
 
+def _port(path: Path) -> int | None:
+    """The port that a document names; None if it names none: services write what they like into their folders."""
+    port = _read_json(path).get("port")
+    return port if type(port) is int and 0 < port < 65536 else None
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     """Empty if it is not there, or not (yet) such a document."""
     try:
-        document = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        with path.open("rb") as file:
+            document = json.loads(file.read(_NOTE_BYTES))
+    except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
 
