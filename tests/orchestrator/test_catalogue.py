@@ -59,7 +59,7 @@ def test_a_broken_built_in_service_says_why_and_keeps_no_other_from_working(fold
     [
         ("a: [1", "is no YAML in line 1"),
         ("\0", "is no YAML"),
-        ("- 1", "input should be"),
+        ("- 1", "must be a mapping of keys to values"),
         ("kind: Service", "apiVersion: is missing"),
     ],
 )

@@ -48,6 +48,22 @@ def test_an_empty_secret_file_is_refused(tmp_path: Path) -> None:
         secret_file(path, lambda: b"new")
 
 
+def test_a_secret_file_that_cannot_be_used_is_told(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(SecretFileError, match="folder: Is a directory"):
+        secret_file(tmp_path / "folder", lambda: b"new")
+    with pytest.raises(SecretFileError, match="none/key: No such file"):
+        secret_file(tmp_path / "none" / "key", lambda: b"new")
+
+
+def test_an_operators_token_that_is_none_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "operator.token"
+    path.touch(mode=0o600)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(SecretFileError, match="holds no token: delete it"):
+        Secrets(tmp_path)
+
+
 def test_session_keys_are_the_same_after_a_restart_and_differ_by_session_and_folder(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

@@ -41,14 +41,12 @@ def apply(
 
 
 def _documents(file: Path) -> list[Any]:
-    import yaml
+    from skytether.api.yaml import YamlError, read_yaml
 
     try:
-        documents = [d for d in yaml.safe_load_all(file.read_text(encoding="utf-8")) if d is not None]
-    except OSError as error:
-        fail(f"cannot read {file}: {error.strerror}", 2)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        fail(f"{file} is no YAML: {' '.join(str(error).split())}", 2)
+        documents = read_yaml(file)
+    except YamlError as error:
+        fail(str(error), 2)
     if not documents:
         fail(f"{file} holds no manifest", 2)
     return documents

@@ -9,9 +9,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from skytether.api.manifest import Manifest
+from skytether.api.yaml import YamlError, read_yaml
 
 from .errors import ConflictError, Fault, InvalidError, NotFoundError
 from .store import Store
@@ -44,15 +43,12 @@ def read_manifest(path: Path) -> Manifest:
         InvalidError: It cannot be read, is no YAML, or has wrong keys; the text begins with the path.
     """
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InvalidError([Fault("", f"cannot be read: {error.strerror}")], str(path)) from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        text = f"is no YAML{where}: {getattr(error, 'problem', None) or error}"
-        raise InvalidError([Fault("", " ".join(text.split()))], str(path)) from None
-    return parse_manifest(document, str(path))
+        documents = read_yaml(path)
+    except YamlError as error:
+        raise InvalidError([Fault("", str(error))]) from None
+    if len(documents) != 1:
+        raise InvalidError([Fault("", f"holds {len(documents)} documents, not one manifest")], str(path))
+    return parse_manifest(documents[0], str(path))
 
 
 def read_folder(folder: Path) -> dict[str, Manifest]:

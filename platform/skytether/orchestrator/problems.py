@@ -39,6 +39,7 @@ STATUS: dict[type[DomainError], tuple[int, str]] = {
 }
 """Status and title of each kind of error."""
 _HTTP = {
+    400: ("Invalid input", "the body is no JSON that can be read"),
     404: ("Not found", "there is nothing at {path}: see /docs for what there is"),
     405: ("Method not allowed", "{method} is not possible on {path}: see /docs for what is"),
     413: ("Too large", "the request is larger than {limit} bytes"),

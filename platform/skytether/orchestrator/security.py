@@ -57,8 +57,15 @@ def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
     """Read a secret, or make it at the first start (mode 0600, complete or not there at all).
 
     Raises:
-        SecretFileError: Others may read the file, or it is empty.
+        SecretFileError: Others may read the file, it is empty, or it can be neither read nor made.
     """
+    try:
+        return _secret_file(path, make)
+    except OSError as error:
+        raise SecretFileError(f"cannot read or make {path}: {error.strerror}") from error
+
+
+def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
     if not path.exists():
         draft = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
         with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
@@ -68,7 +75,7 @@ def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
         with contextlib.suppress(FileExistsError):
             os.link(draft, path)
         draft.unlink()
-    if stat.S_IMODE(path.stat().st_mode) & 0o077:
+    if path.is_file() and stat.S_IMODE(path.stat().st_mode) & 0o077:
         raise SecretFileError(f"{path} can be read by others: chmod 600 {path}")
     content = path.read_bytes()
     if not content.strip():
@@ -87,7 +94,13 @@ class Secrets:
         """
         self._key = secret_file(folder / "secret.key", lambda: secrets.token_bytes(32))
         token = secret_file(folder / "operator.token", lambda: f"{new_token()}\n".encode())
-        self._operator = TokenHash.of(token.decode().strip())
+        try:
+            self._operator = TokenHash.of(token.decode("ascii").strip())
+        except UnicodeDecodeError as error:
+            path = folder / "operator.token"
+            raise SecretFileError(
+                f"{path} holds no token: delete it, and a new one is made at the next start"
+            ) from error
 
     def is_operator(self, token: str) -> bool:
         return self._operator.matches(token)

@@ -41,6 +41,8 @@ def faults(errors: Iterable[Mapping[str, Any]], schema: Mapping[str, Any], prefi
             detail = unknown(str(path[-1]), _keys(schema, path[:-1]))
         elif error["type"] == "missing":
             detail = "is missing"
+        elif error["type"] in ("model_type", "model_attributes_type", "dict_type"):
+            detail = "must be a mapping of keys to values"
         else:
             message = str(error["msg"]).removeprefix("Value error, ")
             detail = message[:1].lower() + message[1:]

@@ -1,0 +1,53 @@
+"""YAML as people write manifests: read safely, and with every key once."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_MAX_BYTES = 1 << 20
+
+
+class YamlError(Exception):
+    """It cannot be read, or is no YAML; the text says why and begins with the file."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that comes twice: of two values one would be dropped without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                continue
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key '{key.value}' comes twice", key.start_mark
+                )
+            if isinstance(key, yaml.ScalarNode):
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def read_yaml(path: Path) -> list[Any]:
+    """All documents of a file that hold anything.
+
+    Raises:
+        YamlError: It cannot be read, is too large, or is no YAML.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise YamlError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(text) > _MAX_BYTES:
+        raise YamlError(f"{path}: is larger than {_MAX_BYTES} bytes: that is no manifest")
+    try:
+        return [document for document in yaml.load_all(text, _Loader) if document is not None]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise YamlError(f"{path}: is no YAML{where}: {getattr(error, 'problem', None) or 'it is no text'}") from error
