@@ -91,6 +91,14 @@ def test_the_bridge_follows_a_service_that_came_back_elsewhere(rig, orchestrator
     assert rig.bridges[0].peers == [("10.0.0.1", 4001)]
 
 
+def test_only_a_twist_may_drive(rig, orchestrator):
+    wrench = SESSION.topics[2].model_copy(update={"type": "geometry_msgs/msg/Wrench"})  # decodes as a Twist
+    orchestrator.session = SESSION.model_copy(update={"topics": (*SESSION.topics[:2], wrench)})
+    rig.ask()
+    assert rig.made == []
+    assert "only a geometry_msgs/msg/Twist may drive" in rig.agent.status().trouble
+
+
 def test_an_experiment_may_put_a_link_in_between(base, orchestrator, make_bridge):
     orchestrator.session = SESSION
     rig = Rig(base, orchestrator, make_bridge, replace(CONFIG, route=lambda host, port: ("127.0.0.1", port + 1)))

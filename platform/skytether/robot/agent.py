@@ -60,7 +60,8 @@ class AgentConfig:
         fallback: Entry point of the group ``skytether.fallbacks``.
         fallback_options: The fallback's.
         limits: The supervisor's; from here only.
-        needs: The arbiter's patience; round trip and loss come from the service's manifest.
+        needs: The arbiter's patience. Its ``max_rtt_s`` and ``max_loss`` hold until a session brings what the service's
+            manifest needs: ``needs.max_rtt_ms`` and ``needs.max_loss`` there; missing there means any.
         command_topic: The service's topic (geometry_msgs/msg/Twist) that drives the robot.
         rate_hz: Of the control loop.
         lease_s: The instance ends when the robot was not heard of for this long.
@@ -293,6 +294,10 @@ class Agent:
             current.close()
 
     def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
+        for topic in granted.topics:
+            if (topic.name, topic.direction) == (self._config.command_topic, "out") and topic.type != Twist.TYPE:
+                # Bytes of another type may well decode: a Wrench has the shape of a Twist.
+                raise ValueError(f"the service's {topic.name} is a {topic.type}, and only a {Twist.TYPE} may drive")
         topics = robot_table(granted.topics, offers(self._base.topics))
         spec = SessionSpec(parse_id(granted.id), parse_key(granted.key), Role.ROBOT, topics)
         session = LiveSession(

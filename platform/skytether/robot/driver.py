@@ -30,7 +30,11 @@ _TRANSITIONS_KEPT = 1000
 
 
 class Base(Protocol):
-    """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick."""
+    """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick.
+
+    A call that never returns, or a killed process, ends the control loop: motors must stop by themselves when nothing
+    has been written for some 100 ms, as motor drives with a watchdog do.
+    """
 
     topics: Mapping[str, type[Message]]
     """What `read` may give, by topic name."""
