@@ -160,6 +160,23 @@ def test_nobody_there_is_one_sentence_that_says_what_to_do(call: Callable[[Clien
     )
 
 
+@pytest.mark.parametrize(
+    ("token", "sentence"),
+    [
+        (None, "the orchestrator wants a token; give the operator's or a robot's with --token-file or SKYTETHER_TOKEN"),
+        ("sky-0", "not known; give the operator's or a robot's with --token-file or SKYTETHER_TOKEN"),
+    ],
+)
+def test_a_refused_token_says_how_to_give_one_and_nothing_of_headers(
+    script: Script, token: str | None, sentence: str
+) -> None:
+    detail = "not known" if token else "send `Authorization: Bearer TOKEN`"
+    script.says("GET", "/api/v1/sites", {"title": "No valid token", "status": 401, "detail": detail}, 401)
+    with Client(script.url, token) as client, pytest.raises(ApiError) as caught:
+        client.sites()
+    assert (caught.value.problem.status, str(caught.value)) == (401, sentence)
+
+
 @pytest.mark.parametrize("token", ["line\nbreak", "grün", "\0"])
 def test_what_cannot_be_a_token_is_refused(token: str) -> None:
     with pytest.raises(ApiError, match="what was given as token is none"):

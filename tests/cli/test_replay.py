@@ -55,7 +55,8 @@ def test_an_unknown_topic_is_told_with_those_that_there_are(bag, token):
 
 
 def test_an_orchestrator_that_does_not_answer_is_told(bag, token):
-    assert "127.0.0.1:9" in refused(run(bag, "--url", "http://127.0.0.1:9", "--token-file", token))
+    sentence = refused(run(bag, "--url", "http://127.0.0.1:9", "--token-file", token))
+    assert sentence.count("no orchestrator answers at http://127.0.0.1:9") == 1
 
 
 def test_a_token_file_that_is_missing_is_told(bag, tmp_path):

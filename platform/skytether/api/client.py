@@ -29,6 +29,7 @@ from .rest import (
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _PREFIX = "/api/v1"
+_GIVE_TOKEN = "give the operator's or a robot's with --token-file or SKYTETHER_TOKEN"  # noqa: S105 (no token)
 _PING_LIMIT = 45.0
 """Seconds without a sign of life after which an event stream counts as dead; the server pings every 15."""
 
@@ -269,7 +270,12 @@ def _parse(model: type[_Model], document: Any) -> _Model:
 
 def _problem(response: httpx.Response) -> Problem:
     try:
-        return Problem.model_validate_json(response.content)
+        problem = Problem.model_validate_json(response.content)
+        if problem.status != 401:
+            return problem
+        # The orchestrator speaks of headers; who uses this client gave a token, or forgot to.
+        refused = problem.detail if "authorization" in response.request.headers else "the orchestrator wants a token"
+        return problem.model_copy(update={"detail": f"{refused}; {_GIVE_TOKEN}"})
     except ValidationError:
         detail = f"the answer was HTTP {response.status_code}: is this the address of an orchestrator?"
         return Problem(title=response.reason_phrase, status=response.status_code, detail=detail)

@@ -122,14 +122,18 @@ class Asker:
         return self._renew_s
 
     def run(self, stop: threading.Event) -> None:
-        """Exchange until told to stop."""
+        """Exchange until told to stop; trouble is logged, each once."""
         delay = 0.0
+        told = ""
         while not stop.wait(delay):
             try:
                 delay = self.step()
             except Exception as error:  # a robot must not stop asking because of one strange answer
                 _log.debug("asking failed", exc_info=error)
                 delay = self._say(f"asking failed unexpectedly: {error!r}", self._backoff.next())
+            if self._trouble and self._trouble != told:
+                _log.warning("%s", self._trouble)
+            told = self._trouble
 
     def release(self) -> str | None:
         """Let the instance go; an orchestrator that does not answer frees it when the lease ends.
@@ -160,7 +164,5 @@ class Asker:
         return self._say(sentence, self._backoff.next())
 
     def _say(self, sentence: str, delay: float) -> float:
-        if sentence != self._trouble:
-            _log.warning("%s", sentence)
-            self._trouble = sentence
+        self._trouble = sentence
         return delay

@@ -12,7 +12,9 @@ from pathlib import Path
 from types import TracebackType
 
 from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1 import ReaderError as Ros1Error
 from rosbags.rosbag2 import Reader as Ros2Reader
+from rosbags.rosbag2 import ReaderError as Ros2Error
 
 from .table import Offer
 
@@ -43,6 +45,8 @@ class Bag:
     def __init__(self, path: Path) -> None:
         if not path.exists():
             raise BagError(f"there is no recording {path}")
+        if path.is_dir() and not (path / "metadata.yaml").exists():
+            raise BagError(f"the folder {path} is no recording: a ROS 2 bag's has a metadata.yaml")
         self._path = path
         self._stack = ExitStack()
         ros1 = path.suffix == ".bag"
@@ -50,7 +54,9 @@ class Bag:
             reader: Ros1Reader | Ros2Reader = Ros1Reader(path) if ros1 else Ros2Reader(path)
             self._stack.enter_context(reader)
         except Exception as error:  # rosbags lets what it trips over through: UnicodeDecodeError, struct.error, ...
-            raise BagError(f"{path} is no recording that can be read (ROS 1 bag, ROS 2 bag, MCAP): {error}") from error
+            raise BagError(
+                f"{path} is no recording that can be read (ROS 1 bag, ROS 2 bag, MCAP){_why(error)}"
+            ) from error
         self._reader = reader
         self.duration = max(0, self._reader.duration) / 1e9 if self._reader.message_count else 0.0
         encoding = "ros1" if ros1 else "cdr"
@@ -77,7 +83,7 @@ class Bag:
             for connection, stamp, data in self._reader.messages(connections):
                 yield (stamp - start) / 1e9, connection.topic, data
         except Exception as error:  # as above
-            raise BagError(f"{self._path} is damaged: {error}") from error
+            raise BagError(f"{self._path} is damaged{_why(error)}") from error
 
     def close(self) -> None:
         """Close the file."""
@@ -90,3 +96,8 @@ class Bag:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _why(error: Exception) -> str:
+    """What rosbags says, where it knew that it was saying something."""
+    return f": {error}" if isinstance(error, Ros1Error | Ros2Error | OSError) else ""
