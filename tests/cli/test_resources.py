@@ -11,7 +11,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from skytether.cli.main import app
+from skytether.cli.app import app
 from skytether.lab.embedded import EmbeddedOrchestrator
 
 MANIFEST = {

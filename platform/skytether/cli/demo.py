@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from skytether.lab.demo import Demo, DemoResult
+    from skytether.robot.driver import Transition
 
 
 def demo(
@@ -37,7 +38,9 @@ def demo(
         output.mkdir(parents=True, exist_ok=True)
         settings = DemoSettings(rtt_ms / 1000, jitter_ms / 1000, loss, burst, seed, output)
         settings.link(0)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        fail(f"cannot make the folder {output}: {error.strerror}; give another with --output", 2)
+    except ValueError as error:
         fail(str(error), 2)
     try:
         console.print("Starting orchestrator, network and walker ...")
@@ -56,10 +59,15 @@ def demo(
 
 def _walk(running: Demo) -> DemoResult:
     """Show how it goes while it goes."""
+    import logging
+
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from skytether.robot import driver as robot_driver
     from skytether.robot.agent import AgentStatus
 
+    logging.getLogger(robot_driver.__name__).setLevel(logging.ERROR)  # its hand-overs are told here, in people's words
+    handed_over = 0.0
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -71,11 +79,30 @@ def _walk(running: Demo) -> DemoResult:
         task = progress.add_task("walking", total=running.trail.length, now="")
 
         def show(s: float, status: AgentStatus) -> None:
+            nonlocal handed_over
             driver = status.driver
+            for change in driver.transitions[1:]:  # the first is the start
+                if change.at > handed_over:
+                    handed_over = change.at
+                    console.print(_told(change, s))
             now = f"{driver.velocity.linear:.2f} m/s, driven by {driver.source}, round trip {status.rtt * 1000:.0f} ms"
             progress.update(task, completed=s, now=now)
 
         return running.walk(show)
+
+
+def _told(change: Transition, s: float) -> str:
+    """One hand-over, in people's words."""
+    drives = {"cloud": "the service drives", "fallback": "the walker's own controller drives", "stop": "nobody drives"}
+    why = {
+        "no_command": "no valid command came in time",
+        "disconnected": "the service is not connected",
+        "rtt": "the round trip is longer than the service bears",
+        "loss": "more is lost than the service bears",
+        "clock": "the age of commands is not known well enough",
+        "recovered": "its commands come in time",
+    }
+    return f"At {s:.1f} m {drives[change.source]}: {why.get(change.reason, change.reason)}."
 
 
 def _print_tables(result: DemoResult) -> None:

@@ -1,52 +1,20 @@
-"""The command tree of ``skytether``; each command lives in a module of its own."""
+"""The entry point of ``skytether``. Nothing is imported before signals are taken care of."""
 
 from __future__ import annotations
 
 import signal
-from typing import Annotated
+import sys
 
-import typer
-
-from skytether import __version__
-
-from . import bridge, demo, lab, orchestrator, relay, replay, resources
-
-app = typer.Typer(
-    help="Cloud robotics: services for robots at the edge or in the cloud, and a bridge that holds.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command()(demo.demo)
-app.command()(replay.replay)
-app.command()(bridge.bridge)
-app.command()(relay.relay)
-app.command()(resources.apply)
-app.add_typer(orchestrator.app, name="orchestrator")
-app.add_typer(resources.service_app, name="service")
-app.add_typer(resources.site_app, name="site")
-app.add_typer(resources.instance_app, name="instance")
-app.add_typer(resources.robot_app, name="robot")
-app.add_typer(lab.app, name="lab")
-
-
-@app.callback()
-def root(
-    version: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version and end.", is_eager=True, callback=lambda v: _version(v)),
-    ] = False,
-) -> None:
-    """Read what holds for all commands."""
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(__version__)
-        raise typer.Exit
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit status of a command that was told to end, as shells have it."""
 
 
 def main() -> None:
     """Run the command line. A request to end is an interrupt, so that what was started is ended in order."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    app()
+    try:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        from .app import app
+
+        app()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -46,7 +46,8 @@ def run(
     from skytether.orchestrator.server import run as serve
     from skytether.orchestrator.settings import Settings, default_state_dir
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # A server's log instead of a command's warnings.
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True)
     for chatty in ("alembic", "uvicorn"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     settings = Settings(

@@ -1,0 +1,47 @@
+"""The command tree of ``skytether``; each command lives in a module of its own."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from skytether import __version__
+
+from . import bridge, demo, lab, orchestrator, relay, replay, resources
+from .output import log_to_console
+
+app = typer.Typer(
+    help="Cloud robotics: services for robots at the edge or in the cloud, and a bridge that holds.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(demo.demo)
+app.command()(replay.replay)
+app.command()(bridge.bridge)
+app.command()(relay.relay)
+app.command()(resources.apply)
+app.add_typer(orchestrator.app, name="orchestrator")
+app.add_typer(resources.service_app, name="service")
+app.add_typer(resources.site_app, name="site")
+app.add_typer(resources.instance_app, name="instance")
+app.add_typer(resources.robot_app, name="robot")
+app.add_typer(lab.app, name="lab")
+
+
+@app.callback()
+def root(
+    version: Annotated[  # noqa: ARG001 (its callback acts)
+        bool,
+        typer.Option("--version", help="Print the version and end.", is_eager=True, callback=lambda v: _version(v)),
+    ] = False,
+) -> None:
+    """Read what holds for all commands."""
+    log_to_console()
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)
+        raise typer.Exit
