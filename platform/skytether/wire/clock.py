@@ -29,6 +29,10 @@ class ClockOffset:
         self.error = math.inf
         """The true offset is within ``offset +- error``, as of the last exchange; inf before the first."""
 
+    def error_at(self, now: float) -> float:
+        """The same as of now: the clocks have drifted since."""
+        return self.error + max(0.0, now - self._updated) * MAX_DRIFT
+
     def exchange(self, t1: float, t2: float, t3: float, t4: float) -> None:
         """Take one exchange: t1, t4 on our clock, t2, t3 on the peer's."""
         age = max(0.0, t4 - self._updated) * MAX_DRIFT

@@ -226,7 +226,7 @@ class Session:
         paths = self._paths.stats(self._ledger.overhead(), now)
         return SessionStats(
             self._connected, self._ledger.stats(table), paths, dict(rejected), clock.offset,
-            clock.error, self._handshakes, now - self._last_heard,
+            clock.error_at(now), self._handshakes, now - self._last_heard,
         )  # fmt: skip
 
     # --- what the owner of the socket calls
@@ -481,7 +481,7 @@ class Session:
             payload = whole
         micros, clock = stamp & ~FLAG, self._clock
         if epoch is self._epoch and clock.known:
-            sent_at, error = micros / 1e6 - clock.offset, clock.error
+            sent_at, error = micros / 1e6 - clock.offset, clock.error_at(now)
         else:
             sent_at, error = now, math.inf
         if topic.topic.reliable:
