@@ -42,7 +42,7 @@ def _compare(rows: Sequence[Row], file: Path) -> Path:
     """Delays (median to 99th percentile, and the largest) and losses by topic, one colour for each transport."""
     topics = list(dict.fromkeys(row.topic for row in rows))
     transports = list(dict.fromkeys(row.transport for row in rows))
-    figure = _figure(11, 1.2 + 0.17 * len(topics) * (len(transports) + 1.5))
+    figure = _figure(11, 1.4 + 0.11 * len(topics) * (len(transports) + 1.5))
     delays, losses = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     step = 0.8 / len(transports)
     for row in rows:
@@ -55,6 +55,8 @@ def _compare(rows: Sequence[Row], file: Path) -> Path:
         losses.barh(y, 100 * row.lost, height=step * 0.9, color=colour)
         losses.plot(0, y, "|", color=colour)
     delays.set_xscale("log")
+    delays.xaxis.set_major_formatter("{x:g}")
+    delays.xaxis.set_minor_formatter("{x:g}")
     delays.set_yticks(range(len(topics)), topics)
     delays.invert_yaxis()
     delays.set_xlabel("delay one way: median to 99th percentile, and largest [ms]")
