@@ -45,6 +45,8 @@ class TopicSpec(Strict):
     """The newest message of a reliable topic is kept and sent to whoever comes later."""
     compression: Literal["none", "zstd"] = "none"
     """Not for what is compressed already, such as camera images."""
+    paths: Literal["failover", "redundant"] = "failover"
+    """``redundant``: every message by two of the robot's networks, where it has several."""
 
     @model_validator(mode="before")
     @classmethod

@@ -56,12 +56,14 @@ class DatagramSocket:
         segmentation: Whether sending uses UDP_SEGMENT; becomes False once the kernel refuses.
         coalescing: Whether receiving uses UDP_GRO.
         errors: Datagrams or batches that the system refused, by name of the error (``EMSGSIZE``).
+        too_large: Size of the latest datagram that was refused as larger than the path takes; None if none was.
     """
 
     def __init__(
         self,
         bind: tuple[str, int],
         *,
+        device: str | None = None,
         batches: bool = True,
         kernel_buffer: int = SOCKET_BUFFER,
         scratch: memoryview | None = None,
@@ -70,6 +72,7 @@ class DatagramSocket:
 
         Args:
             bind: Host (name or address, IPv4 or IPv6) and port; port 0 takes any free one.
+            device: Network interface to send by, whatever the routes say; where the system permits.
             batches: False leaves the kernel's batching alone.
             kernel_buffer: Bytes that the kernel may hold, each way.
             scratch: 64 KiB to receive into, for sockets of one thread that share it; None: its own.
@@ -85,6 +88,9 @@ class DatagramSocket:
             self._socket.setblocking(False)
             grow_buffers(self._socket, kernel_buffer)
             self._never_fragment()
+            if device is not None:
+                with contextlib.suppress(OSError, AttributeError):
+                    self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.encode())
             self.segmentation = batches and self._kernel_has(UDP_SEGMENT, 0)
             self.coalescing = batches and self._kernel_has(UDP_GRO, 1)
             self._socket.bind(address)
@@ -94,7 +100,13 @@ class DatagramSocket:
         name = self._socket.getsockname()
         self.address: tuple[str, int] = (name[0], name[1])
         self.errors: Counter[str] = Counter()
+        self.too_large: int | None = None
         self._buffer = memoryview(bytearray(65_536)) if scratch is None else scratch
+
+    @property
+    def family(self) -> int:
+        """AF_INET or AF_INET6."""
+        return self._socket.family
 
     def fileno(self) -> int:
         """For a selector."""
@@ -154,8 +166,15 @@ class DatagramSocket:
                 return done
             except OSError as error:
                 if self.segmentation and segment is not None and part > segment and error.errno in _NO_BATCHES:
-                    self.segmentation = False
-                    return done + self.send(view[done:], address, segment)
+                    # Some kernels say the same of a path that is too small; a datagram by itself tells which it is.
+                    alone = self._send_alone(view[done : done + segment], address)
+                    if alone != errno.EMSGSIZE:
+                        self.segmentation = False
+                        done += 0 if alone == errno.EAGAIN else segment
+                        return done + self.send(view[done:], address, segment)
+                    error = OSError(alone, "message too long")
+                if error.errno == errno.EMSGSIZE:
+                    self.too_large = min(part, segment or part)
                 self._count(error)
             done += part
         return done
@@ -166,6 +185,14 @@ class DatagramSocket:
         else:
             control = (socket.IPPROTO_UDP, UDP_SEGMENT, _SEGMENT_SIZE.pack(segment))
             self._socket.sendmsg([data], [control], 0, address)
+
+    def _send_alone(self, datagram: memoryview, address: Address) -> int:
+        """Send one datagram of a batch that was refused; returns the system's answer, 0 if it was sent."""
+        try:
+            self._socket.sendto(datagram, address)
+        except OSError as error:
+            return error.errno or 0
+        return 0
 
     def _parts(self, size: int, segment: int | None) -> Iterator[int]:
         """Sizes of what one system call each may take."""

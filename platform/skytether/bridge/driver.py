@@ -1,11 +1,11 @@
-"""What runs in a bridge's thread: a session, its socket, its timer and its graph. Nothing here is thread-safe."""
+"""What runs in a bridge's thread: a session, its sockets, its timer and its graph. Nothing here is thread-safe."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, cast
@@ -13,7 +13,7 @@ from typing import Any, cast
 from skytether.wire import Session
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived
 from skytether.wire.stats import SessionStats
-from skytether.wire.topic import Topic
+from skytether.wire.topic import Role, Topic
 
 from .datagrams import Address, DatagramSocket
 from .port import Port
@@ -27,6 +27,8 @@ _TURN = 8
 class Driver:
     """Drives a session: feed what came in, pass on events, send what may be sent, set the timer again.
 
+    The robot's end has a socket for each path, the service's end one for all.
+
     Attributes:
         agreed: Topics that both ends know, by name; empty while no session is up. May be read from any thread.
     """
@@ -35,17 +37,41 @@ class Driver:
         """Prepare; `begin` starts the session in the loop's thread."""
         self.agreed: dict[str, Topic] = {}
         self._session = session
-        self._socket = sock
+        self._sockets = {0: sock}
+        self._service = session.role is Role.SERVICE
         self._port = port
         self._loop = loop
         self._timer: asyncio.TimerHandle | None = None
-        self._unsent: deque[tuple[memoryview, Address, int | None]] = deque()
+        self._unsent: dict[int, deque[tuple[memoryview, Address, int | None, int]]] = {}
+        """What a socket whose buffer is full has not taken yet."""
+        self._errors: Counter[str] = Counter()
+        """Of sockets that are closed."""
         self._complained: set[tuple[str, type[Exception]]] = set()
 
     def begin(self) -> None:
         """First call, in the loop's thread."""
-        self._loop.add_reader(self._socket, self._on_readable)
+        if 0 in self._sockets:
+            self._loop.add_reader(self._sockets[0], self._on_readable, 0)
         self._advance()
+
+    def open_path(self, path: int, sock: DatagramSocket, cost: int, peer: Address | None) -> None:
+        """Use another network, by a socket that is closed with its path."""
+        self._sockets[path] = sock
+        self._loop.add_reader(sock, self._on_readable, path)
+        self._session.open_path(path, time.monotonic(), cost=cost, peer=peer)
+        self._advance()
+
+    def close_path(self, path: int) -> None:
+        """A network is gone."""
+        self._close(path)
+        self._session.close_path(path, time.monotonic())
+        self._advance()
+
+    def set_cost(self, path: int, cost: int) -> None:
+        """Prefer a path less or more."""
+        if path in self._sockets:
+            self._session.open_path(path, time.monotonic(), cost=cost)
+            self._advance()
 
     def publish(self, messages: Iterable[tuple[str, bytes, float]]) -> None:
         """Send messages: topic, payload, time of publishing."""
@@ -65,22 +91,34 @@ class Driver:
         self.agreed = {}
         if self._timer is not None:
             self._timer.cancel()
-        self._loop.remove_reader(self._socket)
-        self._loop.remove_writer(self._socket)
+        for path in list(self._sockets):
+            self._close(path)
 
     def stats(self) -> SessionStats:
         """A snapshot; what the system refused to send or receive is among the rejected packets."""
         stats = self._session.stats(time.monotonic())
-        refused = {f"socket_{name.lower()}": count for name, count in self._socket.errors.items()}
+        errors = sum((s.errors for s in self._sockets.values()), self._errors)
+        refused = {f"socket_{name.lower()}": count for name, count in errors.items()}
         return replace(stats, rejected={**stats.rejected, **refused})
 
-    def _on_readable(self) -> None:
+    def _close(self, path: int) -> None:
+        sock = self._sockets.pop(path, None)
+        self._unsent.pop(path, None)
+        if sock is not None:
+            self._loop.remove_reader(sock)
+            self._loop.remove_writer(sock)
+            self._errors += sock.errors
+            sock.close()
+
+    def _on_readable(self, path: int) -> None:
+        by = None if self._service else path
         for _ in range(_TURN):
-            batch = self._socket.receive()
+            sock = self._sockets.get(path)
+            batch = sock.receive() if sock is not None else None
             if batch is None:
                 break
             data, address, segment = batch
-            self._session.receive(data, address, time.monotonic(), segment=segment)
+            self._session.receive(data, address, time.monotonic(), segment=segment, path=by)
             self._pass_events()
         self._advance()
 
@@ -89,8 +127,9 @@ class Driver:
         self._session.handle_timer(time.monotonic())
         self._advance()
 
-    def _on_writable(self) -> None:
-        self._loop.remove_writer(self._socket)
+    def _on_writable(self, path: int) -> None:
+        self._loop.remove_writer(self._sockets[path])
+        self._send_unsent(path)
         self._advance()
 
     def _advance(self) -> None:
@@ -125,19 +164,29 @@ class Driver:
 
         While its buffer is full the session keeps the rest, so that what waits still waits by priority and age.
         """
-        while True:
-            while self._unsent:
-                data, address, segment = self._unsent[0]
-                done = self._socket.send(data, address, segment)
-                if done < len(data):
-                    self._unsent[0] = (data[done:], address, segment)
-                    self._loop.add_writer(self._socket, self._on_writable)
-                    return
-                self._unsent.popleft()
-            batches = self._session.transmit(time.monotonic())
-            if not batches:
+        while batches := self._session.transmit(time.monotonic(), self._unsent):
+            for batch in batches:
+                path = 0 if self._service else batch.path
+                unsent = self._unsent.setdefault(path, deque())
+                unsent.append((memoryview(batch.data), cast(Address, batch.address), batch.segment, batch.path))
+                if len(unsent) == 1:
+                    self._send_unsent(path)
+
+    def _send_unsent(self, path: int) -> None:
+        """Hand to a path's socket what it takes."""
+        unsent, sock = self._unsent[path], self._sockets.get(path)
+        while unsent and sock is not None:
+            data, address, segment, by = unsent[0]
+            done = sock.send(data, address, segment)
+            if sock.too_large is not None:
+                self._session.shrink(by, sock.too_large, time.monotonic())
+                sock.too_large = None
+            if done < len(data):
+                unsent[0] = (data[done:], address, segment, by)
+                self._loop.add_writer(sock, self._on_writable, path)
                 return
-            self._unsent.extend((memoryview(b.data), cast(Address, b.address), b.segment) for b in batches)
+            unsent.popleft()
+        del self._unsent[path]
 
     def _set_timer(self) -> None:
         due = self._session.next_timer()

@@ -22,9 +22,12 @@ from types import TracebackType
 from skytether.wire import Config, Session
 from skytether.wire.compression import compress
 from skytether.wire.stats import SessionStats
+from skytether.wire.topic import Role
 
 from .datagrams import Address, DatagramSocket
 from .driver import Driver
+from .interfaces import LocalPath, Network, Wanted, Watcher, addresses, select
+from .paths import LocalPaths
 from .port import Port
 from .spec import SessionSpec
 
@@ -56,6 +59,7 @@ class Bridge:
         *,
         bind: tuple[str, int] = ("127.0.0.1", 0),
         peer: tuple[str, int] | None = None,
+        paths: Wanted = (),
         config: Config | None = None,
     ) -> None:
         """Prepare; nothing is opened before `start`.
@@ -66,8 +70,17 @@ class Bridge:
             bind: Local host and port; port 0 takes any free one. The robot's end needs an address from which
                 the peer can be reached, "0.0.0.0" (or "::") for any.
             peer: Where the service's end listens; the robot's end needs it, now or by `set_peer`.
+            paths: Networks that the robot's end uses side by side, or "auto": all that lead out of this machine. Found
+                again each second. None (and while none of them is there): one socket, bound to `bind`.
             config: Of the protocol.
+
+        Raises:
+            ValueError: The service's end has no paths of its own: it learns its robot's.
         """
+        if paths and spec.role is not Role.ROBOT:
+            raise ValueError("paths: only the robot's end has them; the service's end learns them")
+        self._wanted: Wanted = paths
+        self._watcher: Watcher | None = None
         self.address = bind
         self._spec = spec
         self._port = port
@@ -113,10 +126,15 @@ class Bridge:
             undo.callback(self._loop.close)
             self._driver = Driver(session, self._socket, self._port, self._loop)
             self._port.attach(self)
+            self._paths = LocalPaths(self._driver, self._socket.resolve)
+            networks = self._look() if self._wanted else {}
             undo.pop_all()
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_INTERVAL))
+        self._loop.call_soon(self._paths.use, networks)
         self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
         self._thread.start()
+        if self._wanted:
+            self._watcher = Watcher(self._look, lambda found: self._soon(lambda: self._paths.use(found)), networks)
 
     def publish(self, topic: str, payload: bytes | memoryview) -> bool:
         if topic not in self._sends:
@@ -157,6 +175,19 @@ class Bridge:
             address = self._resolve(host, port)
             self._soon(lambda: self._driver.set_peer(address))
 
+    def set_cost(self, local: str, cost: int) -> None:
+        """Use one of the `paths` less or more from now on: raising the cost of the one in use is a planned switch.
+
+        Args:
+            local: Interface or address, as it was named in `paths`.
+            cost: 0 to 255.
+
+        Raises:
+            ValueError: The cost is out of its range.
+        """
+        path = LocalPath(local, cost)
+        self._soon(lambda: self._paths.set_cost(path.local, path.cost))
+
     def stats(self) -> SessionStats:
         """A snapshot; after `stop` the last one."""
         if threading.current_thread() is self._thread:
@@ -173,6 +204,8 @@ class Bridge:
         """Say goodbye, end the thread, free the port. May be called again; from a port it does not wait."""
         with self._lock:
             first, self._stopping = not self._stopping, True
+        if first and self._watcher is not None:
+            self._watcher.close()
         if first:
             self._soon(self._on_stop)
         if self._thread is not None and self._thread is not threading.current_thread():
@@ -222,6 +255,9 @@ class Bridge:
             for t in stats.topics
         )
         return replace(stats, topics=topics)
+
+    def _look(self) -> dict[Network, LocalPath]:
+        return select(self._wanted, addresses(self._socket.family))
 
     # --- helpers ---------------------------------------------------------------------------------------------------
 

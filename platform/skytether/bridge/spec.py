@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from skytether.api.manifest import TopicSpec
-from skytether.wire.topic import Direction, Role, Topic
+from skytether.wire.topic import Direction, PathUse, Role, Topic
 
 KEY_BYTES = 32
 
@@ -105,4 +105,5 @@ def topic_from_api(spec: TopicSpec) -> Topic:
         reliable=spec.reliable,
         latched=spec.latched,
         compression="" if spec.compression == "none" else spec.compression,
+        paths=PathUse(spec.paths),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Container, Hashable, Sequence
 
 from . import control
 from .clock import ClockOffset
@@ -248,11 +248,12 @@ class Session:
         if not self._closed:
             self._receiver.receive(memoryview(data), address, path, now, segment)
 
-    def transmit(self, now: float) -> list[Transmit]:
-        """What may be sent now, at most a burst; call again until it returns nothing."""
+    def transmit(self, now: float, full: Container[int] = ()) -> list[Transmit]:
+        """What may be sent now, at most a burst by each path that is not ``full``; call again until it is nothing."""
         sent: list[Transmit] = []
         for path in self._paths:
-            sent += self._sender.transmit(path, now)
+            if path.id not in full:
+                sent += self._sender.transmit(path, now)
         if self._raw:
             sent = [*self._raw, *sent]
             self._raw.clear()
