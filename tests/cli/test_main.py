@@ -7,9 +7,16 @@ import subprocess
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
 from skytether.cli import main as entry
+from skytether.cli.app import app
+from skytether.cli.demo import _told
 from skytether.cli.output import log_to_console
+from skytether.cli.resources import _table
+from skytether.robot.arbiter import Reason
+from skytether.robot.command import Source
+from skytether.robot.driver import Transition
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -35,13 +42,36 @@ def test_the_entry_point_imports_nothing_that_takes_long():
 
 
 def test_warnings_are_one_line_on_standard_error_however_often_it_is_set_up(capsys):
-    root = logging.getLogger()
-    before = list(root.handlers)
-    try:
-        log_to_console()
-        log_to_console()
-        logging.getLogger("skytether.robot").warning("no [answer] yet")
-        logging.getLogger("skytether.robot").info("chatter")
-    finally:
-        root.handlers[:] = before
+    log_to_console()
+    log_to_console()
+    logging.getLogger("skytether.robot").warning("no [answer] yet")
+    logging.getLogger("skytether.robot").info("chatter")
     assert capsys.readouterr() == ("", "warning: no [answer] yet\n")
+
+
+def test_in_a_narrow_terminal_names_and_ids_stay_whole(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    rows = [("0123456789abcdef", "walker", "virtual-trail", "failed", "a reason of many words " * 3)]
+    _table(("instance", "robot", "service", "state", "reason"), rows)
+    shown = capsys.readouterr().out
+    assert "0123456789abcdef" in shown
+    assert "\N{HORIZONTAL ELLIPSIS}" not in shown, "what does not fit is folded"
+
+
+@pytest.mark.parametrize(
+    ("reason", "sentence"),
+    [
+        (Reason.NO_COMMAND, "At 3.2 m the walker's own controller drives: no valid command came in time."),
+        (Reason.LOSS, "At 3.2 m the walker's own controller drives: more is lost than the service bears."),
+    ],
+)
+def test_a_hand_over_is_told_in_words(reason, sentence):
+    assert _told(Transition(0.0, Source.FALLBACK, reason), 3.21) == sentence
+
+
+def test_a_plot_folder_that_cannot_be_made_is_one_sentence():
+    result = CliRunner().invoke(app, ["demo", "--json", "--output", "/proc/none"])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "error: cannot make the folder /proc/none: No such file or directory; give another with --output\n"
+    )

@@ -49,7 +49,9 @@ def replay(
         else:
             with connected(url, token_file) as client:
                 result, files = _stream(config, client), []
-    except (ApiError, BagError, EmbeddedError, OSError, ReplayError, Unreachable) as error:
+    except OSError as error:
+        fail(f"cannot write to {error.filename or output}: {error.strerror}; give another folder with --output")
+    except (ApiError, BagError, EmbeddedError, ReplayError, Unreachable) as error:
         fail(str(error))
     except KeyboardInterrupt:
         fail("interrupted; the instance was let go", 130)
@@ -93,7 +95,7 @@ def _stream(config: ReplayConfig, client: Client) -> ReplayResult:
     from skytether.robot import replay
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"starting {config.service}", total=None)
 
         def show(progress: replay.Progress) -> None:

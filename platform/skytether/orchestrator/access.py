@@ -79,7 +79,7 @@ class Access:
             if row.token.matches(token):
                 self._note_seen(row.name)
                 return Principal(row.name, row.services)
-        raise UnauthenticatedError("this token is not known here: was it revoked, or is it another orchestrator's?")
+        raise UnauthenticatedError("this token is not known here: it was revoked, or is another orchestrator's")
 
     def _note_seen(self, robot: str) -> None:
         now = time.monotonic()
