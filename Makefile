@@ -42,4 +42,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean: ## remove what the build and the tools made
-	rm -rf .venv dist build demo-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
