@@ -12,7 +12,7 @@ import pytest
 
 from skytether.lab.bench import conditions
 from skytether.lab.bench.pair import BenchError, Pair
-from skytether.lab.bench.traffic import COMMANDS, TABLE2
+from skytether.lab.bench.traffic import COMMANDS, TABLE2, fig26
 from skytether.lab.bench.transports import NAMES, load
 from skytether.lab.bench.transports.base import TransportError
 from skytether.lab.link_model import LinkConditions
@@ -57,6 +57,14 @@ def test_every_transport_carries_the_traffic_between_namespaces(name: str, netns
     assert rows[0].overhead is not None
     assert rows[0].overhead > 0
     assert rows[0].congestion == ("reno" if load(name).TCP else None)
+
+
+@pytest.mark.parametrize("name", ["skytether", "tcp", "zenoh-tcp"])
+def test_traffic_of_one_direction_connects_too(name: str) -> None:
+    _skip_missing(name)
+    with Pair(name, fig26(2, 1.0, 100.0), condition="loopback", link=None, emulator="user", congestion="reno") as pair:
+        rows = pair.measure(0.3, warm_up=0.1)
+    assert all(row.delivered == row.sent > 0 for row in rows)
 
 
 def test_the_same_ends_measure_other_traffic() -> None:

@@ -60,7 +60,7 @@ class ZenohTransport(Transport):
             )
 
     def connected(self) -> bool:
-        return bool(self._publishers) and all(p.matching_status for p in self._publishers.values())
+        return self._session is not None and all(p.matching_status for p in self._publishers.values())
 
     def publish(self, index: int, payload: bytes) -> None:
         self._publishers[index].put(payload)
