@@ -80,6 +80,19 @@ def test_bad_quality_counts_when_it_lasts_and_the_way_back_takes_longer(driving,
     assert choice.source is Source.CLOUD
 
 
+@pytest.mark.parametrize("now", [nan, inf, -inf])
+def test_a_clock_that_tells_no_time_counts_at_once(driving, now):
+    choice, before = driving
+    choice = choose(NEEDS, choice, replace(GOOD, command_at=before), now)
+    assert (choice.source, choice.reason) == (Source.FALLBACK, Reason.NO_COMMAND)
+
+
+def test_a_clock_error_that_is_not_known_counts(driving):
+    choice, now = driving
+    choice, _ = run(choice, replace(GOOD, clock_error=nan), 0.52, now)
+    assert (choice.source, choice.reason) == (Source.FALLBACK, Reason.CLOCK)
+
+
 def test_what_the_service_does_not_need_does_not_count():
     needs = Needs()
     choice = start(needs, 0.0)

@@ -103,6 +103,20 @@ def test_a_command_backwards_stops_the_walker():
     assert (state.velocity, objections) == ((0.0, 0.0), (Objection.LINEAR_LIMIT,))
 
 
+@pytest.mark.parametrize("beyond", [0.51, 3.0, 1e300])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_command_beyond_the_limits_is_followed_up_to_them_and_no_further(beyond, side):
+    state = Supervised()
+    for i in range(60):  # 0.25 m/s at 1 m/s^2 and 0.5 rad/s at 2 rad/s^2 are reached after 25 ticks
+        now = i * LIMITS.period_s
+        command = replace(HALF, linear=beyond, angular=side * beyond, sequence=i, sent_at=now, received_at=now)
+        state, objections = step(LIMITS, hold(command, now, state), Source.CLOUD, MAX_AGE, now)
+        assert {Objection.LINEAR_LIMIT, Objection.ANGULAR_LIMIT} <= set(objections)
+        assert state.velocity.linear <= 0.25
+        assert abs(state.velocity.angular) <= 0.5
+    assert state.velocity == (0.25, side * 0.5)
+
+
 def test_a_clock_that_jumps_back_does_not_make_an_old_command_young():
     state = drive(hold(HALF), 0.0, 15)
     assert state.velocity.linear > 0
