@@ -60,7 +60,7 @@ def forged(real):
     fields = packet.pull_header(real)
     size = len(real) - packet.HEADER_SIZE
     common = packet.push_common(packet.DATA, SESSION_ID, fields[2], fields[3] + 5000, 1, size)
-    return common + packet.push_shard(0, 0, 0, fields[9] + 1) + os.urandom(size)
+    return common + packet.push_shard(0, 0, 0, fields[9] + 1, fields[10]) + os.urandom(size)
 
 
 KINDS = {

@@ -68,7 +68,7 @@ def test_messages_of_every_size_arrive_both_ways(ends, relays, through):
     flow = stats.sessions[SESSION]
     assert flow.bytes_up > 1_048_811
     assert flow.bytes_down > 1_048_811
-    assert flow.packets_up > 800  # of up to 1,400 bytes
+    assert flow.packets_up > 700  # of up to 1,400 bytes
     assert flow.addresses == (f"127.0.0.1:{robot.address[1]}",)
     assert not stats.rejected
 

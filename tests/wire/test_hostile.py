@@ -41,7 +41,11 @@ def forged(random, epoch):
         length,
     )
     header = packet.push_shard(
-        random.choice((0, 0, 1, 65_535)), random.randrange(256), random.choice((0,) * 9 + (7,)), random.getrandbits(32)
+        random.choice((0, 0, 1, 65_535)),
+        random.randrange(256),
+        random.choice((0,) * 9 + (7,)),
+        random.getrandbits(32),
+        random.getrandbits(16),
     )
     return common + header + random.randbytes(size)
 
@@ -122,10 +126,10 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     def flood():
         # 600 forged packets of a topic's own kind every 10 ms: 560 Mbit/s beside 4 Mbit/s of real messages.
         for i in range(100):
-            length = 30 * 1170
+            length = 30 * 1168
             number = world.random.randrange(60_000)
             common = packet.push_common(packet.DATA, SESSION_ID, epoch, number, 1 + i % 2, length)
-            rows = b"".join(common + packet.push_shard(0, j, 0, j) + bytes(1170) for j in range(6))
+            rows = b"".join(common + packet.push_shard(0, j, 0, j, 0) + bytes(1168) for j in range(6))
             link.inject(SERVICE, rows, segment=1200)
             assert link.sessions[SERVICE]._receiver.messages.used <= config.reassembly_limit
 

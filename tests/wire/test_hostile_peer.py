@@ -1,5 +1,7 @@
 """An authentic peer may be hostile or mistaken: what it says is believed within bounds, and breaks nothing."""
 
+import math
+
 import pytest
 
 from skytether.wire import Role, control, packet
@@ -20,12 +22,17 @@ def say(link, role, message, *, stamp=None, path=0, address=None):
     common = packet.push_common(packet.DATA, session, epoch.id, number, 0, len(plaintext) + 16)
     sealed = epoch.ciphers.seal(number, plaintext, common)
     epoch.next_number += 1
-    link.inject(receiver, common + packet.push_shard(0, 0, path, number) + sealed, address or link.addresses[role])
+    link.inject(receiver, common + packet.push_shard(0, 0, path, number, 0) + sealed, address or link.addresses[role])
+
+
+NOTHING = control.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
 
 
 def ping(path=0, **fields):
     return control.push_ping(
-        control.Ping(**{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "hold": 0} | fields)
+        control.Ping(
+            **{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "hold": 0, "feedback": NOTHING} | fields
+        )
     )
 
 

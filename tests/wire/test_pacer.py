@@ -35,7 +35,7 @@ def test_a_slow_link_gets_small_bursts():
     # 5 Mbit/s: the bucket holds 3 ms, or two packets, of sending, so a burst delays a later packet by 4 ms at most.
     slow = Pacer(5e6, 1200, 19_200, 0.0)
     assert slow.capacity == 2400
-    assert slow.quantum == 1200
+    assert slow.quantum == 1250
     assert Pacer(1e9, 1200, 19_200, 0.0).capacity == 1e9 / 8 * BUCKET_TIME
 
 

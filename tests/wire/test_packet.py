@@ -17,24 +17,26 @@ from skytether.wire import packet, peek_session_id
     index=st.integers(0, 255),
     path=st.integers(0, 255),
     packet_number=st.integers(0, 2**32 - 1),
+    time=st.integers(0, 2**16 - 1),
 )
-def test_round_trip(kind, session_id, epoch, number, topic, length, block, index, path, packet_number):
+def test_round_trip(kind, session_id, epoch, number, topic, length, block, index, path, packet_number, time):
     common = packet.push_common(kind, session_id, epoch, number, topic, length)
-    header = common + packet.push_shard(block, index, path, packet_number)
+    header = common + packet.push_shard(block, index, path, packet_number, time)
     assert packet.pull_header(header + b"shard") == (
-        kind, session_id, epoch, number, topic, length, block, index, path, packet_number,
+        kind, session_id, epoch, number, topic, length, block, index, path, packet_number, time,
     )  # fmt: skip
     assert peek_session_id(memoryview(header)) == session_id
     # What `receiver` and `fragment` find by position.
     assert header[: packet.COMMON_SIZE] == common
     assert header[packet.INDEX_AT] == index
     assert header[packet.PATH_AT] == path
-    assert int.from_bytes(header[packet.NUMBER_AT : packet.HEADER_SIZE], "big") == packet_number
+    assert int.from_bytes(header[packet.NUMBER_AT : packet.TIME_AT], "big") == packet_number
+    assert int.from_bytes(header[packet.TIME_AT : packet.HEADER_SIZE], "big") == time
     assert int.from_bytes(header[packet.COMMON_SIZE : packet.BLOCK_END], "big") == block
 
 
 def test_the_header_is_as_small_as_documented():
-    assert (packet.COMMON_SIZE, packet.HEADER_SIZE) == (22, 30)
+    assert (packet.COMMON_SIZE, packet.HEADER_SIZE) == (22, 32)
 
 
 @given(st.binary(max_size=packet.HEADER_SIZE - 1))

@@ -102,7 +102,7 @@ def check_nonces(link):
     for role in Role:
         sealed = {}
         for _, data in link.sent[role]:
-            kind, _, epoch, number, _, length, block, index, _, _ = packet.pull_header(data)
+            kind, _, epoch, number, _, length, block, index, _, _, _ = packet.pull_header(data)
             if kind == packet.DATA:
                 message = (data[: packet.COMMON_SIZE], data[packet.HEADER_SIZE :])
                 assert sealed.setdefault((epoch, number, block, index), message) == message

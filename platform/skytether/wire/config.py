@@ -20,7 +20,7 @@ class Config:
     max_mtu: int = 1400
     """Largest UDP payload that is tried; not above ``mtu``: none larger."""
     rate_bps: float = 50e6
-    """Pacing budget of a path, bits per second of UDP payload (rule 6)."""
+    """Most that a path is used with, bits per second of UDP payload; less where delays show a queue (rule 6)."""
     burst: int = 19_200
     """Most that one call of ``transmit`` returns: 16 packets. A higher priority waits for no more than this."""
     max_message: int = 16 * 2**20
@@ -30,7 +30,7 @@ class Config:
     queue_limit: int = 64 * 2**20
     """Most memory for messages that wait to be sent; the lowest priorities give way first."""
     keepalive: float = 0.1
-    """Time between pings: keeps NAT bindings open, measures round trip and clock offset."""
+    """Time between pings: keeps NAT bindings open, measures round trip and clock offset, tells what arrives."""
     report_interval: float = 0.5
     """Time between reports of counters to the peer."""
     probe_after: float = 0.15
@@ -50,13 +50,13 @@ class Config:
     old_keys: float = 2.0
     """How long the keys before a new handshake still open packets that were on their way."""
     assumed_loss: float = 0.05
-    """Share of packets that redundancy is sized for (rule 5)."""
-    max_copies: int = 5
+    """Share of packets taken to be lost on a path before anything is known of it (rule 5)."""
+    max_copies: int = 8
     """Most packets that carry the same one-shard message."""
     max_parity: float = 1.0
     """Most parity shards per data shard; messages of few shards may have ``max_copies - 1`` in any case."""
     copy_spacing: float = 0.002
-    """Time between copies of a one-shard message: longer than most bursts of loss, shorter than a control period."""
+    """Least time between copies of a one-shard message; more where losses come in bursts."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.

@@ -14,8 +14,8 @@ ACK = 4
 MISSING = 5
 FORWARD = 6
 
-_PING = struct.Struct(">BBBBHQI")
-_REPORT = struct.Struct(">BBffHH")
+_PING = struct.Struct(">BBBBHQIfffIIIff")
+_REPORT = struct.Struct(">BHH")
 _SENDER = struct.Struct(">HIQQQQQQ")
 _RECEIVER = struct.Struct(">HQQQQQQQffffffff")
 _ACK = struct.Struct(">BHQ")
@@ -27,8 +27,28 @@ ROWS_SIZE = 1000
 MISSING_ROWS = ROWS_SIZE // _MISSING_ROW.size
 
 
+class Feedback(NamedTuple):
+    """What one end knows of a path by what arrived on it. Sums count since the session's keys were made."""
+
+    capacity: float
+    """Highest rate that the path may have, bits per second; inf if nothing says that it has a limit."""
+    queue: float
+    """Seconds that packets wait in a standing queue."""
+    rate: float
+    """Bits per second that arrived of late."""
+    settled: int
+    """Packets known to have been sent."""
+    lost: int
+    """Those of them that did not arrive."""
+    runs: int
+    """Runs of lost packets."""
+    time: float
+    """Seconds from the first to the last packet of each run, summed."""
+    time_squared: float
+
+
 class Ping(NamedTuple):
-    """Keepalive, clock exchange, path probe. The time of sending is the message's own time of publishing."""
+    """Keepalive, clock exchange, path probe, feedback. The time of sending is the message's own time of publishing."""
 
     path: int
     """What it is sent by: authentic, as the header's is not."""
@@ -42,6 +62,7 @@ class Ping(NamedTuple):
     """The peer's latest time stamp (microseconds of its clock); None if it sent none yet."""
     hold: int
     """Microseconds since that arrived."""
+    feedback: Feedback
 
 
 class SenderRow(NamedTuple):
@@ -82,11 +103,6 @@ class ReceiverRow(NamedTuple):
 class Report(NamedTuple):
     """What one end counted."""
 
-    path: int
-    """That the next two are of."""
-    loss: float
-    """Share of packets from the peer that did not arrive; NaN if unknown."""
-    burst: float
     senders: tuple[SenderRow, ...]
     receivers: tuple[ReceiverRow, ...]
 
@@ -131,10 +147,12 @@ PING_SIZE = _PING.size
 
 
 def push_ping(ping: Ping, padding: int = 0) -> bytes:
-    """Encode, with that many zeros more."""
+    """Encode, with that many zeros more; sums wrap."""
     echo = NO_ECHO if ping.echo is None else min(max(ping.echo, 0), NO_ECHO - 1)  # a peer may claim any time
-    hold = min(max(ping.hold, 0), 2**32 - 1)
-    return _PING.pack(PING, ping.path, ping.cost, ping.ask, ping.size, echo, hold) + bytes(padding)
+    hold, feedback = min(max(ping.hold, 0), 2**32 - 1), ping.feedback
+    sums = (value & 0xFFFFFFFF for value in (feedback.settled, feedback.lost, feedback.runs))
+    head = PING, ping.path, ping.cost, ping.ask, ping.size, echo, hold
+    return _PING.pack(*head, *feedback[:3], *sums, *feedback[6:]) + bytes(padding)
 
 
 def push_goodbye() -> bytes:
@@ -158,15 +176,13 @@ def push_forward(forward: Forward) -> bytes:
     return _ACK.pack(FORWARD, forward.topic, forward.base)
 
 
-def push_reports(
-    path: int, loss: float, burst: float, senders: list[SenderRow], receivers: list[ReceiverRow]
-) -> Iterator[bytes]:
+def push_reports(senders: list[SenderRow], receivers: list[ReceiverRow]) -> Iterator[bytes]:
     """Encode as many messages of one packet as the rows need, at least one."""
     while True:
         count_s = min(len(senders), ROWS_SIZE // _SENDER.size)
         count_r = min(len(receivers), (ROWS_SIZE - count_s * _SENDER.size) // _RECEIVER.size)
         rows = [_SENDER.pack(*row) for row in senders[:count_s]] + [_RECEIVER.pack(*row) for row in receivers[:count_r]]
-        yield _REPORT.pack(REPORT, path, loss, burst, count_s, count_r) + b"".join(rows)
+        yield _REPORT.pack(REPORT, count_s, count_r) + b"".join(rows)
         senders, receivers = senders[count_s:], receivers[count_r:]
         if not senders and not receivers:
             return
@@ -177,17 +193,20 @@ def pull_control(data: bytes) -> Control | None:
     try:
         kind = data[0]
         if kind == PING:
-            _, path, cost, ask, size, echo, hold = _PING.unpack_from(data)
-            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, hold)
+            _, path, cost, ask, size, echo, hold, *fields = _PING.unpack_from(data)
+            feedback = Feedback(*fields)
+            if any(math.isnan(value) or value < 0 for value in feedback):
+                return None
+            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, hold, feedback)
         if kind == REPORT:
-            _, path, loss, burst, count_s, count_r = _REPORT.unpack_from(data)
+            _, count_s, count_r = _REPORT.unpack_from(data)
             at = _REPORT.size
             end = at + count_s * _SENDER.size
             senders = tuple(SenderRow(*row) for row in _SENDER.iter_unpack(data[at:end]))
             receivers = tuple(
                 ReceiverRow(*row) for row in _RECEIVER.iter_unpack(data[end : end + count_r * _RECEIVER.size])
             )
-            return Report(path, loss if math.isfinite(loss) else math.nan, burst, senders, receivers)
+            return Report(senders, receivers)
         if kind == GOODBYE:
             return Goodbye()
         if kind == ACK:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import zfec
 
-from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT
+from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT, TIME_AT
 
 Bytes = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
@@ -128,10 +128,15 @@ class Shards:
         self.remaining = len(self._tails)
         """Packets not yet taken."""
 
-    def take(self, count: int, path: int, first_number: int) -> memoryview:
-        """The next ``count`` packets, one after the other, each of ``packet_size`` bytes."""
+    @property
+    def remaining_data(self) -> int:
+        """Data shards not yet taken."""
+        return max(self._shape.shards - self._sent, 0)
+
+    def take(self, count: int, path: int, first_number: int, time: int) -> memoryview:
+        """The next ``count`` packets, one after the other, each of ``packet_size`` bytes; ``time`` in ticks."""
         start, end, shards = self._sent, self._sent + count, self._shape.shards
-        rows = self._headers(self._tails[start:end], path, first_number)
+        rows = self._headers(self._tails[start:end], path, first_number, time)
         data_end = min(end, shards)
         if start < data_end:
             rows[: data_end - start, HEADER_SIZE:] = self._data[start:data_end]
@@ -155,13 +160,13 @@ class Shards:
         parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
         return shards_of(self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity)
 
-    def pick(self, positions: Positions, path: int, first_number: int) -> memoryview:
+    def pick(self, positions: Positions, path: int, first_number: int, time: int) -> memoryview:
         """Packets of any data shards, by their positions in the message, as `take` returns them."""
-        rows = self._headers(self._tails[positions], path, first_number)
+        rows = self._headers(self._tails[positions], path, first_number, time)
         rows[:, HEADER_SIZE:] = self._data[positions]
         return rows.reshape(-1).data
 
-    def _headers(self, tails: Bytes, path: int, first_number: int) -> Bytes:
+    def _headers(self, tails: Bytes, path: int, first_number: int, time: int) -> Bytes:
         """Rows for packets, without the shards."""
         count = len(tails)
         rows = np.empty((count, self.packet_size), np.uint8)
@@ -169,7 +174,8 @@ class Shards:
         rows[:, COMMON_SIZE:HEADER_SIZE] = tails
         rows[:, NUMBER_AT - 1] = path
         numbers = np.arange(first_number, first_number + count).astype(">u4")
-        rows[:, NUMBER_AT:HEADER_SIZE] = numbers.view(np.uint8).reshape(count, 4)
+        rows[:, NUMBER_AT:TIME_AT] = numbers.view(np.uint8).reshape(count, 4)
+        rows[:, TIME_AT], rows[:, TIME_AT + 1] = time >> 8, time & 255
         return rows
 
     def _parity_shard(self, position: int) -> bytes:

@@ -61,11 +61,11 @@ def _pack(kind: int, session_id: int, salt: bytes, key: bytes, plaintext: bytes)
 def cut(common: bytes, message: bytes, room: int, parity: Callable[[int, int, float], int]) -> tuple[memoryview, int]:
     """Packets of a handshake message, one after the other, and their size. Their numbers are 0: no path yet."""
     if len(message) <= room:
-        return memoryview(common + push_shard(0, 0, 0, 0) + message), HEADER_SIZE + len(message)
+        return memoryview(common + push_shard(0, 0, 0, 0, 0) + message), HEADER_SIZE + len(message)
     shape = shape_for(len(message), room)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
     shards = Shards(common, padded, shape, parity(shape.block_k(0), shape.blocks, 0.9))
-    return shards.take(shards.remaining, 0, 0), shards.packet_size
+    return shards.take(shards.remaining, 0, 0, 0), shards.packet_size
 
 
 @dataclass(frozen=True, slots=True)

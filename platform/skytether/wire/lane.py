@@ -32,13 +32,16 @@ RECENT_BYTES = 2**20
 class Copy:
     """A sealed one-shard message that is sent again."""
 
-    __slots__ = ("common", "deadline", "due", "left", "sealed", "topic")
+    __slots__ = ("common", "deadline", "due", "left", "sealed", "spacing", "topic")
 
-    def __init__(self, topic: SendTopic, common: bytes, sealed: bytes, left: int, due: float, deadline: float) -> None:
+    def __init__(
+        self, topic: SendTopic, common: bytes, sealed: bytes, left: int, spacing: float, due: float, deadline: float
+    ) -> None:
         self.topic = topic
         self.common = common
         self.sealed = sealed
         self.left = left
+        self.spacing = spacing
         self.due = due
         self.deadline = deadline
 
@@ -157,7 +160,8 @@ class Lane:
             shards = message.shards.again(self.room)
         elif message.size <= self.room:
             if len(self.queue) < MAX_TAKEN:
-                self.queue.put_other(topic.priority, Copy(topic, message.common, message.sealed, times, now, deadline))
+                copy = Copy(topic, message.common, message.sealed, times, message.spacing, now, deadline)
+                self.queue.put_other(topic.priority, copy)
             return
         else:
             shards = shards_of(message.common, message.sealed, shape_for(message.size, self.room), 0)

@@ -75,10 +75,13 @@ class Ledger:
         """One row for each topic of a table."""
         return tuple(self._stats(topic) for topic in table.values())
 
-    def overhead(self) -> float:
-        """Bytes sent beyond payload, as a share of payload; NaN if nothing was sent."""
+    def overhead(self) -> tuple[float, float]:
+        """Bytes sent beyond payload, and those of copies and parity, as shares of payload; NaN if nothing was sent."""
         payload = sum(c.payload_sent for c in self._out.values())
-        return sum(c.bytes_sent for c in self._out.values()) / payload - 1 if payload else float("nan")
+        if not payload:
+            return float("nan"), float("nan")
+        redundant = sum(c.bytes_redundant for c in self._out.values())
+        return sum(c.bytes_sent for c in self._out.values()) / payload - 1, redundant / payload
 
     @staticmethod
     def _sender_row(topic: SendTopic) -> SenderRow:

@@ -120,9 +120,13 @@ class SequenceTracker:
 class Outbound:
     """Counters of a topic at its sender, since the session object was made; names as in `stats.TopicStats`."""
 
-    __slots__ = ("bytes_sent", "expired", "offered", "payload_sent", "replaced", "retransmitted", "sent")
+    __slots__ = (
+        "bytes_redundant", "bytes_sent", "expired", "offered", "payload_sent", "replaced", "retransmitted", "sent",
+    )  # fmt: skip
 
     def __init__(self) -> None:
+        self.bytes_redundant = 0
+        """Of ``bytes_sent``, copies and parity."""
         self.offered = self.sent = self.expired = self.replaced = self.retransmitted = self.bytes_sent = 0
         self.payload_sent = 0
 

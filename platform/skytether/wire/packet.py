@@ -1,6 +1,6 @@
 """Codec of a packet's clear header. Nothing here knows keys, sessions or time.
 
-Every packet of every type starts with the same 30 bytes, big-endian::
+Every packet of every type starts with the same 32 bytes, big-endian::
 
     offset  size  field
          0     1  version (high four bits) and type (low four bits)
@@ -14,11 +14,12 @@ Every packet of every type starts with the same 30 bytes, big-endian::
         24     1  shard within the block: data shards first, then parity
         25     1  path
         26     4  packet number, per path and direction, for loss and burst statistics
+        30     2  time of sending on the sender's clock, in units of 2**-14 s, for delay statistics
     --- then one shard; all shards of a message have the same size ---
 
-Shard size and sealed length give the number of shards and blocks (``fragment.Shape``). Block, shard, path and
-packet number are not authenticated: a false shard spoils the one message it claims to belong to, a false packet
-number is believed only within a plausible window (``path``).
+Shard size and sealed length give the number of shards and blocks (``fragment.Shape``). Block, shard, path,
+packet number and time are not authenticated: a false shard spoils the one message it claims to belong to, a false
+packet number is believed only within a plausible window (``arrivals``).
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ DATA = VERSION << 4
 HELLO = VERSION << 4 | 1
 WELCOME = VERSION << 4 | 2
 
-HEADER = struct.Struct(">BQBHIHIHBBI")
+HEADER = struct.Struct(">BQBHIHIHBBIH")
 COMMON = struct.Struct(">BQBHIHI")
-SHARD = struct.Struct(">HBBI")
+SHARD = struct.Struct(">HBBIH")
 _SESSION = struct.Struct(">BQ")
 
 HEADER_SIZE = HEADER.size
@@ -43,9 +44,14 @@ BLOCK_END = COMMON_SIZE + 2
 INDEX_AT = 24
 PATH_AT = 25
 NUMBER_AT = 26
+TIME_AT = 30
 
-Fields = tuple[int, int, int, int, int, int, int, int, int, int]
-"""type, session id, epoch, message number, topic index, sealed length, block, shard, path, packet number."""
+TICK = 2.0**-14
+"""Seconds of one unit of the time of sending: 61 microseconds. It wraps after 4 s."""
+TICKS = 2**16
+
+Fields = tuple[int, int, int, int, int, int, int, int, int, int, int]
+"""type, session id, epoch, message number, topic index, sealed length, block, shard, path, packet number, time."""
 
 
 def push_common(kind: int, session_id: int, epoch: int, number: int, topic: int, length: int) -> bytes:
@@ -53,9 +59,14 @@ def push_common(kind: int, session_id: int, epoch: int, number: int, topic: int,
     return COMMON.pack(kind, session_id, epoch, number >> 32, number & 0xFFFFFFFF, topic, length)
 
 
-def push_shard(block: int, index: int, path: int, packet: int) -> bytes:
-    """The part of the header that is a packet's own."""
-    return SHARD.pack(block, index, path, packet)
+def ticks(now: float) -> int:
+    """A time as packets carry it."""
+    return int(now / TICK) % TICKS
+
+
+def push_shard(block: int, index: int, path: int, packet: int, time: int) -> bytes:
+    """The part of the header that is a packet's own; ``time`` in ticks."""
+    return SHARD.pack(block, index, path, packet, time)
 
 
 def pull_number(common: memoryview | bytes) -> int:
@@ -69,8 +80,8 @@ def pull_header(data: memoryview | bytes) -> Fields | None:
     """Both parts; None if the packet is shorter than a header. Values are not checked."""
     if len(data) < HEADER_SIZE:
         return None
-    kind, session_id, epoch, high, low, topic, length, block, index, path, packet = HEADER.unpack_from(data)
-    return kind, session_id, epoch, high << 32 | low, topic, length, block, index, path, packet
+    kind, session_id, epoch, high, low, topic, length, block, index, path, packet, time = HEADER.unpack_from(data)
+    return kind, session_id, epoch, high << 32 | low, topic, length, block, index, path, packet, time
 
 
 def peek_session_id(data: memoryview | bytes) -> int | None:

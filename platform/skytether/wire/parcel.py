@@ -47,11 +47,11 @@ class Parcel(Shards):
         self._reported = False
         """Whether the peer told what is missing since the last `remind`."""
 
-    def take(self, count: int, path: int, first_number: int) -> memoryview:
+    def take(self, count: int, path: int, first_number: int, time: int) -> memoryview:
         chosen = self._todo[self._taken : self._taken + count]
         self._taken += count
         self.remaining -= count
-        return self.pick(chosen, path, first_number)
+        return self.pick(chosen, path, first_number, time)
 
     def sent(self, count: int, now: float) -> None:
         self._sent_at[self._todo[self._taken - count : self._taken]] = now

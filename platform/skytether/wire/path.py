@@ -1,4 +1,4 @@
-"""One path of a session: addresses, packet numbers, pacing, and what is known of losses on it.
+"""One path of a session: addresses, packet numbers, pacing, redundancy, and what is known of losses and delays on it.
 
 Which of several paths is used when is decided in `paths`.
 """
@@ -6,20 +6,28 @@ Which of several paths is used when is decided in `paths`.
 from __future__ import annotations
 
 import math
-from array import array
-from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-import numpy as np
-
+from .arrivals import NUMBERS, DelayMeter, LossMeter
 from .config import Config
+from .congestion import RateControl
+from .control import Feedback
 from .liveness import Liveness
+from .loss import LossEstimate, Sums
 from .measure import Histogram
 from .mtu import MtuSearch
 from .pacer import Pacer
+from .redundancy import Redundancy
 
-NUMBERS = 2**32
+SETTLE = 0.15
+"""Seconds between evaluations of losses: what comes later than that after its successors counts as lost."""
+MUCH = 48
+"""Packets after which the peer is told of them without waiting for the next ping."""
+MUCH_AT_FIRST = 8
+"""The same on a path not known well yet: that it is too slow for the first bursts should be known before the next."""
+FAMILIAR = 500
+"""Packets from which a path is known well."""
 
 
 class Transmit(NamedTuple):
@@ -31,95 +39,14 @@ class Transmit(NamedTuple):
     segment: int | None
 
 
-class LossMeter:
-    """Losses and their bursts from packet numbers.
-
-    Numbers are collected as they come and evaluated from time to time, each one `evaluate` late, so that
-    reordered packets are not taken for lost ones. They are not authenticated: what lies far from the rest is
-    ignored.
-    """
-
-    PLAUSIBLE = 65_536
-    """Numbers further from the middle of an interval's numbers are ignored."""
-    COLLECT = 65_536
-    """Numbers held before they are evaluated early: 256 KiB."""
-    WINDOW = 20
-    """Evaluations that the shares are taken over: 10 s with the default report interval."""
-
-    __slots__ = ("_history", "_numbers", "_settled", "_span")
-
-    def __init__(self) -> None:
-        self._numbers = array("I")
-        self._settled: int | None = None
-        """Highest number evaluated, not wrapped."""
-        self._span = 0
-        """Numbers above ``_settled`` that had been seen at the last evaluation."""
-        self._history: deque[tuple[int, int, int]] = deque(maxlen=self.WINDOW)
-        """Received, lost, runs of lost ones."""
-
-    def add(self, number: int) -> None:
-        """A packet arrived."""
-        self._numbers.append(number)
-        if len(self._numbers) >= self.COLLECT:
-            self._evaluate_early()
-
-    def add_all(self, numbers: bytes) -> None:
-        """Several packets arrived: native unsigned 32-bit numbers."""
-        self._numbers.frombytes(numbers)
-        if len(self._numbers) >= self.COLLECT:
-            self._evaluate_early()
-
-    def _evaluate_early(self) -> None:
-        self.evaluate()
-        self.evaluate()  # nothing is kept for the next time
-
-    def evaluate(self) -> None:
-        """Settle what had arrived by the last evaluation."""
-        if not self._numbers:
-            return
-        numbers = np.frombuffer(self._numbers, np.uint32).astype(np.int64)
-        start = int(numbers[0]) if self._settled is None else self._settled % NUMBERS
-        offsets = (numbers - start + NUMBERS // 2) % NUMBERS - NUMBERS // 2  # they wrap after 2**32 packets
-        middle = np.partition(offsets, len(offsets) // 2)[len(offsets) // 2]
-        offsets = offsets[np.abs(offsets - middle) < self.PLAUSIBLE]
-        highest = int(offsets.max())
-        if self._settled is None or not -self.PLAUSIBLE < highest < 2 * self.PLAUSIBLE:
-            # The first time, or after a silence too long to say anything about the share of packets lost.
-            lowest = int(offsets.min()) - 1
-            self._settled, self._span = start + lowest, highest - lowest
-        else:
-            if self._span:
-                arrived = np.zeros(self._span, bool)
-                arrived[offsets[(offsets > 0) & (offsets <= self._span)] - 1] = True
-                lost = ~arrived
-                runs = int(lost[0]) + int(np.count_nonzero(lost[1:] & ~lost[:-1]))
-                count = int(np.count_nonzero(arrived))
-                self._history.append((count, self._span - count, runs))
-            offsets = offsets[offsets > self._span]
-            self._settled, self._span = start + self._span, max(0, highest - self._span)
-        self._numbers = array("I", ((offsets + start) % NUMBERS).astype(np.uint32).tobytes())
-
-    @property
-    def loss(self) -> float:
-        """Share of packets lost; NaN before the first evaluation."""
-        lost = sum(h[1] for h in self._history)
-        total = lost + sum(h[0] for h in self._history)
-        return lost / total if total else math.nan
-
-    @property
-    def burst(self) -> float:
-        """Mean length of a run of lost packets; NaN if none was lost."""
-        runs = sum(h[2] for h in self._history)
-        return sum(h[1] for h in self._history) / runs if runs else math.nan
-
-
 class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "address", "arrivals", "burst_out", "bytes_received", "bytes_sent", "cost", "echo", "heard_at", "id", "large",
-        "liveness", "loss_out", "mtu", "newest", "next_number", "pacer", "packets_received", "packets_sent", "peer",
-        "ping_at", "pinged_at", "rtt", "rtts",
+        "_assumed_loss", "_fed_back_at", "_settle_at", "address", "bytes_received", "bytes_sent", "control", "cost",
+        "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest",
+        "next_number", "pacer", "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy",
+        "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -143,13 +70,60 @@ class Path:
         """Whether packets of the largest size were sent since the last look."""
         self.pacer = Pacer(config.rate_bps, max(config.mtu, config.max_mtu), config.burst, now)
         self.next_number = 0
-        self.arrivals = LossMeter()
         self.packets_sent = self.packets_received = self.bytes_sent = self.bytes_received = 0
-        self.loss_out = math.nan
-        """Reported by the peer, as is ``burst_out``."""
-        self.burst_out = math.nan
         self.rtt = math.nan
         self.rtts = Histogram()
+        self.control = RateControl(config.rate_bps, now)
+        self.redundancy = Redundancy(config)
+        self._assumed_loss = config.assumed_loss
+        self._measure(now)
+
+    def _measure(self, now: float) -> None:
+        """From the beginning: another peer, or the same one after a restart, counts anew."""
+        self.losses, self.delays = LossMeter(), DelayMeter()
+        self.loss_in = LossEstimate(self._assumed_loss)
+        """Of what arrives here; ``loss_out`` of what the peer says has arrived there."""
+        self.loss_out = LossEstimate(self._assumed_loss)
+        self._fed_back_at = now
+        self._settle_at = now
+
+    def arrived(self, number: int, time: int, size: int, now: float) -> None:
+        """A packet of ``size`` bytes came; ``time`` is that of its sending in ticks."""
+        self.losses.add(number, time)
+        self.delays.add(time, size, now)
+
+    def arrived_all(self, numbers: bytes, times: bytes, size: int, now: float) -> None:
+        """Several packets came: native unsigned 32-bit numbers, 16-bit times."""
+        self.losses.add_all(numbers, times)
+        self.delays.add_all(times, size, now)
+
+    @property
+    def much_arrived(self) -> bool:
+        """Whether the peer should be told before the next ping is due."""
+        return self.delays.pending >= (MUCH if self.losses.settled > FAMILIAR else MUCH_AT_FIRST)
+
+    def feedback(self, now: float) -> Feedback:
+        """What the peer is to know; evaluates what arrived."""
+        losses, delays = self.losses, self.delays
+        if now >= self._settle_at:
+            losses.evaluate()
+            self._settle_at = now + SETTLE
+        delays.evaluate(now)
+        sums = Sums(losses.settled, losses.lost, losses.runs, losses.time, losses.time_squared)
+        self.loss_in.take(sums, now)
+        return Feedback(delays.capacity, delays.queue, delays.rate, losses.settled, losses.lost, losses.runs, *sums[3:])
+
+    def take_feedback(self, feedback: Feedback, now: float) -> None:
+        """Follow what the peer knows."""
+        new = self.loss_out.take(Sums(*feedback[3:]), now)
+        self.redundancy.model = self.loss_out.model.rounded()
+        elapsed = now - self._fed_back_at
+        if elapsed <= 0:
+            return
+        self._fed_back_at = now
+        used, waited = self.pacer.usage()
+        self.control.take(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
+        self.pacer.set_rate(self.control.rate)
 
     def number(self, count: int = 1) -> int:
         """Claim packet numbers; returns the first."""
@@ -162,8 +136,7 @@ class Path:
         """Forget what belongs to a peer that was there before."""
         self.newest = -1
         self.echo = None
-        self.arrivals = LossMeter()
-        self.loss_out = self.burst_out = math.nan
+        self._measure(now)
         self.liveness = Liveness()
         self.mtu.restart(now)
         self.ping_at = now

@@ -157,12 +157,19 @@ class Paths:
             echo, hold = None, 0
         else:
             echo, hold = round(path.echo[0] * 1e6), int((now - path.echo[1]) * 1e6)
-        self._say(path, push_ping(Ping(path.id, path.cost, ask, size, echo, hold), max(0, size - PADDING)), now)
+        ping = Ping(path.id, path.cost, ask, size, echo, hold, path.feedback(now))
+        self._say(path, push_ping(ping, max(0, size - PADDING)), now)
 
     def ping_soon(self, path: Path, now: float) -> None:
         """Ping, unless one was sent just now."""
         if now >= path.pinged_at + PING_SPACING:
             self.ping(path, now)
+
+    def tell(self, now: float) -> None:
+        """Tell the peer what arrived, by the paths on which that is much."""
+        for path in self:
+            if path.much_arrived:
+                self.ping_soon(path, now)
 
     def take(self, ping: Ping, path: Path, sent_at: float, now: float) -> Exchange | None:
         """Take the peer's ping that came by a path, and answer it.
@@ -173,8 +180,9 @@ class Paths:
         first = path.echo is None
         if path.echo is None or sent_at > path.echo[0]:
             path.echo = sent_at, now
+            path.take_feedback(ping.feedback, now)
         if ping.ask:
-            answer = Ping(path.id, path.cost, False, ping.size, round(sent_at * 1e6), 0)
+            answer = Ping(path.id, path.cost, False, ping.size, round(sent_at * 1e6), 0, path.feedback(now))
             self._say(path, push_ping(answer), now)
         elif first:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
@@ -265,14 +273,14 @@ class Paths:
             for path in [p for p in self if p.peer is None and now - p.heard_at > FORGET_AFTER]:
                 self.close(path.id, now)
 
-    def stats(self, overhead: float, now: float) -> tuple[PathStats, ...]:
-        """A snapshot; ``overhead`` is that of all paths."""
+    def stats(self, overhead: float, redundancy: float, now: float) -> tuple[PathStats, ...]:
+        """A snapshot; ``overhead`` and ``redundancy`` are those of all paths."""
         return tuple(
             PathStats(
-                p.id, p.address, p.rtt, p.rtts.minimum, p.rtts.quantile(0.5), p.loss_out, p.arrivals.loss,
-                p.arrivals.burst, p.packets_sent, p.packets_received, p.bytes_sent, p.bytes_received,
-                p.pacer.rate * 8, overhead, p is self.choice.active, p.liveness.health(now).name.lower(), p.cost,
-                p.mtu.size,
+                p.id, p.address, p.rtt, p.rtts.minimum, p.rtts.quantile(0.5), p.loss_out.share, p.loss_in.share,
+                p.loss_in.burst, p.loss_out.burst, p.packets_sent, p.packets_received, p.bytes_sent, p.bytes_received,
+                p.pacer.rate * 8, overhead, redundancy, p is self.choice.active, p.liveness.health(now).name.lower(),
+                p.cost, p.mtu.size,
             )
             for p in self
         )  # fmt: skip
@@ -347,4 +355,5 @@ def _badness(path: Path) -> float:
     rtt = path.liveness.srtt
     if math.isnan(rtt):
         return math.inf
-    return rtt + LOSS_WEIGHT * (path.loss_out if path.loss_out == path.loss_out else 0.0)
+    loss = path.loss_out.share
+    return rtt + LOSS_WEIGHT * (loss if loss == loss else 0.0)

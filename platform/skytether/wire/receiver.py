@@ -25,6 +25,7 @@ from .packet import (
     HELLO,
     NUMBER_AT,
     PATH_AT,
+    TIME_AT,
     VERSION,
     WELCOME,
     pull_header,
@@ -126,7 +127,9 @@ class Receiver:
         if size <= 0:
             self.rejected["short"] += 1
             return
-        kind, session_id, epoch_id, high, low, topic, length, block, index, path_id, packet = HEADER.unpack_from(data)
+        kind, session_id, epoch_id, high, low, topic, length, block, index, path_id, packet, time = HEADER.unpack_from(
+            data
+        )
         if kind != DATA or session_id != self._session_id:
             self._other(data, kind, session_id, size, length, block, index, by, address, now)
             return
@@ -138,7 +141,7 @@ class Receiver:
             self.rejected["path"] += 1
             return
         if path is not None:
-            path.arrivals.add(packet)
+            path.arrived(packet, time, len(data), now)
         number = high << 32 | low
         if length != size:
             entry = self._entry(epoch, number, topic, length, block, bytes(data[:COMMON_SIZE]), size, 1, now)
@@ -157,14 +160,15 @@ class Receiver:
         fields = pull_header(rows[0].data)
         if fields is None or fields[0] != DATA or fields[1] != self._session_id:
             return False
-        _, _, epoch_id, number, topic, length, block, _, _, _ = fields
+        _, _, epoch_id, number, topic, length, block, _, _, _, _ = fields
         epoch = self._find_epoch(epoch_id)
         size = rows.shape[1] - HEADER_SIZE
         if epoch is None or length == size or (rows[:, PATH_AT] != by).any():
             return False
-        numbers = np.ascontiguousarray(rows[:, NUMBER_AT:HEADER_SIZE]).view(">u4")
         if path is not None:
-            path.arrivals.add_all(numbers.astype(np.uint32).tobytes())
+            numbers = np.ascontiguousarray(rows[:, NUMBER_AT:TIME_AT]).view(">u4").astype(np.uint32)
+            times = np.ascontiguousarray(rows[:, TIME_AT:HEADER_SIZE]).view(">u2").astype(np.uint16)
+            path.arrived_all(numbers.tobytes(), times.tobytes(), rows.shape[1], now)
         common = rows[0, :COMMON_SIZE].tobytes()
         entry = self._entry(epoch, number, topic, length, block, common, size, len(rows), now)
         if entry is not None:

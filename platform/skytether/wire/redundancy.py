@@ -1,27 +1,33 @@
-"""How many packets more than needed a message gets (rule 5).
+"""How many packets more than needed a message gets, and how far apart (rule 5).
 
-For now sized for a fixed share of independent losses; a policy that follows the peer's reports replaces
-`FixedRedundancy` without the sender noticing.
+As few as reach a topic's ``delivery`` under the losses that the peer reports, whose bursts are counted: neighbours of
+a lost packet are more likely to be lost, so parity is planned by the distribution of losses in a run of packets, and
+copies keep a distance at which the burst that took the first is likely to be over.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
-from typing import Protocol
+from typing import NamedTuple
+
+import numpy as np
 
 from .config import Config
 from .fragment import MAX_SHARDS
+from .loss import LossModel
+
+APART = 3.0
+"""Mean durations of a burst between two copies: 5 % of bursts last longer."""
+SPREAD = 0.5
+"""Share of a message's lifespan in which its copies are sent."""
 
 
-class RedundancyPolicy(Protocol):
-    """Asked once per message, or once per block shape of a large one."""
+class Copies(NamedTuple):
+    """How often a one-shard message is sent again, and with how many seconds in between."""
 
-    def __call__(self, k: int, blocks: int, delivery: float) -> int:
-        """Extra packets for each block of ``k`` data shards, of which a message has ``blocks``.
-
-        For a one-shard message the extra packets are copies.
-        """
-        ...
+    more: int
+    spacing: float
 
 
 @lru_cache(maxsize=4096)
@@ -46,18 +52,78 @@ def plan(k: int, delivery: float, loss: float, limit: int) -> int:
     return extra
 
 
-class FixedRedundancy:
-    """Sized for ``Config.assumed_loss`` whatever the path does."""
+@lru_cache(maxsize=4096)
+def plan_bursts(k: int, delivery: float, loss: float, burst: float, limit: int) -> int:
+    """The same for losses in runs of ``burst`` packets on average, more than 1 (a Gilbert chain)."""
+    end = 1 / burst
+    begin = min(end * loss / (1 - loss), 1.0)
+    # good[j], bad[j]: P(j packets lost so far, and the last one arrived or was lost).
+    good, bad = np.zeros(limit + 1), np.zeros(limit + 1)
+    good[0] = 1 - loss
+    bad[1:2] = loss
+    for count in range(2, k + limit + 1):
+        stay = good * (1 - begin) + bad * end
+        bad[1:] = (good * begin + bad * (1 - end))[:-1]
+        bad[0] = 0.0
+        good = stay
+        if count >= k:
+            m = count - k
+            if good[: m + 1].sum() + bad[: m + 1].sum() >= delivery:
+                return m
+    return limit
 
-    __slots__ = ("_config",)
+
+@lru_cache(maxsize=1024)
+def plan_copies(delivery: float, model: LossModel, spacing: float, budget: float, limit: int) -> Copies:
+    """Fewest copies of a single packet that reach ``delivery``.
+
+    Args:
+        delivery: Target, in (0, 1).
+        model: Losses.
+        spacing: Least seconds between two.
+        budget: Seconds in which all of them have to be sent.
+        limit: Most copies; the answer when the target cannot be met.
+    """
+    if not model.time:
+        return Copies(plan(1, delivery, model.loss, limit), spacing)
+    if 1 - model.loss >= delivery:
+        return Copies(0, spacing)
+    apart = spacing
+    for count in range(1, limit + 1):
+        apart = max(spacing, min(APART * model.time, budget / count))
+        # A burst that took one packet takes the next if it goes on for that long; else they are lost independently.
+        again = model.loss + (1 - model.loss) * math.exp(-apart / model.time)
+        if 1 - model.loss * again**count >= delivery:
+            return Copies(count, apart)
+    return Copies(limit, apart)
+
+
+class Redundancy:
+    """Plans for one path.
+
+    Attributes:
+        model: Losses of the path.
+    """
+
+    __slots__ = ("_config", "model")
 
     def __init__(self, config: Config) -> None:
         self._config = config
+        self.model = LossModel(config.assumed_loss)
 
-    def __call__(self, k: int, blocks: int, delivery: float) -> int:
-        """See `RedundancyPolicy`: each of the blocks must arrive, so each has the target's root."""
+    def copies(self, delivery: float, lifespan: float) -> Copies:
+        """For a message of one shard."""
         config = self._config
-        if k == 1 and blocks == 1:
-            return plan(1, delivery, config.assumed_loss, config.max_copies - 1)
+        return plan_copies(delivery, self.model, config.copy_spacing, SPREAD * lifespan, config.max_copies - 1)
+
+    def parity(self, k: int, blocks: int, delivery: float) -> int:
+        """Parity shards for each block of ``k`` data shards of a message that has ``blocks``.
+
+        Each of the blocks must arrive, so each has the target's root.
+        """
+        config, model = self._config, self.model
         limit = min(max(int(k * config.max_parity + 0.5), config.max_copies - 1), MAX_SHARDS - k)
-        return plan(k, delivery ** (1 / blocks), config.assumed_loss, limit)
+        each = delivery ** (1 / blocks)
+        if model.burst > 1 and limit:
+            return plan_bursts(k, each, model.loss, model.burst, limit)
+        return plan(k, each, model.loss, limit)

@@ -19,11 +19,10 @@ from .crypto import TAG_SIZE
 from .epoch import CONTROL_PRIORITY, Epoch, SendTopic
 from .fragment import Shape, Shards, shape_for
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
-from .packet import DATA, HEADER_SIZE, push_common, push_shard
+from .packet import DATA, HEADER_SIZE, push_common, push_shard, ticks
 from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
-from .redundancy import RedundancyPolicy
 from .reliable import NUMBER_SPAN, Outbox
 
 INNER = struct.Struct(">IQ")
@@ -40,14 +39,12 @@ class Sender:
     Args:
         session_id: In every header.
         config: Settings.
-        redundancy: How many packets more than needed a message gets.
         path: The only one at first.
     """
 
-    def __init__(self, session_id: int, config: Config, redundancy: RedundancyPolicy, path: Path) -> None:
+    def __init__(self, session_id: int, config: Config, path: Path) -> None:
         self._session_id = session_id
         self._config = config
-        self._redundancy = redundancy
         self.epoch: Epoch | None = None
         self._lanes = {path.id: Lane(path, config.queue_limit)}
         self._active = self._lanes[path.id]
@@ -104,7 +101,7 @@ class Sender:
             return
         number, common, plaintext = self._next(epoch, topic, payload, now)
         sealed = epoch.ciphers.seal(number, plaintext, common)
-        packet = b"".join((common, push_shard(0, 0, path.id, path.number()), sealed))
+        packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
         topic.counters.bytes_sent += len(packet)
         self._lane(path).say(packet)
 
@@ -160,10 +157,12 @@ class Sender:
                 path.large = True
                 flight.sent_at = now
                 count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
-                batches.add_run(shards.take(count, path.id, path.number(count)), size)
+                counters = flight.topic.counters
+                counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
+                batches.add_run(shards.take(count, path.id, path.number(count), ticks(now)), size)
                 shards.sent(count, now)
                 sent = count * size
-                flight.topic.counters.bytes_sent += sent
+                counters.bytes_sent += sent
                 if not shards.remaining:
                     flights.pop()
                     shards.land(now)
@@ -203,7 +202,7 @@ class Sender:
             deadline = published_at + topic.lifespan
             return self._send_small(epoch, topic, number, common, plaintext, deadline, extra, lane, batches, now)
         shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
-        parity = self._redundancy(shape.block_k(0), shape.blocks, topic.delivery)
+        parity = lane.path.redundancy.parity(shape.block_k(0), shape.blocks, topic.delivery)
         flight = Flight(topic, Shards(common, sealed, shape, parity), now + topic.lifespan)
         lane.flights.append(flight)
         if self._other is not None:
@@ -271,10 +270,10 @@ class Sender:
     ) -> int:
         """Seal and send a message of one shard, and plan its copies. Returns bytes sent."""
         sealed, other = epoch.ciphers.seal(number, plaintext, common), self._other
-        if extra is None:
-            extra = self._redundancy(1, 1, topic.delivery)
+        planned, spacing = lane.path.redundancy.copies(topic.delivery, topic.lifespan)
+        extra = planned if extra is None else extra
         if other is not None:
-            message = Copy(topic, common, sealed, 0, 0.0, deadline)
+            message = Copy(topic, common, sealed, 0, spacing, 0.0, deadline)
             lane.remember(message, now)
             # every second copy goes by the other path, one at once
             if self._doubled or topic.redundant or (extra and len(sealed) <= other.room):
@@ -282,9 +281,8 @@ class Sender:
                 other.take(message, now, there)
                 extra = max(0, extra - there)
         if extra:
-            due = now + self._config.copy_spacing
-            heapq.heappush(lane.copies, Copy(topic, common, sealed, extra, due, deadline))
-        return self._send_shard(topic, common, sealed, lane.path, batches)
+            heapq.heappush(lane.copies, Copy(topic, common, sealed, extra, spacing, now + spacing, deadline))
+        return self._send_shard(topic, common, sealed, lane.path, batches, now)
 
     @staticmethod
     def _seal_large(epoch: Epoch, number: int, common: bytes, plaintext: bytes, room: int) -> tuple[Shape, memoryview]:
@@ -300,13 +298,15 @@ class Sender:
             return 0
         copy.left -= 1
         if copy.left:
-            copy.due = now + self._config.copy_spacing
+            copy.due = now + copy.spacing
             heapq.heappush(lane.copies, copy)
-        return self._send_shard(copy.topic, copy.common, copy.sealed, lane.path, batches)
+        size = self._send_shard(copy.topic, copy.common, copy.sealed, lane.path, batches, now)
+        copy.topic.counters.bytes_redundant += size
+        return size
 
     @staticmethod
-    def _send_shard(topic: SendTopic, common: bytes, sealed: bytes, path: Path, batches: Batches) -> int:
-        packet = b"".join((common, push_shard(0, 0, path.id, path.number()), sealed))
+    def _send_shard(topic: SendTopic, common: bytes, sealed: bytes, path: Path, batches: Batches, now: float) -> int:
+        packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)
         return len(packet)

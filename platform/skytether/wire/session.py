@@ -21,7 +21,6 @@ from .packet import HEADER_SIZE, HELLO, WELCOME
 from .path import Path, Transmit
 from .paths import Choice, Paths
 from .receiver import Receiver
-from .redundancy import FixedRedundancy
 from .seeker import Seeker
 from .sender import INNER, Sender
 from .stats import SessionStats
@@ -80,8 +79,7 @@ class Session:
         self._events: deque[Event] = deque()
         self._paths = Paths(self._config, self._say_by, self._on_choice, now)
         self._peer: Hashable | None = None
-        self._redundancy = FixedRedundancy(self._config)
-        self._sender = Sender(session_id, self._config, self._redundancy, self._paths.choice.active)
+        self._sender = Sender(session_id, self._config, self._paths.choice.active)
         self._receiver = Receiver(
             session_id, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
             self._on_expired,
@@ -223,7 +221,7 @@ class Session:
         rejected = Counter(self._receiver.rejected)
         if self._receiver.messages.evicted:
             rejected["evicted"] = self._receiver.messages.evicted
-        paths = self._paths.stats(self._ledger.overhead(), now)
+        paths = self._paths.stats(*self._ledger.overhead(), now)
         return SessionStats(
             self._connected, self._ledger.stats(table), paths, dict(rejected), clock.offset,
             clock.error_at(now), self._handshakes, now - self._last_heard,
@@ -247,6 +245,8 @@ class Session:
         """
         if not self._closed:
             self._receiver.receive(memoryview(data), address, path, now, segment)
+            if self._connected:
+                self._paths.tell(now)
 
     def transmit(self, now: float, full: Container[int] = ()) -> list[Transmit]:
         """What may be sent now, at most a burst by each path that is not ``full``; call again until it is nothing."""
@@ -543,9 +543,6 @@ class Session:
                     self._clock.exchange(*exchange, now)
         elif isinstance(message, Report):
             self._ledger.take(message, epoch, now)
-            reported = self._paths.get(message.path)
-            if reported is not None:
-                reported.loss_out, reported.burst_out = message.loss, message.burst
         elif isinstance(message, Goodbye):
             self._end_epoch(now)
         elif isinstance(message, Forward):
@@ -570,12 +567,8 @@ class Session:
     def _report(self, now: float) -> None:
         if self._epoch is None:
             return
-        rows = self._ledger.rows(self._epoch, now)
-        for path in self._paths:
-            path.arrivals.evaluate()
-            for message in control.push_reports(path.id, path.arrivals.loss, path.arrivals.burst, *rows):
-                self._say(message, now)
-            rows = [], []
+        for message in control.push_reports(*self._ledger.rows(self._epoch, now)):
+            self._say(message, now)
 
     def _say(self, message: bytes, now: float) -> None:
         """Queue a control message, once: the next one of its kind makes up for its loss."""
@@ -588,7 +581,7 @@ class Session:
     def _send_raw(self, common: bytes, message: bytes, path: Path, address: Hashable) -> None:
         if len(self._raw) >= MAX_RAW:
             return
-        packets, size = cut(common, message, self._config.mtu - HEADER_SIZE, self._redundancy)
+        packets, size = cut(common, message, self._config.mtu - HEADER_SIZE, path.redundancy.parity)
         path.pacer.spend(len(packets))
         path.packets_sent += -(-len(packets) // size)
         path.bytes_sent += len(packets)

@@ -76,6 +76,7 @@ class PathStats:
     """Share of packets sent by the peer that did not arrive here."""
     burst_in: float = float("nan")
     """Mean length of a run of lost packets."""
+    burst_out: float = float("nan")
     packets_sent: int = 0
     packets_received: int = 0
     bytes_sent: int = 0
@@ -84,6 +85,8 @@ class PathStats:
     """Pacing budget, bits per second."""
     overhead: float = float("nan")
     """Bytes sent beyond payload, as a share of payload; of all paths together."""
+    redundancy: float = float("nan")
+    """Bytes of copies and parity, as a share of payload; of all paths together."""
     active: bool = True
     """Whether this end sends by it."""
     health: str = "live"

@@ -1,0 +1,202 @@
+"""Losses and bursts from packet numbers; queue and capacity from delays."""
+
+import math
+from array import array
+from random import Random
+
+import pytest
+
+from skytether.lab.link_model import LinkConditions, LinkModel
+from skytether.wire.arrivals import COLLECT, NUMBERS, DelayMeter, LossMeter
+from skytether.wire.config import Config
+from skytether.wire.packet import TICK, TICKS, ticks
+from skytether.wire.path import Path
+
+
+def feed(meter, numbers, every=200, period=0.01):
+    for i, number in enumerate(numbers):
+        meter.add(number % NUMBERS, ticks(number % NUMBERS * period))
+        if i % every == every - 1:
+            meter.evaluate()
+    meter.evaluate()
+    meter.evaluate()
+
+
+@pytest.mark.parametrize("start", [0, 1000, NUMBERS - 2000])
+@pytest.mark.parametrize("reorder", [0, 30])
+def test_share_and_runs_are_what_was_dropped(start, reorder):
+    random, lost, runs, kept, inside = Random(3), 0, 0, [], False
+    total = 4000
+    for number in range(total):
+        if number not in (0, total - 1) and random.random() < (0.7 if inside else 0.02):
+            lost, runs, inside = lost + 1, runs + (not inside), True
+        else:
+            inside = False
+            kept.append(start + number)
+    kept.sort(key=lambda n: n + random.random() * reorder)
+    meter = LossMeter()
+    feed(meter, kept)
+    assert meter.settled >= total - 2
+    assert meter.lost == pytest.approx(lost, abs=2)
+    assert meter.runs == pytest.approx(runs, rel=0.01)
+
+
+@pytest.mark.parametrize("every", [1, 3, 100])
+def test_a_run_is_one_run_with_its_duration_wherever_it_is_evaluated(every):
+    meter = LossMeter()
+    feed(meter, [n for n in range(300) if n % 50 not in (10, 11, 12, 13, 14)], every)
+    assert (meter.lost, meter.runs) == (30, 6)
+    if every == 100:  # those within one evaluation: five packets, 10 ms apart
+        assert meter.time == pytest.approx(6 * 0.04, abs=0.045)
+        assert meter.time_squared == pytest.approx(meter.time * 0.04, rel=0.01)
+
+
+def test_reordering_alone_is_not_loss():
+    numbers = list(range(3000))
+    random = Random(4)
+    numbers.sort(key=lambda n: n + random.random() * 100)
+    meter = LossMeter()
+    feed(meter, numbers)
+    assert (meter.lost, meter.runs, meter.time) == (0, 0, 0.0)
+
+
+def test_false_numbers_far_away_change_nothing():
+    meter = LossMeter()
+    numbers = []
+    for n in range(2000):
+        numbers += [n] if n % 10 else [n, n + 10_000_000]
+    feed(meter, numbers)
+    assert meter.lost == 0
+
+
+def test_after_a_long_silence_it_begins_again():
+    meter = LossMeter()
+    feed(meter, [*range(1000), *range(50_000_000, 50_001_000)])
+    assert meter.lost == 0
+
+
+def test_a_flood_is_bounded_and_batches_count_like_packets():
+    meter, other = LossMeter(), LossMeter()
+    numbers = [n for n in range(200_000) if n % 7]
+    for start in range(0, len(numbers), 50):
+        some = numbers[start : start + 50]
+        meter.add_all(array("I", some).tobytes(), array("H", [0] * len(some)).tobytes())
+        for n in some:
+            other.add(n, 0)
+        assert len(meter._numbers) < COLLECT
+    meter.evaluate()
+    other.evaluate()
+    assert meter.lost / meter.settled == pytest.approx(1 / 7, abs=1e-3)
+    assert other.lost == pytest.approx(meter.lost, abs=10)  # evaluated at other moments
+
+
+def test_packet_numbers_wrap():
+    path = Path(0, Config(), 0.0)
+    path.next_number = NUMBERS - 2
+    assert path.number(3) == NUMBERS - 2
+    assert path.number() == 1
+    assert path.packets_sent == 4
+
+
+class Line:
+    """Packets of a camera and of a fast small topic through a modelled link into a meter."""
+
+    def __init__(self, conditions, offset=0.0):
+        self.model = LinkModel(conditions, "up")
+        self.meter = DelayMeter()
+        self.offset = offset
+        """Of the sender's clock."""
+        self.now = 0.0
+
+    def run(self, seconds, frame=47_611, rate=50e6, period=1 / 15, small=180):
+        end, events = self.now + seconds, []
+        sends = [(self.now + 0.01 * i, small) for i in range(round(seconds / 0.01))]
+        for i in range(round(seconds / period)):
+            gap = 1200 * 8 / rate
+            sends += [(self.now + i * period + j * gap, 1200) for j in range(frame // 1168)]
+        for sent, size in sorted(sends):
+            events += [(arrival, sent, size) for arrival in self.model.decide(size, sent)]
+        at = self.now
+        for arrival, sent, size in sorted(events):
+            while arrival > at + 0.1:
+                at += 0.1
+                self.meter.evaluate(at)
+            self.meter.add(ticks(sent + self.offset), size, arrival)
+        self.meter.evaluate(end)
+        self.now = end
+
+
+@pytest.mark.parametrize("capacity", [5e6, 20e6, 40e6])
+def test_the_first_burst_tells_the_capacity(capacity):
+    line = Line(LinkConditions(delay=0.03, rate=capacity), offset=1e6)
+    line.run(0.2)
+    # Of IP packets, of which headers are not counted; rates considered are 12 % apart.
+    assert line.meter.capacity == pytest.approx(capacity * 1200 / 1228, rel=0.13)
+
+
+def test_a_fast_link_has_no_capacity_and_no_queue():
+    line = Line(LinkConditions(delay=0.03))
+    line.run(3)
+    assert line.meter.capacity == math.inf
+    assert line.meter.queue == 0
+    assert line.meter.rate == pytest.approx((100 * 180 + 15 * 40 * 1200) * 8, rel=0.2)
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.3])
+def test_random_loss_is_no_congestion(loss):
+    line = Line(LinkConditions(delay=0.03, loss=loss))
+    line.run(5)
+    assert line.meter.capacity == math.inf
+    assert line.meter.queue == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jitter_is_no_congestion(seed):
+    line = Line(LinkConditions(delay=0.098, jitter=0.024, loss=0.027, seed=seed))
+    worst, queue = math.inf, 0.0
+    for _ in range(20):
+        line.run(0.5)
+        worst, queue = min(worst, line.meter.capacity), max(queue, line.meter.queue)
+    assert worst > 30e6
+    assert queue < 0.02
+
+
+def test_behind_jitter_the_capacity_is_found_in_seconds():
+    line = Line(LinkConditions(delay=0.098, jitter=0.024, loss=0.027, rate=20e6))
+    line.run(4)
+    assert 14e6 < line.meter.capacity < 35e6
+
+
+def test_a_standing_queue_is_measured_and_forgotten():
+    line = Line(LinkConditions(delay=0.03))
+    line.run(2)
+    line.model.conditions = LinkConditions(delay=0.08)
+    line.run(2)
+    assert line.meter.queue == pytest.approx(0.05, abs=0.003)
+    line.model.conditions = LinkConditions(delay=0.03)
+    line.run(2)
+    assert line.meter.queue < 0.002
+
+
+def test_a_capacity_that_grows_is_noticed():
+    line = Line(LinkConditions(delay=0.03, rate=8e6))
+    line.run(2)
+    assert line.meter.capacity < 10e6
+    line.model.conditions = LinkConditions(delay=0.03)
+    line.run(6)
+    assert line.meter.capacity == math.inf
+
+
+def test_times_wrap_and_any_times_are_borne():
+    assert ticks(TICKS * TICK + 5 * TICK) == 5
+    random, meter = Random(1), DelayMeter()
+    for i in range(5000):
+        meter.add(random.getrandbits(16), random.randint(33, 65_507), i * 1e-3)
+        if random.random() < 0.02:
+            meter.evaluate(i * 1e-3)
+            assert meter.capacity > 0
+            assert meter.queue >= 0
+    flood = DelayMeter()
+    for i in range(40):
+        flood.add_all(array("H", [7] * 4000).tobytes(), 1200, i * 1e-3)
+        assert len(flood._times) <= COLLECT
