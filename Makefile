@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test unit check fmt lock clean
+.PHONY: demo test unit fuzz check fmt lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -14,6 +14,9 @@ test: $(READY) ## every test that this machine can run; what is missing is skipp
 
 unit: $(READY) ## the quick part, under a minute
 	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+
+fuzz: $(READY) ## every byte that can arrive, with coverage, 30 s for each target (SECONDS=300 for more)
+	$(BIN)/python tests/fuzz/run.py --seconds $(or $(SECONDS),30)
 
 check: $(READY) ## style, types and layers: the same for people and CI
 	$(BIN)/ruff format --check .
@@ -42,4 +45,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean: ## remove what the build and the tools made
-	rm -rf .venv dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
