@@ -1,10 +1,11 @@
 """Reliable topics between two sessions over made-up links: everything once, in order, whatever the link does."""
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Direction, Role, Topic
+from skytether.wire import Config, Connected, Direction, Role, Topic
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 TOPICS = (
@@ -75,3 +76,134 @@ def test_everything_arrives_once_and_in_order_on_any_link(make_world, up, down, 
             counted = row(link, role, name)
             assert (counted.lost, counted.expired, counted.replaced) == (0, 0, 0)
         assert link.sessions[role]._streams._busy == set()
+
+
+def test_a_latched_value_published_before_there_was_a_session_is_kept(world):
+    link = make(world, connect=False, up=LinkConditions(cut=True), down=LinkConditions(cut=True))
+    assert link.publish(SERVICE, "param", b"old")
+    assert link.publish(SERVICE, "param", b"new")
+    link.run(200)  # longer than its lifespan
+    link.models[ROBOT].conditions = link.models[SERVICE].conditions = LinkConditions()
+    link.run(3)
+    assert received(link, ROBOT, "param") == [b"new"]
+    link.run(60)
+    assert received(link, ROBOT, "param") == [b"new"]
+
+
+def test_a_restarted_peer_gets_the_latched_value_and_what_was_not_acknowledged(world):
+    link = make(world)
+    link.publish(SERVICE, "param", b"p")
+    link.publish(SERVICE, "map", b"acknowledged")
+    link.run(1)
+    link.models[SERVICE].conditions = LinkConditions(cut=True)
+    link.publish(SERVICE, "map", b"1")
+    link.publish(SERVICE, "map", bytes(5000))
+    link.run(0.5)
+    link.models[SERVICE].conditions = LinkConditions()
+    link.messages[ROBOT].clear()
+    link.replace(ROBOT, world.session(ROBOT, topics=TOPICS, now=link.now))
+    link.run(2)
+    assert received(link, ROBOT, "param") == [b"p"]
+    assert received(link, ROBOT, "map") == [b"1", bytes(5000)]
+    assert [e.restarted for _, e in link.events[SERVICE] if isinstance(e, Connected)] == [False, True]
+    assert row(link, ROBOT, "map").lost == 0
+
+
+def test_what_expired_is_lost_and_holds_nothing_up(world):
+    topics = (Topic("goal", "a/b", Direction.IN, lifespan=0.5, depth=10, reliable=True),)
+    link = make(world, ends={"topics": topics})
+    link.publish(ROBOT, "goal", b"1")
+    link.run(0.3)
+    link.models[ROBOT].conditions = LinkConditions(cut=True)
+    link.publish(ROBOT, "goal", b"2")
+    link.run(1.0)
+    link.models[ROBOT].conditions = LinkConditions()
+    link.publish(ROBOT, "goal", b"3")
+    link.run(1.0)
+    assert received(link, SERVICE, "goal") == [b"1", b"3"]
+    link.run(2)
+    counted = row(link, SERVICE, "goal")
+    assert (counted.sent, counted.delivered, counted.lost, counted.expired) == (3, 2, 1, 1)
+
+
+def test_depth_bounds_what_is_not_acknowledged(world):
+    topics = (
+        Topic("state", "a/b", Direction.IN, lifespan=9.0, reliable=True),
+        Topic("event", "a/b", Direction.IN, lifespan=9.0, depth=3, reliable=True),
+    )
+    link = make(world, ends={"topics": topics})
+    link.models[SERVICE].conditions = LinkConditions(cut=True)  # no acknowledgements
+    accepted = []
+    for i in range(5):
+        assert link.publish(ROBOT, "state", b"%d" % i)
+        accepted.append(link.publish(ROBOT, "event", b"%d" % i))
+    assert accepted == [True, True, True, False, False]
+    link.models[SERVICE].conditions = LinkConditions()
+    link.run(3)
+    assert received(link, SERVICE, "state") == [b"0", b"4"]
+    assert received(link, SERVICE, "event") == [b"0", b"1", b"2"]
+    assert row(link, ROBOT, "state").replaced == 3
+    assert row(link, ROBOT, "event").replaced == 2
+
+
+def test_memory_of_the_sender_is_bounded(world):
+    config = Config(queue_limit=2**20, max_message=2**20)
+    topics = (Topic("event", "a/b", Direction.IN, lifespan=60.0, depth=10_000, reliable=True),)
+    link = make(world, ends={"topics": topics, "config": config})
+    link.models[SERVICE].conditions = LinkConditions(cut=True)
+    streams = link.sessions[ROBOT]._streams
+    accepted = sum(link.publish(ROBOT, "event", bytes(10_000)) for _ in range(500))
+    assert accepted == 2**20 // 10_000
+    assert streams.outbox("event").used == accepted * 10_000
+    link.models[SERVICE].conditions = LinkConditions()
+    link.run(10)
+    assert received(link, SERVICE, "event") == [bytes(10_000)] * accepted
+    assert streams.outbox("event").used == 0
+
+
+@pytest.mark.parametrize("size", [4 * 2**20, 16 * 2**20 - 8])
+def test_a_large_map_over_a_bad_link_hurts_no_velocity_command(make_world, size):
+    bad = LinkConditions(delay=0.05, loss=0.05)
+    delays = []
+    for payload in (b"", make_world(1).random.randbytes(size)):
+        link = make(make_world(2), up=bad, down=bad, connect=False, ends={"config": Config(rate_bps=20e6)})
+        link.run(2)
+        link.every(0.01, link.now + 8, lambda link=link: link.publish(SERVICE, "cmd_vel", bytes(80)))
+        if payload:
+            link.publish(SERVICE, "map", payload)
+        link.run(10)
+        delays.append(row(link, ROBOT, "cmd_vel").delay_p99)
+        assert received(link, ROBOT, "map") == ([payload] if payload else [])
+        assert row(link, ROBOT, "cmd_vel").delivered + row(link, ROBOT, "cmd_vel").superseded > 790
+    counted = row(link, SERVICE, "map")
+    assert delays[1] < delays[0] + 0.001
+    assert counted.bytes_sent < 1.1 * size  # 5 % sent again, headers 2.6 %
+
+
+def test_compression_shrinks_what_can_be_shrunk(world):
+    topics = tuple(
+        Topic(name, "a/b", Direction.IN, lifespan=5.0, depth=9, reliable=reliable, compression=compression)
+        for name, reliable, compression in (("a", True, "zstd"), ("b", False, "zstd"), ("c", False, ""))
+    )
+    link = make(world, ends={"topics": topics})
+    easy, hard = bytes(100_000), world.random.randbytes(100_000)
+    for name in "abc":
+        link.publish(ROBOT, name, easy)
+        link.publish(ROBOT, name, hard)
+        link.publish(ROBOT, name, b"")
+    link.run(2)
+    for name in "abc":
+        assert sorted(received(link, SERVICE, name)) == sorted([easy, hard, b""])
+        counted = row(link, SERVICE, name)
+        assert counted.bytes_delivered == 200_000
+        assert (counted.bytes_sent < 140_000) == (name != "c")
+
+
+def test_what_expands_beyond_the_largest_message_is_refused(world):
+    topics = (Topic("a", "a/b", Direction.IN, lifespan=5.0, depth=9, compression="zstd"),)
+    link = world.link(robot={"topics": topics}, service={"topics": topics, "config": Config(max_message=50_000)})
+    link.publish(ROBOT, "a", bytes(50_001))
+    link.publish(ROBOT, "a", bytes(50_000))
+    link.run(1)
+    assert received(link, SERVICE, "a") == [bytes(50_000)]
+    assert link.sessions[SERVICE].stats(link.now).rejected == {"compressed": 1}

@@ -18,7 +18,7 @@ class Parcel(Shards):
     """One sealed message."""
 
     __slots__ = (
-        "_landed", "_missing", "_reported", "_sent_at", "_taken", "_todo", "flying", "number",
+        "_known", "_landed", "_missing", "_reported", "_sent_at", "_taken", "_todo", "flying", "number",
     )  # fmt: skip
 
     def __init__(
@@ -38,6 +38,8 @@ class Parcel(Shards):
         self._landed = landed
         self._missing = np.ones(shape.shards, bool)
         """What the peer is not known to have."""
+        self._known = 0
+        """Shards of which the peer has told anything."""
         self._sent_at = np.full(shape.shards, math.inf)
         """inf while a shard is to be sent."""
         self._todo: Positions = np.arange(shape.shards)
@@ -68,13 +70,14 @@ class Parcel(Shards):
         """
         shape = self._shape
         self._reported = True
-        self._missing[: shape.block_start(min(until, shape.blocks))] = False
+        self._known = known = shape.block_start(min(until, shape.blocks))
+        self._missing[:known] = False
         for block, bits in rows:
             if block < shape.blocks:
                 start, k = shape.block_start(block), shape.block_k(block)
                 lacking = np.unpackbits(np.frombuffer(bits, np.uint8), bitorder="little")[:k]
                 self._missing[start : start + len(lacking)] |= lacking.astype(bool)
-        return self._again(np.flatnonzero(self._missing & (self._sent_at < now - patience)))
+        return self._again(self._lost(now - patience))
 
     def remind(self, now: float, patience: float) -> int:
         """Nothing was heard for some time.
@@ -84,15 +87,20 @@ class Parcel(Shards):
             since the last time, one, so that it does.
         """
         told, self._reported = self._reported, False
-        missing = np.flatnonzero(self._missing & (self._sent_at < now - patience / 2))
-        if told and len(missing):
-            return self._again(missing)
+        lost = self._lost(now - patience / 2)
+        if told and len(lost):
+            return self._again(lost)
         last = np.flatnonzero(self._missing)[-1:]
         return self._again(last if len(last) else np.array([self._shape.shards - 1]))
 
     def cancel(self) -> None:
         """Send nothing more."""
         self.remaining = 0
+
+    def _lost(self, before: float) -> Positions:
+        """What the peer lacks although it was sent earlier than ``before``."""
+        known = self._known
+        return np.flatnonzero(self._missing[:known] & (self._sent_at[:known] < before))
 
     def _again(self, positions: Positions) -> int:
         if len(positions):

@@ -32,6 +32,7 @@ from .packet import (
 )
 from .path import Path
 from .reassembly import Entry, Reassembly
+from .reliable import PREFIX
 from .replay import Seen
 from .sender import INNER, OVERHEAD
 
@@ -73,7 +74,7 @@ class Receiver:
         on_expired: Callable[[int], None],
     ) -> None:
         self._session_id = session_id
-        self._max_length = config.max_message + OVERHEAD
+        self._max_length = config.max_message + PREFIX.size + OVERHEAD
         self._find_path = find_path
         self._find_epoch = find_epoch
         self._accept = accept

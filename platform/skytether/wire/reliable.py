@@ -296,11 +296,11 @@ class Outbox:
         return flying < min(self.topic.depth, WINDOW) and self._flying_bytes + size <= WINDOW_BYTES
 
     def _expire(self, now: float) -> None:
-        while self._flying and (letter := self._flying[self.base]).deadline < now:
+        while self._flying and (letter := self._flying[self.base]).deadline <= now:
             self._land(letter)
             self.counters.expired += 1
             self.forward_at = now
-        while self._waiting and self._waiting[0].deadline < now:
+        while self._waiting and self._waiting[0].deadline <= now:
             self._waiting_bytes -= len(self._waiting.popleft().payload)
             self.counters.expired += 1
 
