@@ -15,6 +15,8 @@ Tier = Literal["robot", "edge", "cloud"]
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
+CALL_DEPTH = 64
+"""Requests, and answers, that may be under way by default."""
 
 
 class Strict(BaseModel):
@@ -28,6 +30,9 @@ class TopicSpec(Strict):
 
     name: Annotated[str, Field(min_length=1, max_length=255)]
     """``*`` takes any topic that the robot offers (direction ``in`` only), with this row's quality of service."""
+    kind: Literal["topic", "call"] = "topic"
+    """A call is asked in the row's direction and answered in the other; its type is that of a ROS service,
+    ``nav_msgs/srv/GetPlan``. It is reliable, and ``lifespan_ms`` and ``depth`` have defaults that suit it."""
     type: Annotated[str, Field(min_length=1, max_length=255)]
     """ROS 2 style name, ``geometry_msgs/msg/Twist``; ``*`` with name ``*``."""
     direction: Literal["in", "out"]
@@ -51,15 +56,31 @@ class TopicSpec(Strict):
     @model_validator(mode="before")
     @classmethod
     def _reliable_lives_long(cls, row: Any) -> Any:
-        if isinstance(row, dict) and row.get("reliable") and "lifespan_ms" not in row:
-            return {**row, "lifespan_ms": RELIABLE_LIFESPAN_MS}
-        return row
+        if not isinstance(row, dict):
+            return row
+        if row.get("kind") == "call":
+            row = {"reliable": True, "depth": CALL_DEPTH, **row}
+        return {"lifespan_ms": RELIABLE_LIFESPAN_MS, **row} if row.get("reliable") else row
 
     @model_validator(mode="after")
-    def _latched_is_reliable(self) -> TopicSpec:
+    def _reliability_fits(self) -> TopicSpec:
         if self.latched and not self.reliable:
             raise ValueError("latched: true needs reliable: true")
+        if self.kind == "call" and (not self.reliable or self.latched or self.name == ANY_TOPIC):
+            raise ValueError("kind: call is reliable and not latched, and has a name of its own")
         return self
+
+    def rows(self) -> tuple[TopicSpec, ...]:
+        """The topics that carry it: itself, or the request and the response of a call."""
+        if self.kind == "topic":
+            return (self,)
+        row = self.model_copy(update={"kind": "topic"})
+        there, back = self.direction, "out" if self.direction == "in" else "in"
+        parts = (("request", "_Request", there), ("response", "_Response", back))
+        return tuple(
+            row.model_copy(update={"name": f"{self.name}/{part}", "type": self.type + suffix, "direction": direction})
+            for part, suffix, direction in parts
+        )
 
     @model_validator(mode="after")
     def _any_topic_comes_in(self) -> TopicSpec:

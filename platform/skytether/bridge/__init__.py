@@ -4,16 +4,20 @@ Here is what touches the system. Rules of the protocol belong into `skytether.wi
 `skytether.ros`.
 """
 
+from .calls import CallError, CallFailedError, CallTimeoutError
 from .endpoint import Bridge, BridgeError
 from .local import GraphPort, LocalGraph
 from .port import Port, Publisher
 from .relay import Relay, RelayStats
 from .relay_table import RelayLimits
-from .spec import SessionSpec, topic_from_api
+from .spec import SessionSpec, topic_from_api, topics_from_api
 
 __all__ = [
     "Bridge",
     "BridgeError",
+    "CallError",
+    "CallFailedError",
+    "CallTimeoutError",
     "GraphPort",
     "LocalGraph",
     "Port",
@@ -23,4 +27,5 @@ __all__ = [
     "RelayStats",
     "SessionSpec",
     "topic_from_api",
+    "topics_from_api",
 ]

@@ -15,6 +15,7 @@ from skytether.wire.events import Connected, Disconnected, Event, MessageReceive
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role, Topic
 
+from .calls import Calls
 from .datagrams import Address, DatagramSocket
 from .port import Port
 
@@ -33,13 +34,16 @@ class Driver:
         agreed: Topics that both ends know, by name; empty while no session is up. May be read from any thread.
     """
 
-    def __init__(self, session: Session, sock: DatagramSocket, port: Port, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, session: Session, sock: DatagramSocket, port: Port, calls: Calls, loop: asyncio.AbstractEventLoop
+    ) -> None:
         """Prepare; `begin` starts the session in the loop's thread."""
         self.agreed: dict[str, Topic] = {}
         self._session = session
         self._sockets = {0: sock}
         self._service = session.role is Role.SERVICE
         self._port = port
+        self._calls = calls
         self._loop = loop
         self._timer: asyncio.TimerHandle | None = None
         self._unsent: dict[int, deque[tuple[memoryview, Address, int | None, int]]] = {}
@@ -141,8 +145,10 @@ class Driver:
     def _pass_events(self) -> None:
         while (event := self._session.next_event()) is not None:
             if isinstance(event, MessageReceived):
-                self._call(self._port.deliver, event)
+                if not self._calls.deliver(event):
+                    self._call(self._port.deliver, event)
                 continue
+            self._calls.notify(event)
             if isinstance(event, Connected):
                 self.agreed = {topic.name: topic for topic in event.topics}
             elif isinstance(event, Disconnected):

@@ -24,6 +24,7 @@ from skytether.wire.compression import compress
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
 
+from .calls import CallFailedError, Calls, Handler
 from .datagrams import Address, DatagramSocket
 from .driver import Driver
 from .interfaces import LocalPath, Network, Wanted, Watcher, addresses, select
@@ -87,6 +88,7 @@ class Bridge:
         self._peer = peer
         self._config = config or Config()
         self._sends = {t.name: t for t in spec.topics if t.direction.sender is spec.role}
+        self._calls = Calls(spec.topics, spec.role, self.publish, int.from_bytes(os.urandom(8)))
         self._handover: deque[tuple[str, bytes, float]] = deque()
         self._handover_bytes = 0
         self._overrun: Counter[str] = Counter()
@@ -124,7 +126,7 @@ class Bridge:
                 session.set_peer(self._resolve(*self._peer))
             self._loop = _new_loop(self._socket)
             undo.callback(self._loop.close)
-            self._driver = Driver(session, self._socket, self._port, self._loop)
+            self._driver = Driver(session, self._socket, self._port, self._calls, self._loop)
             self._port.attach(self)
             self._paths = LocalPaths(self._driver, self._socket.resolve)
             networks = self._look() if self._wanted else {}
@@ -163,6 +165,43 @@ class Bridge:
                 self._overrun[oldest] += 1
             first = len(self._handover) == 1
         return not first or self._soon(self._on_handover)
+
+    def call(self, name: str, payload: bytes | memoryview, timeout: float) -> bytes:
+        """Ask the other end, and wait for its answer. Waits for a session too, as long as the time-out allows.
+
+        Args:
+            name: Of the call: this end sends the reliable topic ``NAME/request`` and receives ``NAME/response``.
+            payload: The request, serialised.
+            timeout: Seconds.
+
+        Returns:
+            The answer, serialised.
+
+        Raises:
+            CallTimeoutError: Nothing came in time; it may have been carried out all the same.
+            CallFailedError: The other end cannot answer, was restarted or ended the session, or this is the bridge's
+                own thread, which cannot wait.
+            KeyError: This end does not make such a call.
+            ValueError: The request is larger than the session's largest message.
+        """
+        if threading.current_thread() is self._thread:
+            raise CallFailedError(f"call '{name}': a port's thread cannot wait for an answer; call from another")
+        return self._calls.call(name, payload, timeout)
+
+    def answer(self, name: str, handler: Handler) -> None:
+        """Have calls of the other end answered by a function: serialised request in, serialised answer out.
+
+        It runs in threads of its own, several at the same time, and raises `CallError` to tell the caller a reason.
+
+        Raises:
+            KeyError: This end does not answer such a call.
+        """
+        self._calls.answer(name, handler)
+
+    @property
+    def late_answers(self) -> int:
+        """Answers to calls that came when nobody waited for them any more."""
+        return self._calls.late
 
     def set_peer(self, host: str, port: int) -> None:
         """Speak to a service's end elsewhere from now on.
@@ -207,6 +246,7 @@ class Bridge:
         if first and self._watcher is not None:
             self._watcher.close()
         if first:
+            self._calls.close()
             self._soon(self._on_stop)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()

@@ -57,7 +57,7 @@ class SessionSpec:
         Raises:
             ValueError: The text names the field and what it must be, and never holds the key.
         """
-        return cls(parse_id(session_id), parse_key(key), role, tuple(map(topic_from_api, topics)))
+        return cls(parse_id(session_id), parse_key(key), role, topics_from_api(topics))
 
 
 def parse_id(text: str) -> int:
@@ -87,6 +87,11 @@ def parse_key(text: str) -> bytes:
     if len(key) != KEY_BYTES:
         raise ValueError(f"session: key must be {KEY_BYTES} bytes in base64")
     return key
+
+
+def topics_from_api(specs: Iterable[TopicSpec]) -> tuple[Topic, ...]:
+    """A table of the schema; calls become two topics each."""
+    return tuple(topic_from_api(row) for spec in specs for row in spec.rows())
 
 
 def topic_from_api(spec: TopicSpec) -> Topic:

@@ -80,7 +80,11 @@ class BridgeConfig(Strict):
             raise ValueError("peer: only role 'robot' has one; the service's end learns where its robot is")
         if self.role != "both" and self.link is not None:
             raise ValueError("link: only role 'both' can have one; across machines the network is what it is")
-        sent = [t.name for t in self.topics if Direction(t.direction).sender in self.roles and t.name != ANY_TOPIC]
+        sent = [
+            t.name
+            for t in self.topics
+            if Direction(t.direction).sender in self.roles and t.name != ANY_TOPIC and t.kind == "topic"
+        ]
         for i, source in enumerate(self.sources):
             if source.topic not in sent:
                 raise ValueError(

@@ -11,7 +11,7 @@ from types import TracebackType
 
 from skytether.bridge.endpoint import Bridge
 from skytether.bridge.local import GraphPort, LocalGraph
-from skytether.bridge.spec import SessionSpec, parse_id, topic_from_api
+from skytether.bridge.spec import SessionSpec, parse_id, topics_from_api
 from skytether.lab.link import LinkConditions, LinkEmulator
 from skytether.wire import Config
 from skytether.wire.events import Connected, Event, Refused
@@ -34,7 +34,7 @@ class End:
         Raises:
             ValueError: A topic cannot be.
         """
-        topics = tuple(map(topic_from_api, settings.topics))
+        topics = topics_from_api(settings.topics)
         self.role = role
         self.graph = LocalGraph()
         self.was_connected = False

@@ -30,17 +30,20 @@ def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, enco
 
     A row of the service that the robot offers too carries the robot's type, hash and encoding (a wrong type is told by
     the handshake, which names both). A row ``*`` takes every other offer with its quality of service. Offers that the
-    service does not take are left out. The service's own topics are all wanted.
+    service does not take are left out. The service's own topics are all wanted, and its calls.
 
     Args:
         specs: The service's topics, from the session.
         offers: The robot's, by name.
         encoding: In which the robot wants the service's topics.
     """
-    rows = list(specs)
+    everything = list(specs)
+    rows = [spec for spec in everything if spec.kind == "topic"]
     named = {spec.name: spec for spec in rows}
     anything = named.pop(ANY_TOPIC, None)
     table = [_topic(spec, spec.name, Offer(spec.type, "", encoding)) for spec in rows if spec.direction == "out"]
+    calls = [row for spec in everything if spec.kind == "call" for row in spec.rows()]
+    table += [_topic(row, row.name, Offer(row.type, "", encoding)) for row in calls]
     for name, offer in offers.items():
         row = named.get(name, anything)
         if row is not None and row.direction == "in":
