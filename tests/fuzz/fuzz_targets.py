@@ -220,7 +220,11 @@ def strangers(data: bytes) -> None:
             header = (packet.DATA, packet.DATA, packet.HELLO, packet.WELCOME)[op >> 1 & 3]
             length = len(body) if op & 8 else script.number(3)
             common = packet.push_common(header, SESSION_ID, epoch, script.number(), script.number() % 8, length)
-            body = common + packet.push_shard(script.number() % 3, script.number(), 0, script.number(4)) + body
+            body = (
+                common
+                + packet.push_shard(script.number() % 3, script.number(), 0, script.number(4), script.number(2))
+                + body
+            )
         segment = None
         if op & 16 and body:
             segment = len(body)
@@ -262,7 +266,7 @@ def peers(data: bytes) -> None:
             path = script.number() if op & 32 else 0
             common = packet.push_common(packet.DATA, SESSION_ID, peer.id, number, topic, len(plaintext) + 16)
             sealed = peer.ciphers.seal(number, plaintext, common)
-            whole = common + packet.push_shard(0, 0, path, number) + sealed
+            whole = common + packet.push_shard(0, 0, path, number, 0) + sealed
             end.receive(whole, "elsewhere" if op & 64 else other(role).value, ends.now)
         ends.drain(role)
         ends.check(role)

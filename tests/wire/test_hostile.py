@@ -1,5 +1,6 @@
 """Any bytes, any time: nothing raises, nothing grows beyond its bound, nothing but a counter changes."""
 
+import tracemalloc
 from random import Random
 
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Role, packet
+from skytether.wire.handshake import MAX_HANDSHAKE
 from skytether.wire.sender import OVERHEAD
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
@@ -182,3 +184,51 @@ def test_a_stranger_cannot_bring_an_end_up(make_world, seed):
         assert service.transmit(0.0) == []
     assert service.next_event() is None
     assert service.next_timer() is None
+
+
+def test_who_is_faster_than_the_ends_takes_an_address_for_a_moment_only(world):
+    """A packet that is repeated from elsewhere before it arrives moves its peer; both ends then speak to nobody."""
+    link = world.link(record=True, up=LinkConditions(delay=0.05), down=LinkConditions(delay=0.05))
+    for role in Role:
+        link.publish(role, "log" if role is ROBOT else "map", b"x")
+    for role in Role:
+        link.inject(SERVICE if role is ROBOT else ROBOT, link.sent[role][-1][1], "faster")
+    assert {end.stats(link.now).paths[0].address for end in link.sessions.values()} == {"faster"}
+    link.run(0.5)
+    assert link.sessions[ROBOT].stats(link.now).paths[0].address == "service"
+    assert link.sessions[SERVICE].stats(link.now).paths[0].address == "robot"
+    for role, end in link.sessions.items():
+        assert (end.stats(link.now).connected, end.stats(link.now).handshakes) == (True, 1), role
+
+
+def test_memory_of_a_flooded_end_is_bounded(make_world):
+    """Forged shards of all sizes, forged and repeated HELLOs, what was sent before: measured, not counted."""
+    config = Config(max_message=100_000, reassembly_limit=400_000, queue_limit=200_000)
+    world = make_world(3)
+    link = world.link(robot={"config": config}, service={"config": config}, record=True)
+    link.publish(ROBOT, "log", bytes(5000))
+    link.run(0.1)
+    epoch = packet.pull_header(link.sent[ROBOT][-1][1])[2]
+    session, random = link.sessions[SERVICE], world.random
+    recorded = [p for _, p in link.sent[ROBOT]]
+
+    def flood(count):
+        for i in range(count):
+            session.receive(forged(random, epoch), f"stranger {i}", link.now)
+            session.receive(random.choice(recorded), f"stranger {i}", link.now)
+            hello = packet.push_common(packet.HELLO, SESSION_ID, 0, random.getrandbits(48), 0, 200_000)
+            session.receive(hello + packet.push_shard(0, i % 200, 0, 0, 0) + random.randbytes(1100), "x", link.now)
+            for _ in iter(session.next_event, None):
+                pass
+            session.transmit(link.now)
+
+    flood(500)  # caches of what is used for the first time
+    tracemalloc.start()
+    try:
+        flood(6000)
+        used, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # Of 16 MB that came: the messages' bound, the handshakes', and room for counters.
+    assert 400_000 < used < config.reassembly_limit + 2 * MAX_HANDSHAKE + 300_000
+    assert session.stats(link.now).rejected["evicted"] > 100

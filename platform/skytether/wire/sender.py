@@ -96,14 +96,20 @@ class Sender:
 
     def say(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> None:
         """Send a message of one packet by that path, once and at once, however large the packet."""
+        packet = self.packet(topic, payload, path, now)
+        if packet is not None:
+            self._lane(path).say(packet)
+
+    def packet(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> bytes | None:
+        """Seal a message of one packet; None if there are no keys."""
         epoch = self.epoch
         if epoch is None:
-            return
+            return None
         number, common, plaintext = self._next(epoch, topic, payload, now)
         sealed = epoch.ciphers.seal(number, plaintext, common)
         packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
         topic.counters.bytes_sent += len(packet)
-        self._lane(path).say(packet)
+        return packet
 
     def _lane(self, path: Path) -> Lane:
         lane = self._lanes.get(path.id)

@@ -307,21 +307,24 @@ class Session:
 
     def _on_handshake(self, kind: int, common: bytes, message: bytes, path: int, address: Hashable, now: float) -> None:
         if kind == HELLO and self._door is not None:
-            self._on_hello(self._door, common, message, address, now)
+            self._on_hello(self._door, common, message, path, address, now)
         elif kind == WELCOME and self._seeker.hello is not None:
             self._on_welcome(self._seeker.hello, common, message, path, address, now)
         else:
             self._receiver.rejected["unasked"] += 1
 
-    def _on_hello(self, door: Doorkeeper, common: bytes, message: bytes, address: Hashable, now: float) -> None:
+    def _on_hello(
+        self, door: Doorkeeper, common: bytes, message: bytes, path: int, address: Hashable, now: float
+    ) -> None:
         held = NO_KEYS if self._epoch is None else self._epoch.ciphers.resume
         taken = {e.id for e in (self._epoch, self._previous) if e is not None}
         answer = door.answer(common, message, held, taken, now)
         if isinstance(answer, str):
             self._receiver.rejected[answer] += 1
         elif isinstance(answer, Resume):
-            for path in self._paths:
-                self._paths.ping_soon(path, now)
+            for each in self._paths:
+                self._paths.ping_soon(each, now)
+            self._answer(self._paths.get(path) or self._paths.choice.active, address, now)
         else:
             if answer.outcome is not None and answer.epoch is None:
                 answer.epoch = self._make_epoch(answer.outcome)
@@ -352,6 +355,20 @@ class Session:
                 came_by.echo = t3, now
         for each in self._paths:
             self._paths.ping(each, now)
+
+    def _answer(self, path: Path, address: Hashable, now: float) -> None:
+        """Tell a robot that holds the keys, where it asks for them.
+
+        Somebody may have been faster than the robot with one of its own packets, and be taken for it since.
+        """
+        if address == path.address or len(self._raw) >= MAX_RAW:
+            return
+        ping = control.push_ping(Ping(path.id, path.cost, False, 0, None, 0, path.feedback(now)))
+        packet = self._sender.packet(self._control, ping, path, now)
+        if packet is not None:
+            path.packets_sent += 1
+            path.bytes_sent += len(packet)
+            self._raw.append(Transmit(path.id, address, packet, None))
 
     def _refuse(self, reason: str) -> None:
         self._refusal = reason
