@@ -1,6 +1,8 @@
 import threading
 import time
 from dataclasses import replace
+from itertools import count
+from math import isnan
 
 import pytest
 
@@ -113,10 +115,14 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     rig.ask()
     old = rig.agent._driver.session
     make_cloud(old)
+    rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
+    rig.agent.watch(rig.now)
+    assert rig.agent.status().rtt == 0.7
     orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
     rig.ask()
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
     assert not rig.agent.status().connected
+    assert isnan(rig.agent.status().rtt), "of the session before"
     cloud = make_cloud(rig.agent._driver.session)
     assert rig.agent.status().connected
     cloud.send(rig.now)
@@ -182,6 +188,28 @@ def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
         cloud.send(rig.now)
         rig.agent.tick(rig.now)
     assert rig.agent.status().driver.transitions[-1].reason is Reason.RTT
+
+
+def test_a_control_loop_that_dies_leaves_the_wheels_standing(rig, base):
+    def die():
+        if len(base.written) == 50:
+            raise SystemExit
+
+    rig.agent._clock = count(50.0, 0.005).__next__
+    base.on_read = die
+    with pytest.raises(SystemExit):
+        rig.agent._control()
+    assert base.written[-2][0] > 0
+    assert base.velocity == (0.0, 0.0)
+
+
+def test_closing_stands_the_wheels_whatever_the_loop_does(rig, base):
+    for _ in range(50):
+        rig.now += 0.01
+        rig.agent.tick(rig.now)
+    assert base.velocity[0] > 0
+    rig.agent.close()
+    assert base.velocity == (0.0, 0.0)
 
 
 def test_nothing_shows_the_token():

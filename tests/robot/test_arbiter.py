@@ -93,6 +93,15 @@ def test_a_clock_error_that_is_not_known_counts(driving):
     assert (choice.source, choice.reason) == (Source.FALLBACK, Reason.CLOCK)
 
 
+@pytest.mark.parametrize("bad", [{"rtt": 0.61}, {"connected": False}])
+def test_a_bad_moment_on_the_way_back_starts_it_anew(bad):
+    choice, now = run(start(NEEDS, 0.0), GOOD, 0.9, 0.0)
+    choice, now = run(choice, replace(GOOD, **bad), TICK, now)
+    choice, now = run(choice, GOOD, 0.99, now)
+    assert choice.source is Source.FALLBACK
+    assert run(choice, GOOD, 0.03, now)[0].source is Source.CLOUD
+
+
 def test_what_the_service_does_not_need_does_not_count():
     needs = Needs()
     choice = start(needs, 0.0)

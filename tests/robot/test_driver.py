@@ -12,7 +12,7 @@ from skytether.robot.driver import Driver
 from skytether.robot.fallback import Admittance, Stop
 from skytether.robot.session import LiveSession
 from skytether.robot.supervisor import Limits
-from skytether.wire.events import Connected, Disconnected
+from skytether.wire.events import Connected, Disconnected, MessageReceived
 
 TICK = 0.01
 
@@ -215,6 +215,45 @@ def test_the_services_needs_decide(driven):
     assert driven.run(1.2, linear=0.2).source is Source.CLOUD
     driven.driver.loss = 0.3
     assert driven.run(0.6, linear=0.2).transitions[-1].reason is Reason.LOSS
+
+
+def test_a_command_older_than_the_service_needs_is_not_followed(driven):
+    driven.driver.set_needs(0.1, None)  # 0.25 s in all, with the time that a command may be repeated
+    status = driven.run(0.3, linear=0.2, delay=0.26)
+    assert status.objections["stale"] == 30
+    assert status.transitions[-1].reason is Reason.NO_COMMAND
+    assert driven.run(1.5, linear=0.2, delay=0.2).source is Source.CLOUD
+
+
+def test_commands_whose_age_is_not_known_well_enough_hand_over(driven):
+    def send(now, **_):
+        payload = encode(Twist(linear=Vector3(x=0.2)), "cdr")
+        driven.cloud.session.deliver(MessageReceived("cmd_vel", payload, driven.cloud.sequence, now, 0.6, now))
+        driven.cloud.sequence += 1
+
+    driven.cloud.send = send
+    assert driven.run(0.6, linear=0.2).transitions[-1].reason is Reason.CLOCK
+
+
+def test_the_fallback_is_told_no_time_that_cannot_be(base, make_cloud):
+    told = []
+
+    class Asked(Stop):
+        drives = True
+
+        def step(self, velocity, readings, dt):
+            told.append(dt)
+
+    rig = Rig(base, make_cloud, fallback=Asked())
+    for now in (100.01, 101.0, 90.0, nan, 90.01):
+        rig.driver.tick(now)
+    assert told[:3] == [pytest.approx(0.01), Limits().max_step_s, 0.0]
+    assert all(0.0 <= dt <= Limits().max_step_s for dt in told)
+
+
+def test_a_session_that_was_closed_is_not_connected(driven):
+    driven.cloud.session.close()
+    assert not driven.cloud.session.connected
 
 
 def test_the_observer_sees_each_command_and_cannot_stop_the_robot(base, make_cloud, bridge):
