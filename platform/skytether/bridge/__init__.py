@@ -6,6 +6,7 @@ Here is what touches the system. Rules of the protocol belong into `skytether.wi
 
 from .calls import CallError, CallFailedError, CallTimeoutError
 from .endpoint import Bridge, BridgeError
+from .interfaces import LocalPath
 from .local import GraphPort, LocalGraph
 from .port import Port, Publisher
 from .relay import Relay, RelayStats
@@ -20,6 +21,7 @@ __all__ = [
     "CallTimeoutError",
     "GraphPort",
     "LocalGraph",
+    "LocalPath",
     "Port",
     "Publisher",
     "Relay",

@@ -16,6 +16,17 @@ from skytether.wire.topic import Direction, Role
 from .config_file import ConfigError, Endpoint, read_config
 
 
+class LocalNetwork(Strict):
+    """One of the robot's networks."""
+
+    local: Annotated[str, Field(min_length=1)]
+    """The interface's name (``wlan0``) or one of this machine's addresses."""
+    cost: Annotated[int, Field(ge=0, le=255)] = 0
+    """Of networks that work as well as each other the cheapest is used."""
+    peer: Endpoint | None = None
+    """Where the service's end is as seen from this network; null: as from all."""
+
+
 class Source(Strict):
     """A synthetic publisher."""
 
@@ -55,6 +66,8 @@ class BridgeConfig(Strict):
     bind: Endpoint = Endpoint()
     peer: Endpoint | None = None
     """Where the service's end listens; for role ``robot``."""
+    paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
+    """Networks that the robot's end uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
     topics: Annotated[tuple[TopicSpec, ...], Field(min_length=1)]
     sources: tuple[Source, ...] = ()
     """Publishers of made-up messages, on topics that this end sends."""
@@ -78,6 +91,8 @@ class BridgeConfig(Strict):
             raise ValueError("peer: role 'robot' needs the host and port where the service's end listens")
         if self.role != "robot" and self.peer is not None:
             raise ValueError("peer: only role 'robot' has one; the service's end learns where its robot is")
+        if self.role == "service" and self.paths:
+            raise ValueError("paths: only the robot's end has them; the service's end learns them")
         if self.role != "both" and self.link is not None:
             raise ValueError("link: only role 'both' can have one; across machines the network is what it is")
         sent = [

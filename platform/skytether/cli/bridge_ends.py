@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from types import TracebackType
 
 from skytether.bridge.endpoint import Bridge
+from skytether.bridge.interfaces import LocalPath, Wanted
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.bridge.spec import SessionSpec, parse_id, topics_from_api
 from skytether.lab.link import LinkConditions, LinkEmulator
@@ -44,7 +45,8 @@ class End:
         config = Config() if settings.rate_mbps is None else Config(rate_bps=settings.rate_mbps * 1e6)
         spec = SessionSpec(parse_id(settings.id), key, role, topics)
         port = GraphPort(self.graph, topics, role, on_event=self._on_event)
-        self.bridge = Bridge(spec, port, bind=bind, peer=peer, config=config)
+        paths = local_paths(settings) if role is Role.ROBOT else ()
+        self.bridge = Bridge(spec, port, bind=bind, peer=peer, paths=paths, config=config)
         sent = {t.name for t in topics if t.direction.sender is role}
         self.sources = tuple(s for s in settings.sources if s.topic in sent)
 
@@ -106,6 +108,13 @@ def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack) -> list[End
         stack.enter_context(Sources(end.graph, end.sources))
         ends.append(end)
     return ends
+
+
+def local_paths(settings: BridgeConfig) -> Wanted:
+    """Networks of the configuration as the bridge takes them."""
+    if settings.paths == "auto":
+        return "auto"
+    return [LocalPath(p.local, p.cost, (p.peer.host, p.peer.port) if p.peer else None) for p in settings.paths]
 
 
 def conditions(link: LinkConfig) -> LinkConditions:

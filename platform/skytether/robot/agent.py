@@ -20,6 +20,7 @@ from typing import Any
 from skytether.api import rest
 from skytether.api.client import Client
 from skytether.bridge import Bridge, BridgeError, SessionSpec
+from skytether.bridge.interfaces import Wanted
 from skytether.bridge.port import Port
 from skytether.bridge.spec import parse_id, parse_key
 from skytether.messages import Message, Twist, type_hash, warm
@@ -68,6 +69,7 @@ class AgentConfig:
         renew_s: Between renewals, which carry the report.
         request_timeout_s: Of each request to the orchestrator.
         bind: Local address of the robot's end of the bridge; port 0: any.
+        paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
     """
 
@@ -87,6 +89,7 @@ class AgentConfig:
     renew_s: float = 2.0
     request_timeout_s: float = 5.0
     bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
+    paths: Wanted = ()
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
 
 
@@ -144,14 +147,16 @@ class Agent:
         *,
         observer: Observer | None = None,
         client: Orchestrator | None = None,
-        bridge: MakeBridge = lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer),
+        bridge: MakeBridge | None = None,
         clock: Callable[[], float] = time.monotonic,
         random: Random | None = None,
     ) -> None:
         self._config = config
         self._base = base
         self._clock = clock
-        self._make_bridge = bridge
+        self._make_bridge = bridge or (
+            lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
+        )
         local = fallback.load(config.fallback, config.fallback_options)
         self._driver = Driver(base, local, config.limits, config.needs, clock(), observer)
         self._own_client = None if client else Client(config.url, config.token, timeout=config.request_timeout_s)

@@ -347,7 +347,7 @@ class Paths:
     def _set(self, choice: Choice, reason: str, now: float) -> None:
         if choice != self.choice:
             self.choice = choice
-            self._changed(choice, reason, now)
+            self._changed(choice, reason if self._up else "", now)
 
 
 def _badness(path: Path) -> float:

@@ -1,0 +1,25 @@
+"""The hand-over of the thesis, section 3.5, with real sockets."""
+
+import pytest
+
+from skytether.lab.handover import VARIANTS, handover
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nothing_is_lost_when_the_network_changes(variant):
+    rows = handover(variant, seconds=3.0, at=1.5)
+    assert [row.direction for row in rows] == ["robot to service", "service to robot"]
+    for row in rows:
+        assert row.sent == 300
+        assert row.lost == 0
+        # Two periods, and what a busy machine adds; without notice, the detection.
+        assert row.gap_max_ms < (60 if variant != "failover" else 400)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"), [({"variant": "wild"}, "planned"), ({"variant": "planned", "at": 30}, "within")]
+)
+def test_what_cannot_be_done_is_refused(options, says):
+    with pytest.raises(ValueError, match=says):
+        handover(**options)
