@@ -216,7 +216,9 @@ def test_memory_of_a_flooded_end_is_bounded(make_world):
         for i in range(count):
             session.receive(forged(random, epoch), f"stranger {i}", link.now)
             session.receive(random.choice(recorded), f"stranger {i}", link.now)
-            hello = packet.push_common(packet.HELLO, SESSION_ID, 0, random.getrandbits(48), 0, 200_000)
+            shard = packet.push_common(packet.DATA, SESSION_ID, epoch, random.randrange(60_000), 1 + i % 2, 30_000)
+            session.receive(shard + packet.push_shard(0, i % 40, 0, 0, 0) + random.randbytes(1000), "x", link.now)
+            hello = packet.push_common(packet.HELLO, SESSION_ID, 0, random.getrandbits(48), 0, 182 * 1100)
             session.receive(hello + packet.push_shard(0, i % 200, 0, 0, 0) + random.randbytes(1100), "x", link.now)
             for _ in iter(session.next_event, None):
                 pass
@@ -231,4 +233,4 @@ def test_memory_of_a_flooded_end_is_bounded(make_world):
         tracemalloc.stop()
     # Of 16 MB that came: the messages' bound, the handshakes', and room for counters.
     assert 400_000 < used < config.reassembly_limit + 2 * MAX_HANDSHAKE + 300_000
-    assert session.stats(link.now).rejected["evicted"] > 100
+    assert session.stats(link.now).rejected["evicted"] > 1000
