@@ -31,6 +31,10 @@ WINDOW_BYTES = 2**20
 """Bytes of a topic that may be under way, except for a single message: bounds what the receiver has to hold."""
 HELD_LIMIT = 2 * WINDOW_BYTES
 """Bytes of a topic that the receiver holds back until what goes before them arrives."""
+NUMBERS = 2**63
+"""Above all numbers that anybody will ever use."""
+FAR_AHEAD = 2**32
+"""Most messages that a sender may have given up at a time."""
 STATUS_DELAY = 0.025
 """Seconds between accounts of what is missing in a large message that is arriving."""
 RESEAL_AFTER = 6
@@ -224,7 +228,7 @@ class Outbox:
         """The peer tells what it has."""
         while self._flying and (sequence := self.base) < ack.expected:
             self._land(self._flying[sequence])
-        for i, byte in enumerate(ack.held):
+        for i, byte in enumerate(ack.held[: WINDOW // 8]):
             for bit in range(8):
                 if byte >> bit & 1:
                     letter = self._flying.get(ack.expected + 1 + 8 * i + bit)
@@ -365,8 +369,10 @@ class Inbox:
         if len(body) < PREFIX.size:
             return []
         sequence, below = PREFIX.unpack_from(body)
-        self.touch(now)
         base = max(sequence - below, 0)
+        if base > NUMBERS - FAR_AHEAD:
+            return []
+        self.touch(now)
         if self._expected is None:
             self._expected = base
         payload = body[PREFIX.size :]
@@ -380,6 +386,8 @@ class Inbox:
     def forward(self, base: int) -> list[Delivery]:
         """The sender gave up all below ``base``; returns what can be delivered now."""
         expected = base if self._expected is None else self._expected
+        if base > expected + FAR_AHEAD or base > NUMBERS - FAR_AHEAD:  # nobody has sent that many
+            return []
         out: list[Delivery] = []
         if base > expected:
             out.extend(self._release(s) for s in sorted(self._held) if s < base)
