@@ -104,7 +104,7 @@ class RateControl:
         self._updated = now
         self._used += (1 - math.exp(-elapsed / USED_TIME)) * (used - self._used)
         rtt = min(max(rtt, 0.01), 1.0) if rtt == rtt else 0.1
-        self._watch(feedback.queue, now)
+        self._watch(feedback, now)
         before = self._share
         overflown = self._beyond_usual(settled, lost, now)
         if self.competing:
@@ -149,17 +149,18 @@ class RateControl:
         expected = settled * losses / packets if packets else 0.0
         return lost > expected + 3 * math.sqrt(expected)
 
-    def _watch(self, queue: float, now: float) -> None:
+    def _watch(self, feedback: Feedback, now: float) -> None:
         """Find out whose queue it is."""
+        queue = feedback.queue
         self._calm_since = math.inf if queue > TARGET else min(self._calm_since, now)
         if queue <= FOREIGN:
             self._foreign_since = math.inf
         elif self._foreign_since == math.inf:
             self._foreign_since = now
             if not self.competing:
-                self._before = self._share
+                self._before = min(self._share, SMOOTH * feedback.rate)
         if self.competing:
             self.competing = now - self._calm_since < PATIENCE
         elif now - self._foreign_since >= PATIENCE:
             self.competing = True
-            self._share, self._drain = max(self._share, min(self._before, self._ceiling)), math.inf
+            self._share, self._drain = max(self._share, self._before), math.inf
