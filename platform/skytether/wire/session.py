@@ -9,7 +9,7 @@ from collections.abc import Callable, Container, Hashable, Sequence
 from . import control
 from .clock import ClockOffset
 from .compression import FLAG, Compressed, compress, decompress
-from .config import Config
+from .config import MIN_MTU, Config
 from .control import Forward, Goodbye, Ping, Report
 from .crypto import KEY_SIZE
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, ReceiveTopic, SendTopic
@@ -598,7 +598,7 @@ class Session:
     def _send_raw(self, common: bytes, message: bytes, path: Path, address: Hashable) -> None:
         if len(self._raw) >= MAX_RAW:
             return
-        packets, size = cut(common, message, self._config.mtu - HEADER_SIZE, path.redundancy.parity)
+        packets, size = cut(common, message, MIN_MTU - HEADER_SIZE, path.redundancy.parity)
         path.pacer.spend(len(packets))
         path.packets_sent += -(-len(packets) // size)
         path.bytes_sent += len(packets)
