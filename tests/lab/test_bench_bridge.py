@@ -40,7 +40,8 @@ def test_user_space_emulator_delays_and_counts(name: str) -> None:
         assert row.delay_p50_ms is not None
         assert row.delay_p50_ms >= 20
         assert row.overhead is not None
-        assert row.overhead >= 28 / 80  # headers of IP and UDP at least
+        # Headers of IP and UDP at least; a message at an end of the interval may enter the link just outside of it.
+        assert row.overhead >= 28 / 80 - 2 * (108 / 80) / 40
         assert (row.emulator, row.congestion) == ("user", None)
 
 
