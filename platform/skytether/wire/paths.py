@@ -8,12 +8,13 @@ active one: make before break. Duplicates end at the receiver's replay window.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import NamedTuple
 
 from .config import Config
-from .control import PING_SIZE, Ping, push_ping
+from .control import PING_SIZE, Control, Ping, push_ping
 from .crypto import TAG_SIZE
+from .events import Event, PathSwitched, PeerMoved
 from .liveness import HURRY, Health
 from .mtu import SMALL
 from .packet import HEADER_SIZE
@@ -60,8 +61,8 @@ class Paths:
     Args:
         config: Settings.
         say: Sends a ping by a path, at once.
-        changed: Called with the choice whenever it is another one, and when paths came or went. The reason is empty
-            unless another path became the active one: ``lost``, ``closed``, ``cheaper`` or ``better``.
+        changed: Called with the choice whenever it is another one, and when paths came or went.
+        tell: Takes events: the peer moved, another path became the active one.
         now: Time.
     """
 
@@ -69,12 +70,14 @@ class Paths:
         self,
         config: Config,
         say: Callable[[Path, bytes, float], None],
-        changed: Callable[[Choice, str, float], None],
+        changed: Callable[[Choice, float], None],
+        tell: Callable[[Event], None],
         now: float,
     ) -> None:
         self._config = config
         self._say = say
         self._changed = changed
+        self._tell = tell
         self._paths: dict[int, Path] = {0: Path(0, config, now)}
         self.choice = Choice(self._paths[0], None, False)
         self._overlap_until = -math.inf
@@ -94,11 +97,6 @@ class Paths:
         """The path of that id."""
         return self._paths.get(path_id)
 
-    @property
-    def addressed(self) -> bool:
-        """Whether it is known for any path where to send."""
-        return any(p.address is not None for p in self._paths.values())
-
     # --- which there are
 
     def open(self, path_id: int, cost: int, now: float) -> Path:
@@ -111,9 +109,21 @@ class Paths:
             path = self._paths[path_id] = Path(path_id, self._config, now)
             if self._up:
                 path.start_epoch(now)
-            self._changed(self.choice, "", now)
+            self._changed(self.choice, now)
         path.cost = cost
         return path
+
+    def admit(self, path_id: int, message: Control | None, now: float) -> Path | None:
+        """The robot speaks by a path that is not known yet: its ping says so, or there is none other.
+
+        Args:
+            path_id: The path.
+            message: What it says, if that is a control message.
+            now: Time.
+        """
+        if any(p.address is not None for p in self) and not (isinstance(message, Ping) and message.path == path_id):
+            return None
+        return self.open(path_id, 0, now)
 
     def close(self, path_id: int, now: float) -> None:
         """Drop a path; the last one stays, and leads nowhere until another is opened."""
@@ -126,7 +136,7 @@ class Paths:
         if path is self.choice.active:
             self._switch(self._best(self, now), "closed", now)
         self.choose(now)
-        self._changed(self.choice, "", now)
+        self._changed(self.choice, now)
         if len(self._paths) == 1:  # nobody asks any more, so no answer can be missing
             self.choice.active.liveness.calm()
 
@@ -201,8 +211,17 @@ class Paths:
             self.choose(now)
         return Exchange(asked_at, sent_at - hold, sent_at)
 
-    def heard(self, path: Path, now: float) -> None:
-        """An authentic message came by that path."""
+    def heard(self, path: Path, number: int, address: Hashable, now: float) -> None:
+        """An authentic message came by that path; the newest of its messages tells where the peer is."""
+        if number > path.newest:
+            path.newest = number
+            if address != path.address:
+                moved = path.address is not None
+                path.address = address
+                if moved:
+                    path.mtu.restart(now)
+                    self._tell(PeerMoved(address))
+                self.choose(now)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
             self.ping_soon(path, now)
@@ -347,7 +366,9 @@ class Paths:
     def _set(self, choice: Choice, reason: str, now: float) -> None:
         if choice != self.choice:
             self.choice = choice
-            self._changed(choice, reason if self._up else "", now)
+            self._changed(choice, now)
+            if reason and self._up:
+                self._tell(PathSwitched(choice.active.id, reason))
 
 
 def _badness(path: Path) -> float:

@@ -61,6 +61,7 @@ class Receiver:
         accept: Called with each authentic message, once.
         handshake: Called with each complete, not yet authenticated handshake message.
         on_expired: Called with the topic index of each message that stayed incomplete for too long.
+        rejected: Counters of what is refused.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class Receiver:
         accept: Accept,
         handshake: TakeHandshake,
         on_expired: Callable[[int], None],
+        rejected: Counter[str],
     ) -> None:
         self._session_id = session_id
         self._max_length = config.max_message + PREFIX.size + OVERHEAD
@@ -79,7 +81,7 @@ class Receiver:
         self._find_epoch = find_epoch
         self._accept = accept
         self._handshake = handshake
-        self.rejected: Counter[str] = Counter()
+        self.rejected = rejected
         self.messages = Reassembly(config.reassembly_limit, on_expired)
         self._handshakes = Reassembly(2 * MAX_HANDSHAKE, _nothing)
 

@@ -67,6 +67,10 @@ class Seeker:
         self.hello = None
         self.due = until
 
+    def refused(self, now: float) -> None:
+        """The service has other topics: ask again, rarely."""
+        self.rest(now + self._config.hello_retry_max)
+
     def seek(self, held: Ciphers | None, last_heard: float, now: float) -> Hello | None:
         """What to send now.
 

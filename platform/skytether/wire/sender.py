@@ -16,9 +16,10 @@ from functools import partial
 from .compression import FLAG, Compressed, original_size
 from .config import Config
 from .crypto import TAG_SIZE
-from .epoch import CONTROL_PRIORITY, Epoch, SendTopic
+from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
 from .fragment import Shape, Shards, shape_for
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
+from .measure import Outbound
 from .packet import DATA, HEADER_SIZE, push_common, push_shard, ticks
 from .parcel import Parcel
 from .path import Path, Transmit
@@ -46,6 +47,7 @@ class Sender:
         self._session_id = session_id
         self._config = config
         self.epoch: Epoch | None = None
+        self._control = _control()
         self._lanes = {path.id: Lane(path, config.queue_limit)}
         self._active = self._lanes[path.id]
         self._other: Lane | None = None
@@ -84,6 +86,7 @@ class Sender:
         for lane in self._lanes.values():
             lane.clear()
         self.epoch = epoch
+        self._control = _control()
 
     def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
@@ -94,18 +97,22 @@ class Sender:
         outbox.queued = True
         self._active.queue.put_other(outbox.topic.priority, outbox)
 
-    def say(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> None:
-        """Send a message of one packet by that path, once and at once, however large the packet."""
-        packet = self.packet(topic, payload, path, now)
+    def tell(self, message: bytes, now: float) -> None:
+        """Queue a control message, once: the next one of its kind makes up for its loss."""
+        self.put(self._control, message, now, extra=0)
+
+    def say(self, path: Path, message: bytes, now: float) -> None:
+        """Send a control message of one packet by that path, once and at once, however large the packet."""
+        packet = self.packet(message, path, now)
         if packet is not None:
             self._lane(path).say(packet)
 
-    def packet(self, topic: SendTopic, payload: bytes, path: Path, now: float) -> bytes | None:
-        """Seal a message of one packet; None if there are no keys."""
-        epoch = self.epoch
+    def packet(self, message: bytes, path: Path, now: float) -> bytes | None:
+        """Seal a control message of one packet; None if there are no keys."""
+        epoch, topic = self.epoch, self._control
         if epoch is None:
             return None
-        number, common, plaintext = self._next(epoch, topic, payload, now)
+        number, common, plaintext = self._next(epoch, topic, message, now)
         sealed = epoch.ciphers.seal(number, plaintext, common)
         packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
         topic.counters.bytes_sent += len(packet)
@@ -316,6 +323,11 @@ class Sender:
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)
         return len(packet)
+
+
+def _control() -> SendTopic:
+    """What an epoch's control messages are sent as; nobody reads their counters."""
+    return SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
 
 
 def _inner(sequence: int, published_at: float, payload: bytes) -> bytes:
