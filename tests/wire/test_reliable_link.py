@@ -207,3 +207,15 @@ def test_what_expands_beyond_the_largest_message_is_refused(world):
     link.run(1)
     assert received(link, SERVICE, "a") == [bytes(50_000)]
     assert link.sessions[SERVICE].stats(link.now).rejected == {"compressed": 1}
+
+
+def test_a_goodbye_that_leaves_an_acknowledgement_owed_leaves_nothing_due(world):
+    link = make(world)
+    service = link.sessions[SERVICE]
+    assert link.publish(ROBOT, "goal", b"last words")
+    link.at(link.now, lambda: link.sessions[ROBOT].close(link.time_of(ROBOT)))
+    link.run(0.5)
+    assert received(link, SERVICE, "goal") == [b"last words"]
+    assert not service.stats(link.time_of(SERVICE)).connected
+    due = service.next_timer()
+    assert due is None or due > link.time_of(SERVICE)

@@ -66,6 +66,7 @@ class Streams:
         for outbox in self._outboxes.values():
             if epoch is None or outbox.topic.name not in epoch.send:
                 outbox.start_epoch(None, now, newcomer=False)
+        self._owing.clear()  # without these keys nothing can be acknowledged; what is missed is sent again
         if epoch is None:
             return False
         newcomer, restarted = epoch.life != self._life, self._life not in (b"", epoch.life)
@@ -74,7 +75,6 @@ class Streams:
             for topic in self._receiving:  # what arrives late under the keys before is of no interest any more
                 topic.inbox = None
             self._inboxes.clear()
-        self._owing.clear()
         self._receiving = [t for t in epoch.receive.values() if t.topic.reliable]
         self._inboxes = {t.name: self._inboxes.get(t.name) or Inbox(self._owing) for t in self._receiving}
         for receive in self._receiving:
