@@ -149,6 +149,16 @@ def test_a_mistake_is_named_by_its_key_with_what_is_allowed(run, document, says)
     assert "Traceback" not in result.output
 
 
+def test_a_key_that_comes_twice_and_a_second_document_are_refused(run):
+    for text, says in (
+        ("id: a\nrole: robot\nid: b\n", "in line 3: the key 'id' comes twice"),
+        ("role: robot\n---\nrole: service\n", "holds 2 documents; a configuration is one"),
+    ):
+        result = run(None, text=text)
+        assert result.exit_code == 2
+        assert says in " ".join(result.stderr.split())
+
+
 @pytest.mark.parametrize("text", ["", "- a\n- b", "a: [1", "\x00", "[" * 5000])
 def test_what_is_no_configuration_is_refused(run, text):
     result = run(None, text=text)

@@ -1,4 +1,4 @@
-"""YAML as people write manifests: read safely, and with every key once."""
+"""YAML as people write manifests and configurations: read safely, and with every key once."""
 
 from __future__ import annotations
 
@@ -39,12 +39,34 @@ def read_yaml(path: Path) -> list[Any]:
         YamlError: It cannot be read, is too large, or is no YAML.
     """
     try:
-        with path.open("rb") as file:
-            text = file.read(_MAX_BYTES + 1)
+        text = read_bounded(path)
     except OSError as error:
         raise YamlError(f"{path}: cannot be read: {error.strerror}") from error
+    return parse_yaml(text, path)
+
+
+def read_bounded(path: Path) -> bytes:
+    """A file's bytes, no more than `parse_yaml` needs to see that it is too large.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return file.read(_MAX_BYTES + 1)
+
+
+def parse_yaml(text: bytes, path: Path) -> list[Any]:
+    """All documents of a text that hold anything.
+
+    Args:
+        text: What the file holds.
+        path: What to call it in a complaint.
+
+    Raises:
+        YamlError: It is too large, or is no YAML.
+    """
     if len(text) > _MAX_BYTES:
-        raise YamlError(f"{path}: is larger than {_MAX_BYTES} bytes: that is no manifest")
+        raise YamlError(f"{path}: is larger than {_MAX_BYTES} bytes: that is nothing people write")
     try:
         return [document for document in yaml.load_all(text, _Loader) if document is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:

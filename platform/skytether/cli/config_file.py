@@ -6,12 +6,10 @@ import difflib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, Field, ValidationError
 
 from skytether.api.manifest import Strict
-
-MAX_CONFIG_BYTES = 1024 * 1024
+from skytether.api.yaml import YamlError, parse_yaml, read_bounded
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -40,19 +38,14 @@ def read_config(path: Path, model: type[_Model]) -> _Model:
         ConfigError: It cannot be read, is no YAML, or a key is wrong.
     """
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_CONFIG_BYTES + 1)
+        documents = parse_yaml(read_bounded(path), path)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    if len(text) > MAX_CONFIG_BYTES:
-        raise ConfigError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; that is no configuration")
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{path} is no YAML{where}: {getattr(error, 'problem', None) or 'unreadable'}") from error
-    return check_config(document, model, str(path))
+    except YamlError as error:
+        raise ConfigError(str(error)) from error
+    if len(documents) > 1:
+        raise ConfigError(f"{path} holds {len(documents)} documents; a configuration is one")
+    return check_config(documents[0] if documents else None, model, str(path))
 
 
 def check_config(document: Any, model: type[_Model], where: str) -> _Model:
