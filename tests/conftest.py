@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from pathlib import Path
 from typing import NoReturn
 
@@ -48,3 +49,24 @@ def nftables(netns: None) -> None:
     for program in ("nft", "conntrack"):
         if shutil.which(program) is None:
             require("nftables", f"the program '{program}' is missing: install nftables and conntrack")
+
+
+@pytest.fixture(scope="session")
+def ros1() -> None:
+    """A ROS 1 installation: master, rospy and the tools, under the system's Python."""
+    for program in ("rosmaster", "roslaunch", "rosbag"):
+        if shutil.which(program) is None:
+            require("ros1", f"the program '{program}' is missing: install ros-core and python3-rospy")
+
+
+@pytest.fixture(scope="session")
+def docker_engine() -> str:
+    """A Docker engine that answers, and the image that everything is built on; its version."""
+    if shutil.which("docker") is None:
+        require("docker", "the program 'docker' is missing: install docker.io")
+    asked = subprocess.run(["docker", "version", "--format", "{{.Server.Version}}"], capture_output=True, text=True)
+    if asked.returncode:
+        require("docker", f"no Docker engine answers: {asked.stderr.strip()}")
+    if subprocess.run(["docker", "image", "inspect", "debian:bookworm-slim"], capture_output=True).returncode:
+        require("docker", "the engine has no image debian:bookworm-slim")
+    return asked.stdout.strip()
