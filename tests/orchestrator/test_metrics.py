@@ -5,9 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 from skytether.api.rest import Refusal, Report, TopicReport
-from skytether.orchestrator.metrics import Metrics, Running
+from skytether.orchestrator.metrics import Metrics, Running, SiteGauges
 from skytether.orchestrator.records import Record
-from skytether.orchestrator.runtimes.base import Observation, Phase
+from skytether.orchestrator.runtimes.base import Capacity, Observation, Phase
 
 NewRecord = Callable[..., Record]
 ALLOWED = {"robot", "service", "topic", "priority", "site", "direction", "outcome", "source", "reason", "phase"}
@@ -43,7 +43,7 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
     )
     text = metrics.text().decode()
     names = set(re.findall(r"^# TYPE skytether_(\w+) ", text, re.MULTILINE)) - {"instance_start_seconds_created"}
-    assert names - {"placement_refusals_created"} == {
+    assert {name for name in names if not name.startswith("site_")} - {"placement_refusals_created"} == {
         "topic_one_way_delay_seconds",
         "path_rtt_seconds",
         "topic_messages_total",
@@ -124,3 +124,22 @@ def test_no_robot_can_blow_up_the_number_of_series(new_record: NewRecord, manife
     assert len(re.findall(r"^skytether_fallback_transitions_total", text, re.MULTILINE)) == 64
     assert "evil" not in text
     assert "xxx" not in text
+
+
+def test_sites_tell_capacity_load_and_what_they_promised(new_record, manifest) -> None:
+    running = [Running(record_with(new_record, manifest, "scan"), None)]
+    gauges = [SiteGauges("lab", Capacity(4, 1024), 0.25), SiteGauges("gone", None, None)]
+    text = Metrics(lambda: running, 64, lambda: gauges).text().decode()
+    needs = running[0].record.spec.needs
+    for line in (
+        'skytether_site_up{site="lab"} 1.0',
+        'skytether_site_up{site="gone"} 0.0',
+        'skytether_site_cpu_cores{site="lab"} 4.0',
+        'skytether_site_memory_bytes{site="lab"} 1.073741824e+09',
+        'skytether_site_load_ratio{site="lab"} 0.25',
+        f'skytether_site_promised_cpu_cores{{site="lab"}} {needs.cpu}',
+        'skytether_site_instances{site="lab"} 1.0',
+        'skytether_site_instances{site="gone"} 0.0',
+    ):
+        assert line in text.splitlines()
+    assert 'skytether_site_cpu_cores{site="gone"}' not in text

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs
 from skytether.api.rest import Measurement
-from skytether.orchestrator.placement import Candidate, place
+from skytether.orchestrator.placement import Candidate, place, score
 from skytether.orchestrator.runtimes.base import Capacity
+from skytether.orchestrator.settings import Weights
 
 NEEDS = Needs(cpu=2, memory_mb=512, gpu=1, max_rtt_ms=100, max_loss=0.05, tiers=("edge", "cloud"))
 GOOD = Candidate("good", "edge", total=Capacity(4, 4096, 1))
@@ -114,3 +115,46 @@ def test_every_site_is_chosen_or_refused_in_any_order(sites: list[Candidate], me
         assert not decision.hopeless
         assert chosen.unreachable is None
         assert chosen.used.cpu + NEEDS.cpu <= chosen.total.cpu + 1e-6
+
+
+def test_the_score_is_the_delay_of_control_with_what_money_and_crowding_are_worth() -> None:
+    needs = Needs(cpu=1, compute_ms=8)
+    candidate = Candidate("a", "edge", total=Capacity(4, 4096), used=Capacity(1, 0), speed=2, cost=3)
+    reckoned = score(needs, Measurement(rtt_ms=30, jitter_ms=4), candidate, Weights(cost_ms=5, spread_ms=10))
+    # Half of the processors are promised with this one: waiting takes as long as computing, 8 ms at double speed.
+    assert (reckoned.rtt_ms, reckoned.compute_ms, reckoned.queue_ms) == (34, 4, 4)
+    assert (reckoned.cost_ms, reckoned.spread_ms) == (15, 5)
+    assert reckoned.total_ms == 62
+    assert reckoned.measured
+
+
+def test_what_is_busy_counts_where_it_is_more_than_what_was_promised() -> None:
+    needs = Needs(cpu=1, compute_ms=10)
+    candidate = Candidate("a", "edge", total=Capacity(4, 4096), load=0.5)
+    assert score(needs, Measurement(), candidate, Weights()).queue_ms == 30  # u = 0.75
+    full = dataclasses.replace(candidate, load=1.0)
+    assert score(needs, Measurement(), full, Weights()).queue_ms == 190  # u = 0.95 at most
+
+
+def test_a_dear_site_must_be_faster_by_what_it_costs() -> None:
+    near, far = site(name="near", cost=50), site(name="far")
+    measured = {"near": Measurement(rtt_ms=10), "far": Measurement(rtt_ms=50)}
+    assert place(NEEDS, measured, [near, far], weights=Weights(cost_ms=1)).site == "far"
+    decision = place(NEEDS, measured, [near, far], weights=Weights(cost_ms=0.5))
+    assert decision.site == "near"
+    assert [s.site for s in decision.scores] == ["near", "far"]
+
+
+def test_images_and_architectures_rule_out() -> None:
+    closed = site(images=("registry.example/*",))
+    decision = place(NEEDS, {}, [closed], image="evil/image:1")
+    assert [(r.reason, r.detail) for r in decision.refused] == [
+        ("image", "allows images registry.example/*, asked for is evil/image:1")
+    ]
+    assert decision.hopeless
+    assert place(NEEDS, {}, [closed], image="registry.example/a:1").site == "good"
+    arm = site(total=Capacity(4, 4096, 1, "arm64"))
+    needs = NEEDS.model_copy(update={"architectures": ("amd64",)})
+    decision = place(needs, {}, [arm])
+    assert [(r.reason, r.detail) for r in decision.refused] == [("architecture", "is arm64, needed is amd64")]
+    assert place(needs, {}, [GOOD]).site == "good"  # not known: the engine will tell

@@ -14,7 +14,7 @@ from skytether.orchestrator.reconcile import Reconciler
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.security import Secrets
-from skytether.orchestrator.settings import Limits, Timing
+from skytether.orchestrator.settings import Limits, Timing, Weights
 from skytether.orchestrator.sites import Site
 from skytether.orchestrator.store import Store
 from skytether.testing.runtimes import (
@@ -56,7 +56,14 @@ class Bench:
 
     def _reconciler(self, folder: Path) -> Reconciler:
         return Reconciler(
-            self.store, Secrets(folder), self.metrics, Timing(), Limits(ended_count=1), self.clock, self._wake
+            self.store,
+            Secrets(folder),
+            self.metrics,
+            Timing(),
+            Limits(ended_count=1),
+            Weights(),
+            self.clock,
+            self._wake,
         )
 
     def _site(self) -> Site:

@@ -96,6 +96,10 @@ class Needs(Strict):
     """Cores."""
     memory_mb: Annotated[int, Field(gt=0)] = 128
     gpu: Annotated[int, Field(ge=0)] = 0
+    compute_ms: Annotated[float, Field(gt=0, le=60_000)] = 5.0
+    """One step of the service on a core of its own; placement reckons delay with it."""
+    architectures: tuple[Annotated[str, Field(pattern=r"^[a-z0-9_]+$")], ...] = ()
+    """As container images name them (``amd64``, ``arm64``); empty: any."""
     max_rtt_ms: Annotated[float, Field(gt=0)] | None = None
     """Above this the robot's fallback takes over; None: any."""
     max_loss: Annotated[float, Field(ge=0, le=1)] | None = None

@@ -32,6 +32,9 @@ class Measurement(Strict):
     """What a robot measured towards one site."""
 
     rtt_ms: Annotated[float, Field(ge=0)] | None = None
+    """Median round trip."""
+    jitter_ms: Annotated[float, Field(ge=0)] | None = None
+    """How much longer a slow one takes than the median."""
     loss: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
@@ -52,8 +55,29 @@ class Refusal(Strict):
 
     site: str
     reason: str
-    """Bounded, for metrics: ``tier``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``, ``runtime``, ``unreachable``."""
+    """Bounded, for metrics: ``tier``, ``architecture``, ``image``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``,
+    ``runtime``, ``unreachable``."""
     detail: str
+
+
+class Score(Strict):
+    """What placement reckoned for a site that fits, in milliseconds; the lowest total is chosen."""
+
+    site: str
+    rtt_ms: float
+    """Round trip with its jitter, or what was assumed for it."""
+    measured: bool
+    """Whether the robot measured it."""
+    compute_ms: float
+    queue_ms: float
+    """Waiting for a processor."""
+    cost_ms: float
+    spread_ms: float
+
+    @property
+    def total_ms(self) -> float:
+        """The sum."""
+        return round(self.rtt_ms + self.compute_ms + self.queue_ms + self.cost_ms + self.spread_ms, 3)
 
 
 class Placement(Strict):
@@ -61,6 +85,8 @@ class Placement(Strict):
 
     site: str
     refused: tuple[Refusal, ...] = ()
+    scores: tuple[Score, ...] = ()
+    """Of the sites that fitted when it was placed, the best first."""
 
 
 class Session(Strict):
@@ -154,6 +180,12 @@ class SiteCreate(Strict):
     """Entry point of group ``skytether.runtimes``."""
     options: dict[str, Any] = {}
     """The runtime's own options; unknown ones are refused by name."""
+    speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    """Of one core, beside the core for which services state ``needs.compute_ms``."""
+    cost: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    """Of one instance, in any unit that is the same for all sites; placement weighs it against delay."""
+    images: tuple[Annotated[str, Field(min_length=1, max_length=255)], ...] = ("*",)
+    """Patterns (``registry.example/*``) of the images that may run there."""
 
 
 class Site(SiteCreate):
@@ -163,6 +195,10 @@ class Site(SiteCreate):
     reason: str = ""
     cpu: float | None = None
     memory_mb: int | None = None
+    gpu: int | None = None
+    architecture: str = ""
+    load: float | None = None
+    """Share of its processors that is busy."""
     instances: int = 0
 
 

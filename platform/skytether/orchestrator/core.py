@@ -11,7 +11,7 @@ from .catalogue import Catalogue
 from .events import Broker
 from .instances import Instances
 from .loops import Loop
-from .metrics import Metrics, Running
+from .metrics import Metrics, Running, SiteGauges
 from .reconcile import Reconciler
 from .runtimes.base import Runtime
 from .security import Secrets
@@ -50,11 +50,18 @@ class Orchestrator:
         self.store = Store(settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}")
         self.broker = Broker()
         self.store.on_change = self.broker.publish
-        self.metrics = Metrics(self._running, settings.limits.reported_topics)
+        self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges)
         self.catalogue = Catalogue(self.store)
         self.access = Access(self.store, secrets, clock)
         self.reconciler = Reconciler(
-            self.store, secrets, self.metrics, settings.timing, settings.limits, clock, self._wake_placer
+            self.store,
+            secrets,
+            self.metrics,
+            settings.timing,
+            settings.limits,
+            settings.weights,
+            clock,
+            self._wake_placer,
         )
         self.sites = Sites(
             settings.state_dir / "sites", self.store, self.reconciler.site_step, settings.timing, find_runtime
@@ -118,3 +125,8 @@ class Orchestrator:
             seen = site.observed.get(record.id) if site else None
             running.append(Running(record, seen))
         return running
+
+    def _site_gauges(self) -> list[SiteGauges]:
+        return [
+            SiteGauges(site.name, None if site.unreachable else site.capacity, site.load) for site in self.sites.all()
+        ]

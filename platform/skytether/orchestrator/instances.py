@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from skytether.api.rest import Instance, InstanceCreate, Placement, Refusal, Renew, Session, State
+from skytether.api.rest import Instance, InstanceCreate, Placement, Refusal, Renew, Score, Session, State
 
 from .access import Principal
 from .catalogue import Catalogue
@@ -161,6 +161,7 @@ class Instances:
     def show(self, record: Record, *, with_session: bool = True) -> Instance:
         """As REST tells it."""
         refused = tuple(Refusal.model_validate(refusal) for refusal in record.refused)
+        scores = tuple(Score.model_validate(score) for score in record.scores)
         return Instance(
             id=record.id,
             robot=record.robot,
@@ -168,7 +169,7 @@ class Instances:
             state=record.state,
             reason=record.reason,
             params=record.params,
-            placement=Placement(site=record.site, refused=refused) if record.site else None,
+            placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
             session=self._session(record) if with_session else None,
             restarts=record.restarts,
             created_at=utc(record.created_at),

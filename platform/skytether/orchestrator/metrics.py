@@ -19,7 +19,7 @@ from skytether.api.manifest import ANY_TOPIC
 from skytether.api.rest import Refusal, Report, TopicReport
 
 from .records import Record
-from .runtimes.base import Observation
+from .runtimes.base import Capacity, Observation
 
 OUTCOMES = ("sent", "delivered", "lost", "late", "expired", "replaced", "superseded", "duplicate")
 SOURCES = ("cloud", "fallback", "stop")
@@ -38,12 +38,27 @@ class Running:
     observation: Observation | None
 
 
+@dataclass(frozen=True, slots=True)
+class SiteGauges:
+    """A site at the moment of a scrape; None: not known."""
+
+    name: str
+    capacity: Capacity | None
+    load: float | None
+
+
 class Metrics(Collector):
     """The registry of one orchestrator, and what feeds it."""
 
-    def __init__(self, running: Callable[[], Iterable[Running]], max_topics: int) -> None:
-        """``running`` is asked at each scrape; ``max_topics`` bounds the topics of one robot's report."""
+    def __init__(
+        self,
+        running: Callable[[], Iterable[Running]],
+        max_topics: int,
+        sites: Callable[[], Iterable[SiteGauges]] = tuple,
+    ) -> None:
+        """``running`` and ``sites`` are asked at each scrape; ``max_topics`` bounds the topics of a robot's report."""
         self._running = running
+        self._sites = sites
         self._max_topics = max_topics
         self._lock = threading.Lock()
         self._reports: dict[str, Report] = {}
@@ -108,6 +123,7 @@ class Metrics(Collector):
         with self._lock:
             reports = [(r.record, self._reports[r.record.id]) for r in running if r.record.id in self._reports]
         yield from _instances(running)
+        yield from _sites(self._sites(), running)
         yield from _control(reports)
         yield from _topics([(record, topic) for record, report in reports for topic in report.topics])
 
@@ -148,6 +164,29 @@ def _instances(running: Iterable[Running]) -> Iterator[Metric]:
             memory.add(labels, one.observation.memory_bytes)
     yield _counter("instance_cpu_seconds", "Processor time of the present runs", _INSTANCE, cpu)
     yield _gauge("instance_memory_bytes", "Resident memory", _INSTANCE, memory)
+
+
+def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Metric]:
+    up, cores, memory, load, promised, count = _Sums(), _Sums(), _Sums(), _Sums(), _Sums(), _Sums()
+    for site in sites:
+        labels = (site.name,)
+        up.put(labels, float(site.capacity is not None))
+        load.put(labels, site.load)
+        if site.capacity is not None:
+            cores.put(labels, site.capacity.cpu)
+            memory.put(labels, site.capacity.memory_mb * 2.0**20)
+        promised.put(labels, 0.0)
+        count.put(labels, 0.0)
+    for one in running:
+        if (one.record.site or "",) in up:
+            promised.add((one.record.site,), one.record.spec.needs.cpu)
+            count.add((one.record.site,), 1)
+    yield _gauge("site_up", "1 while the site answers", ("site",), up)
+    yield _gauge("site_cpu_cores", "Processors of the site", ("site",), cores)
+    yield _gauge("site_memory_bytes", "Memory of the site", ("site",), memory)
+    yield _gauge("site_load_ratio", "Share of the site's processors that is busy", ("site",), load)
+    yield _gauge("site_promised_cpu_cores", "Processors that the instances there asked for", ("site",), promised)
+    yield _gauge("site_instances", "Instances there that have not ended", ("site",), count)
 
 
 def _control(reports: Iterable[tuple[Record, Report]]) -> Iterator[Metric]:

@@ -30,6 +30,9 @@ sites = Table(
     Column("tier", String(16), nullable=False),
     Column("runtime", String(63), nullable=False),
     Column("options", JSON, nullable=False),
+    Column("speed", Float, nullable=False, server_default="1"),
+    Column("cost", Float, nullable=False, server_default="0"),
+    Column("images", JSON, nullable=False, server_default='["*"]'),
 )
 
 robots = Table(
@@ -68,6 +71,7 @@ instances = Table(
     Column("reason", String(1024), nullable=False),
     Column("site", String(63)),
     Column("refused", JSON, nullable=False),
+    Column("scores", JSON, nullable=False, server_default="[]"),
     Column("host", String(255)),
     Column("port", Integer),
     Column("attempt", Integer, nullable=False),

@@ -1,18 +1,26 @@
-"""Where an instance should run: pure. Each refusal says why, with the number asked for and the one found."""
+"""Where an instance should run: pure.
+
+First what rules a site out, each refusal with the number asked for and the one found; then a score for what is left, in
+milliseconds: the delay of control to be expected there, and what money and crowding are worth.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 from skytether.api.manifest import Needs, Tier
-from skytether.api.rest import Measurement, Refusal
+from skytether.api.rest import Measurement, Refusal, Score
 
 from .runtimes.base import Capacity
+from .settings import Weights
 
 NOTHING = Capacity(0.0, 0)
 _TIER_ORDER: Mapping[Tier, int] = {"robot": 0, "edge": 1, "cloud": 2}
 """Nearer first, where nothing was measured."""
+_FULLEST = 0.95
+"""Utilisation beyond which queueing is not reckoned as longer: the formula's pole is no prediction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +36,14 @@ class Candidate:
     total: Capacity = NOTHING
     used: Capacity = NOTHING
     """What the instances that are there asked for."""
+    load: float = 0.0
+    """Share of its processors that is busy, whoever makes them so; 0 where it is not known."""
+    speed: float = 1.0
+    """Of one core, beside the core for which services state ``compute_ms``."""
+    cost: float = 0.0
+    """Of one instance, in the operator's unit."""
+    images: tuple[str, ...] = ("*",)
+    """Patterns of the images that may run there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,28 +54,60 @@ class Decision:
     refused: tuple[Refusal, ...]
     hopeless: bool
     """None fits, and none would if it were empty and reachable: waiting is no use."""
+    scores: tuple[Score, ...] = ()
+    """Of the sites that fit, the best first."""
 
 
-def place(needs: Needs, measured: Mapping[str, Measurement], candidates: Sequence[Candidate]) -> Decision:
+def place(
+    needs: Needs,
+    measured: Mapping[str, Measurement],
+    candidates: Sequence[Candidate],
+    *,
+    image: str | None = None,
+    weights: Weights = Weights(),  # noqa: B008 (frozen)
+) -> Decision:
     """Choose a site.
 
-    Of those that fit, the one with the lowest measured round trip; then the nearest tier, the most free processor, and
-    the first by name. A robot that measured nothing towards a site does not rule it out.
+    Of those that fit, the one with the lowest score; at equal scores the nearest tier, then the first by name. A robot
+    that measured nothing towards a site does not rule it out: the site counts with the worst that the service bears.
     """
-    verdicts = [(site, _refuse(needs, measured.get(site.name, Measurement()), site)) for site in candidates]
+    verdicts = [(site, _refuse(needs, measured.get(site.name, Measurement()), site, image)) for site in candidates]
     fitting = [site for site, verdict in verdicts if verdict is None]
-    best = min(fitting, key=lambda site: _rank(site, measured.get(site.name)), default=None)
+    tiers = {site.name: _TIER_ORDER[site.tier] for site in fitting}
+    scores = [score(needs, measured.get(site.name, Measurement()), site, weights) for site in fitting]
+    scores.sort(key=lambda s: (s.total_ms, tiers[s.site], s.site))
     refused = tuple(verdict[0] for _, verdict in verdicts if verdict)
     hopeless = all(verdict is not None and verdict[1] for _, verdict in verdicts)
-    return Decision(best.name if best else None, refused, hopeless)
+    return Decision(scores[0].site if scores else None, refused, hopeless, tuple(scores))
 
 
-def _rank(site: Candidate, measured: Measurement | None) -> tuple[float, int, float, str]:
-    rtt = measured.rtt_ms if measured and measured.rtt_ms is not None else float("inf")
-    return rtt, _TIER_ORDER[site.tier], site.used.cpu - site.total.cpu, site.name
+def score(needs: Needs, measured: Measurement, site: Candidate, weights: Weights) -> Score:
+    """What an instance there would cost the robot, part by part, in milliseconds.
+
+    The delay of control is round trip (with its jitter), computing, and waiting for a processor: of a queue with random
+    arrivals (M/M/1), the time of service times u / (1 - u) at utilisation u, which is what was promised to instances or
+    what is busy, whichever is more, with this instance added.
+    """
+    if measured.rtt_ms is not None:
+        rtt = measured.rtt_ms + (measured.jitter_ms or 0.0)
+    else:
+        rtt = needs.max_rtt_ms if needs.max_rtt_ms is not None else weights.unmeasured_ms
+    compute = needs.compute_ms / site.speed
+    cores = max(site.total.cpu, 1e-9)
+    promised = (site.used.cpu + needs.cpu) / cores
+    busy = min(max(promised, site.load + needs.cpu / cores), _FULLEST)
+    return Score(
+        site=site.name,
+        rtt_ms=round(rtt, 3),
+        measured=measured.rtt_ms is not None,
+        compute_ms=round(compute, 3),
+        queue_ms=round(compute * busy / (1 - busy), 3),
+        cost_ms=round(weights.cost_ms * site.cost, 3),
+        spread_ms=round(weights.spread_ms * min(promised, 1.0), 3),
+    )
 
 
-def _refuse(needs: Needs, measured: Measurement, site: Candidate) -> tuple[Refusal, bool] | None:
+def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | None) -> tuple[Refusal, bool] | None:
     """Why not, and whether for good; None: it fits. What is for good comes first."""
 
     def no(reason: str, detail: str, *, for_good: bool = True) -> tuple[Refusal, bool]:
@@ -69,6 +117,11 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate) -> tuple[Refus
         return no("tier", f"is of tier {site.tier}, needed is {' or '.join(needs.tiers)}")
     if site.cannot_run is not None:
         return no("runtime", site.cannot_run)
+    if image is not None and not any(fnmatchcase(image, pattern) for pattern in site.images):
+        return no("image", f"allows images {', '.join(site.images) or '(none)'}, asked for is {image}")
+    if needs.architectures and site.total.architecture and site.total.architecture not in needs.architectures:
+        wanted = " or ".join(needs.architectures)
+        return no("architecture", f"is {site.total.architecture}, needed is {wanted}")
     if needs.max_rtt_ms is not None and measured.rtt_ms is not None and measured.rtt_ms > needs.max_rtt_ms:
         return no("rtt", f"round trip measured {measured.rtt_ms:g} ms, at most {needs.max_rtt_ms:g} ms allowed")
     if needs.max_loss is not None and measured.loss is not None and measured.loss > needs.max_loss:

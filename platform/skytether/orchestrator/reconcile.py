@@ -16,7 +16,7 @@ from .plan import Action, Crash, End, Expire, Place, Ready, Remove, Start, Stop,
 from .records import Record
 from .runtimes.base import Capacity, Launch, RuntimeFailure
 from .security import Secrets
-from .settings import Limits, Timing
+from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
 from .store import Store
 
@@ -40,6 +40,7 @@ class Reconciler:
         metrics: Metrics,
         timing: Timing,
         limits: Limits,
+        weights: Weights,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
     ) -> None:
@@ -49,6 +50,7 @@ class Reconciler:
         self._metrics = metrics
         self._timing = timing
         self._limits = limits
+        self._weights = weights
         self._clock = clock
         self._wake_placer = wake_placer
         self._pruned_at = 0.0
@@ -79,7 +81,8 @@ class Reconciler:
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
         used = _used(others)
         sites = [site.candidate(record.spec, used.get(site.name, NOTHING)) for site in self.sites.all()]
-        return place(record.spec.needs, measured, sites)
+        spec = record.spec
+        return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
 
     def _place(self, record: Record, placed: Sequence[Record]) -> Record | None:
         decision = self.weigh(record, placed)
@@ -95,7 +98,8 @@ class Reconciler:
         if moving is None:
             return None
         now = self._clock()
-        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site)
+        scores = [score.model_dump() for score in decision.scores]
+        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site, scores=scores)
         if chosen is not None:
             self._metrics.phase(chosen, "placing", now - record.created_at)
             self._wake_site(decision.site)
@@ -123,11 +127,13 @@ class Reconciler:
             if site.capacity is None:
                 site.capacity = site.runtime.capacity()
             observed = site.runtime.observe()
+            if due := time.monotonic() - site.tidied_at >= _TIDY:
+                site.load = site.runtime.load()
         except RuntimeFailure as error:
             if str(error) != site.failure:
                 log.warning("site %s: %s", site.name, error)
             site.failure = str(error)
-            site.capacity = None  # it may come back as another machine
+            site.capacity = site.load = None  # it may come back as another machine
             return self._timing.place
         site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
         strangers = observed.keys() - {record.id for record in live}
@@ -135,7 +141,7 @@ class Reconciler:
         actions = plan(live, observed, ended, self._clock(), self._timing)
         for action in actions:
             self._act(site, action)
-        if time.monotonic() - site.tidied_at >= _TIDY:
+        if due:
             site.tidied_at = time.monotonic()
             site.runtime.tidy()
         if actions or any(r.state in (State.STARTING, State.STOPPING) for r in live):

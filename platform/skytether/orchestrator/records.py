@@ -60,6 +60,8 @@ class Record:
     site: str | None = None
     refused: list[dict[str, Any]] = field(default_factory=list)
     """:class:`skytether.api.rest.Refusal` as JSON."""
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    """:class:`skytether.api.rest.Score` as JSON."""
     host: str | None = None
     port: int | None = None
     attempt: int = 1

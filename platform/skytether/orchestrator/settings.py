@@ -43,6 +43,20 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class Weights:
+    """What placement weighs against milliseconds of delay."""
+
+    cost_ms: float = 1.0
+    """Delay that one unit of a site's ``cost`` is worth."""
+    spread_ms: float = 2.0
+    """Delay that an empty site is worth beside a full one: a few milliseconds, so that near sites fill evenly."""
+    unmeasured_ms: float = 200.0
+    """Round trip reckoned for a site that was not measured, when the service names no ``max_rtt_ms``."""
+    migrate_ms: float = 20.0
+    """By how much another site must be better before an instance is moved there."""
+
+
+@dataclass(frozen=True)
 class Limits:
     """Bounds of what is kept and taken."""
 
@@ -80,3 +94,4 @@ class Settings:
     """True: ``/metrics`` needs no token."""
     timing: Timing = field(default_factory=Timing)
     limits: Limits = field(default_factory=Limits)
+    weights: Weights = field(default_factory=Weights)

@@ -98,6 +98,8 @@ class Site:
         self.asked = asked
         self.runtime = runtime
         self.capacity: Capacity | None = None
+        self.load: float | None = None
+        """Share of its processors that is busy; None: not known."""
         self.failure = ""
         """Why the last look failed; empty: it did not."""
         self.observed: Mapping[str, Observation] = {}
@@ -128,6 +130,10 @@ class Site:
             unreachable=self.unreachable or None,
             total=self.capacity or NOTHING,
             used=used,
+            load=self.load or 0.0,
+            speed=self.asked.speed,
+            cost=self.asked.cost,
+            images=self.asked.images,
         )
 
 

@@ -21,10 +21,16 @@ def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
         tier=asked.tier,
         runtime=asked.runtime,
         options=asked.options if caller.robot is None else {},  # how to reach an engine is no robot's business
+        speed=asked.speed,
+        cost=asked.cost,
+        images=asked.images,
         state="unreachable" if site.unreachable else "ready",
         reason=site.unreachable,
         cpu=total.cpu if total else None,
         memory_mb=total.memory_mb if total else None,
+        gpu=total.gpu if total else None,
+        architecture=total.architecture if total else "",
+        load=site.load,
         instances=len(core.store.live_at(asked.name)),
     )
 

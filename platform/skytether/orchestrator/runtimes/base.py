@@ -73,6 +73,8 @@ class Capacity:
     """Cores."""
     memory_mb: int
     gpu: int = 0
+    architecture: str = ""
+    """As container images name it, ``amd64`` or ``arm64``; empty: not known."""
 
 
 class RuntimeFailure(Exception):  # noqa: N818 (not an error of ours)
@@ -140,6 +142,16 @@ class Runtime(ABC):
     @abstractmethod
     def logs(self, instance: str, lines: int) -> str:
         """The last lines that all runs of the instance wrote; empty if there are none."""
+
+    def load(self) -> float | None:
+        """Share of the site's processors that is busy, whoever makes them so, 0 to 1; None: not known.
+
+        Called about once a second, after ``observe``.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+        return None
 
     def tidy(self) -> None:  # noqa: B027 (most need none)
         """Keep what grows within bounds (logs). Called about once a second."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import shutil
 import signal
 import socket
@@ -22,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil
 from pydantic import Field, model_validator
 from typing_extensions import override
 
@@ -35,6 +37,8 @@ _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
+_ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
+"""Names of container images for what the kernel says."""
 _LAST_LINE = 300
 """Characters of a log's last line that are told."""
 
@@ -114,7 +118,13 @@ class ProcessRuntime(Runtime):
 
     def capacity(self) -> Capacity:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
-        return Capacity(self._options.cpu or float(os.cpu_count() or 1), self._options.memory_mb or memory)
+        cpu = self._options.cpu or float(os.cpu_count() or 1)
+        machine = platform.machine()
+        return Capacity(cpu, self._options.memory_mb or memory, architecture=_ARCHITECTURES.get(machine, machine))
+
+    @override
+    def load(self) -> float | None:
+        return psutil.cpu_percent() / 100
 
     def start(self, launch: Launch) -> None:
         old = self._runs.get(launch.instance)
