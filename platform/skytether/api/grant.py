@@ -28,6 +28,10 @@ class Grant(Strict):
     session_key: Annotated[str, Field(repr=False)]
     """32 bytes, base64."""
     topics: tuple[TopicSpec, ...]
+    launch: str | None = None
+    """Of a service with a ROS graph of its own: its launch file, see the manifest."""
+    remap: dict[str, str] = {}
+    """Of such a service: names in its graph."""
     bind_host: str = "127.0.0.1"
     bind_port: int = 0
     """0: any free port; the one taken is told in ``ready_file``."""

@@ -15,8 +15,11 @@ Tier = Literal["robot", "edge", "cloud"]
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
+ROS1_ENTRYPOINT = "skytether.service.ros1"
 CALL_DEPTH = 64
 """Requests, and answers, that may be under way by default."""
+ACTION_NEWEST_LIFESPAN_MS = 1000
+"""Of an action's feedback and status, which come again and again."""
 
 
 class Strict(BaseModel):
@@ -30,9 +33,12 @@ class TopicSpec(Strict):
 
     name: Annotated[str, Field(min_length=1, max_length=255)]
     """``*`` takes any topic that the robot offers (direction ``in`` only), with this row's quality of service."""
-    kind: Literal["topic", "call"] = "topic"
+    kind: Literal["topic", "call", "action"] = "topic"
     """A call is asked in the row's direction and answered in the other; its type is that of a ROS service,
-    ``nav_msgs/srv/GetPlan``. It is reliable, and ``lifespan_ms`` and ``depth`` have defaults that suit it."""
+    ``nav_msgs/srv/GetPlan``. It is reliable, and ``lifespan_ms`` and ``depth`` have defaults that suit it.
+    An action's goals go in the row's direction; its type is that of a ROS action, ``move_base_msgs/action/MoveBase``.
+    It is carried on its five topics, the last three in the other direction: goal, cancel, result (these reliable),
+    feedback and status."""
     type: Annotated[str, Field(min_length=1, max_length=255)]
     """ROS 2 style name, ``geometry_msgs/msg/Twist``; ``*`` with name ``*``."""
     direction: Literal["in", "out"]
@@ -58,7 +64,7 @@ class TopicSpec(Strict):
     def _reliable_lives_long(cls, row: Any) -> Any:
         if not isinstance(row, dict):
             return row
-        if row.get("kind") == "call":
+        if row.get("kind") in ("call", "action"):
             row = {"reliable": True, "depth": CALL_DEPTH, **row}
         return {"lifespan_ms": RELIABLE_LIFESPAN_MS, **row} if row.get("reliable") else row
 
@@ -66,20 +72,37 @@ class TopicSpec(Strict):
     def _reliability_fits(self) -> TopicSpec:
         if self.latched and not self.reliable:
             raise ValueError("latched: true needs reliable: true")
-        if self.kind == "call" and (not self.reliable or self.latched or self.name == ANY_TOPIC):
-            raise ValueError("kind: call is reliable and not latched, and has a name of its own")
+        if self.kind != "topic" and (not self.reliable or self.latched or self.name == ANY_TOPIC):
+            raise ValueError(f"kind: {self.kind} is reliable and not latched, and has a name of its own")
         return self
 
     def rows(self) -> tuple[TopicSpec, ...]:
-        """The topics that carry it: itself, or the request and the response of a call."""
+        """The topics that carry it: itself, the request and the response of a call, or the five topics of an action."""
         if self.kind == "topic":
             return (self,)
         row = self.model_copy(update={"kind": "topic"})
         there, back = self.direction, "out" if self.direction == "in" else "in"
+        if self.kind == "action":
+            return self._action_rows(row, there, back)
         parts = (("request", "_Request", there), ("response", "_Response", back))
         return tuple(
             row.model_copy(update={"name": f"{self.name}/{part}", "type": self.type + suffix, "direction": direction})
             for part, suffix, direction in parts
+        )
+
+    def _action_rows(self, row: TopicSpec, there: str, back: str) -> tuple[TopicSpec, ...]:
+        kind = self.type.replace("/action/", "/msg/")
+        newest = {"reliable": False, "depth": 1, "lifespan_ms": ACTION_NEWEST_LIFESPAN_MS}
+        parts: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
+            ("goal", f"{kind}ActionGoal", there, {}),
+            ("cancel", "actionlib_msgs/msg/GoalID", there, {}),
+            ("feedback", f"{kind}ActionFeedback", back, newest),
+            ("result", f"{kind}ActionResult", back, {}),
+            ("status", "actionlib_msgs/msg/GoalStatusArray", back, newest),
+        )
+        return tuple(
+            row.model_copy(update={"name": f"{self.name}/{part}", "type": typ, "direction": direction, **quality})
+            for part, typ, direction, quality in parts
         )
 
     @model_validator(mode="after")
@@ -122,10 +145,36 @@ class ServiceSpec(Strict):
     """Container image; needed by container sites."""
     entrypoint: str | None = None
     """Python module with a ``__main__``; needed by process sites."""
+    graph: Literal["ros1"] | None = None
+    """``ros1``: a ROS 1 graph of its own, with unchanged nodes: ``launch`` says which. The entry point is then
+    ``skytether.service.ros1`` unless another is named, and the image one made on ``skytether/ros1-base``."""
+    launch: Annotated[str, Field(min_length=1, max_length=1024)] | None = None
+    """Launch file of the graph: an absolute path where the service runs, or ``package/file.launch``."""
+    remap: dict[str, str] = {}
+    """Names in the graph of the service's topics, calls and actions, where they are not those of its namespaces."""
     params: dict[str, Any] = {}
     """JSON schema (2020-12) of the parameters; ``additionalProperties`` is false unless it says otherwise."""
     topics: tuple[TopicSpec, ...] = ()
     needs: Needs = Needs()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _graphs_have_an_entry_point(cls, spec: Any) -> Any:
+        if isinstance(spec, dict) and spec.get("graph") == "ros1" and not spec.get("entrypoint"):
+            return {**spec, "entrypoint": ROS1_ENTRYPOINT}
+        return spec
+
+    @model_validator(mode="after")
+    def _graph_is_whole(self) -> ServiceSpec:
+        if self.graph is not None and self.launch is None:
+            raise ValueError(f"graph: {self.graph} needs launch: the launch file with the service's nodes")
+        if self.graph is None and (self.launch is not None or self.remap):
+            raise ValueError("launch and remap are for a service with a graph of its own; add graph: ros1")
+        known = {t.name for t in self.topics}
+        for name in self.remap:
+            if name not in known and ANY_TOPIC not in known:
+                raise ValueError(f"remap: the service has no topic '{name}'")
+        return self
 
     @model_validator(mode="after")
     def _can_run_and_names_are_unique(self) -> ServiceSpec:

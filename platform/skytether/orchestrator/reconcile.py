@@ -194,6 +194,8 @@ class Reconciler:
             session_id=record.session_id,
             session_key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
             topics=spec.topics,
+            launch=spec.launch,
+            remap=spec.remap,
         )
         return Launch(record.attempt, spec, grant)
 

@@ -32,6 +32,7 @@ from .arbiter import Needs
 from .asker import Asker, Orchestrator
 from .command import Source
 from .driver import Base, Driver, DriverStatus, Observer
+from .graph_base import Graph
 from .link import LinkMonitor
 from .session import Endpoint, LiveSession
 from .supervisor import Limits
@@ -130,6 +131,8 @@ class Agent:
     Args:
         config: What to do.
         base: The robot's hardware.
+        graph: The robot's graph, if it has one: what the service takes in and gives out then goes by it as bytes, all
+            but the command topic.
         observer: Told each command from the cloud; must return at once.
         client: The orchestrator; made from the configuration if not given.
         bridge: Makes the robot's end of the bridge.
@@ -145,6 +148,7 @@ class Agent:
         config: AgentConfig,
         base: Base,
         *,
+        graph: Graph | None = None,
         observer: Observer | None = None,
         client: Orchestrator | None = None,
         bridge: MakeBridge | None = None,
@@ -153,6 +157,7 @@ class Agent:
     ) -> None:
         self._config = config
         self._base = base
+        self._graph = graph
         self._clock = clock
         self._make_bridge = bridge or (
             lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
@@ -188,7 +193,7 @@ class Agent:
 
     def start(self) -> None:
         """Start driving and asking; returns at once."""
-        warm([*self._base.topics.values(), Twist], "cdr")
+        warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
         for target in (self._control, self._ask, self._watch):
             thread = threading.Thread(target=target, name=f"agent{target.__name__}", daemon=True)
@@ -303,11 +308,16 @@ class Agent:
             if (topic.name, topic.direction) == (self._config.command_topic, "out") and topic.type != Twist.TYPE:
                 # Bytes of another type may well decode: a Wrench has the shape of a Twist.
                 raise ValueError(f"the service's {topic.name} is a {topic.type}, and only a {Twist.TYPE} may drive")
-        topics = robot_table(granted.topics, offers(self._base.topics))
+        command = self._config.command_topic
+        if self._graph is None:
+            topics = robot_table(granted.topics, offers(self._base.topics))
+            names = frozenset(topic.name for topic in topics)
+            session = LiveSession(granted.id, names, command, self._epochs)
+        else:
+            topics, port = self._graph.open(granted.topics, command)
+            encoding = self._graph.encoding
+            session = LiveSession(granted.id, frozenset(), command, self._epochs, encoding=encoding, graph=port)
         spec = SessionSpec(parse_id(granted.id), parse_key(granted.key), Role.ROBOT, topics)
-        session = LiveSession(
-            granted.id, frozenset(topic.name for topic in topics), self._config.command_topic, self._epochs
-        )
         session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
         return session
 

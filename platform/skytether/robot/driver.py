@@ -13,7 +13,7 @@ from math import nan
 from typing import Protocol
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import DecodeError, Message, Twist, Vector3, decode
+from skytether.messages import DecodeError, Encoding, Message, Twist, Vector3, decode
 from skytether.wire.events import MessageReceived
 
 from . import arbiter, supervisor
@@ -195,7 +195,7 @@ class Driver:
             return
         for epoch, message in self.session.take():
             try:
-                command = _command(epoch, message)
+                command = _command(epoch, message, self.session.encoding)
             except DecodeError as error:
                 self._caught("decode", error)
                 continue
@@ -272,8 +272,8 @@ class Driver:
             _log.error("%s failed, further ones are counted only: %s", part, error, exc_info=error)
 
 
-def _command(epoch: int, message: MessageReceived) -> Command:
-    twist = decode(Twist, message.payload)
+def _command(epoch: int, message: MessageReceived, encoding: Encoding) -> Command:
+    twist = decode(Twist, message.payload, encoding)
     return Command(
         source=Source.CLOUD,
         linear=twist.linear.x,

@@ -12,7 +12,7 @@ from itertools import count
 from typing import Protocol
 
 from skytether.bridge.port import Port, Publisher
-from skytether.messages import Message, encode
+from skytether.messages import Encoding, Message, encode
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived, Refused
 from skytether.wire.stats import SessionStats
 
@@ -47,13 +47,26 @@ class LiveSession:
 
     Args:
         id: The session's, to tell it from the next.
-        topics: What the robot may send in it.
+        topics: What the robot's control loop may send in it.
         command_topic: What it waits for.
         epochs: Numbers of handshakes, shared with the sessions before and after it.
+        encoding: Of its messages, both ways.
+        graph: Port of the robot's graph, which takes every other message and is told every event.
     """
 
-    def __init__(self, id: str, topics: frozenset[str], command_topic: str, epochs: count[int]) -> None:  # noqa: A002
+    def __init__(
+        self,
+        id: str,  # noqa: A002
+        topics: frozenset[str],
+        command_topic: str,
+        epochs: count[int],
+        *,
+        encoding: Encoding = "cdr",
+        graph: Port | None = None,
+    ) -> None:
         self.id = id
+        self.encoding = encoding
+        self._graph = graph
         self.connected = False
         self.bridge: Endpoint | None = None
         self.peer: tuple[str, int] | None = None
@@ -84,7 +97,7 @@ class LiveSession:
     def publish(self, topic: str, message: Message) -> None:
         """Send a reading if the service takes it."""
         if self.connected and self.bridge is not None and topic in self._topics:
-            self.bridge.publish(topic, encode(message, "cdr"))
+            self.bridge.publish(topic, encode(message, self.encoding))
 
     def take(self) -> list[tuple[int, MessageReceived]]:
         """What arrived since the last call, with the number of its handshake, oldest first."""
@@ -94,12 +107,16 @@ class LiveSession:
         return taken
 
     def attach(self, publisher: Publisher) -> None:
-        """Port: nothing is needed from the bridge at this point."""
+        """Port: the graph sends through it."""
+        if self._graph is not None:
+            self._graph.attach(publisher)
 
     def deliver(self, message: MessageReceived) -> None:
-        """Port: keep commands; nothing else is waited for."""
+        """Port: keep commands; the rest is the graph's."""
         if message.topic == self._command_topic:
             self._arrived.append((self._epoch, message))
+        elif self._graph is not None:
+            self._graph.deliver(message)
 
     def notify(self, event: Event) -> None:
         """Port: know what is up."""
@@ -110,3 +127,5 @@ class LiveSession:
             self.connected = False
         elif isinstance(event, Refused):
             _log.error("the service refused the session: %s", event.reason)
+        if self._graph is not None:
+            self._graph.notify(event)

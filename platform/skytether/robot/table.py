@@ -37,7 +37,7 @@ def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, enco
         offers: The robot's, by name.
         encoding: In which the robot wants the service's topics.
     """
-    everything = list(specs)
+    everything = [row for spec in specs for row in (spec.rows() if spec.kind == "action" else (spec,))]
     rows = [spec for spec in everything if spec.kind == "topic"]
     named = {spec.name: spec for spec in rows}
     anything = named.pop(ANY_TOPIC, None)

@@ -1,0 +1,192 @@
+"""The configuration of ``skytether robot run``: what people write in robot.yaml."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from skytether.api.manifest import Name, Strict
+from skytether.messages import type_of
+from skytether.robot.supervisor import Limits
+from skytether.ros.names import Generation, check_name
+
+from .bridge_config import LocalNetwork
+from .config_file import ConfigError, Endpoint, read_config
+
+DEFAULT_MASTER = "http://localhost:11311"
+
+
+class FallbackConfig(Strict):
+    """The robot's own controller."""
+
+    name: Annotated[str, Field(min_length=1)] = "stop"
+    """Entry point of the group ``skytether.fallbacks``."""
+    options: dict[str, Any] = {}
+
+
+class GraphConfig(Strict):
+    """What a robot's graph has in either generation of ROS. Names: absolute, or in ``namespace``."""
+
+    namespace: str | None = None
+    """Where the robot's topics are; null: under the robot's name."""
+    remap: dict[str, str] = {}
+    """The graph's names of the service's topics, calls and actions, of ``cmd_vel`` and of the readings."""
+    cmd_vel: Annotated[str, Field(min_length=1)] = "cmd_vel"
+    """What the wheels listen to."""
+    idle_s: Annotated[float, Field(gt=0)] | None = 1.0
+    """Seconds that a standstill is told before ``cmd_vel`` is left to others; null: for ever."""
+    readings: dict[str, str] = {}
+    """What the robot's own control reads, name to type: ``{force: geometry_msgs/msg/WrenchStamped}``."""
+    topics: tuple[str, ...] = ()
+    """What is sent to a service that takes any topic, such as the recorder."""
+
+    @field_validator("readings")
+    @classmethod
+    def _known_types(cls, readings: dict[str, str]) -> dict[str, str]:
+        for name, kind in readings.items():
+            try:
+                type_of(kind)
+            except KeyError as error:
+                raise ValueError(f"{name}: {error.args[0]}") from None
+        return readings
+
+    def check_names(self, ros: Generation) -> None:
+        """Refuse what this generation refuses.
+
+        Raises:
+            ValueError: The text names the key.
+        """
+        named = {"namespace": self.namespace, "cmd_vel": self.cmd_vel}
+        named.update({f"remap.{key}": value for key, value in self.remap.items()})
+        named.update({f"topics.{i}": value for i, value in enumerate(self.topics)})
+        for key, value in named.items():
+            try:
+                if value is not None:
+                    check_name(value, ros)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from None
+
+
+class Ros1Config(GraphConfig):
+    """A ROS 1 graph."""
+
+    master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
+    """Address of the master; without it ``ROS_MASTER_URI``, or this machine's."""
+    host: str | None = None
+    """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
+    node: Annotated[str, Field(min_length=1)] = "skytether"
+    """Name of the node in the graph."""
+    params: tuple[str, ...] = ()
+    """Parameters that the service's graph gets, by name or namespace: ``/robot_description``."""
+    use_sim_time: bool | None = None
+    """Whether /clock tells the time; null: as the master's parameter /use_sim_time says."""
+
+    @field_validator("master")
+    @classmethod
+    def _an_address(cls, uri: str) -> str:
+        if not uri.startswith("http://"):
+            raise ValueError(f"must be an address such as {DEFAULT_MASTER}, not '{uri}'")
+        return uri
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros1Config:
+        self.check_names(1)
+        for i, name in enumerate(self.params):
+            try:
+                check_name(name)
+            except ValueError as error:
+                raise ValueError(f"params.{i}: {error}") from None
+        return self
+
+
+class RobotConfig(Strict):
+    """The whole file."""
+
+    robot: Name
+    """As it is registered: ``skytether robot add NAME``."""
+    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="http://HOST:PORT")]
+    token_file: Path
+    """Holds the token that the registration printed; relative to this file's folder."""
+    service: Name
+    params: dict[str, Any] = {}
+    """The service's."""
+    command_topic: Annotated[str, Field(min_length=1)] = "cmd_vel"
+    """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
+    fallback: FallbackConfig = FallbackConfig()
+    limits: dict[str, float] = {}
+    """What the wheels may do: fields of ``skytether.robot.supervisor.Limits``."""
+    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Of the robot's control loop."""
+    bind: Endpoint = Endpoint(host="0.0.0.0")  # noqa: S104 - a robot has one network or several
+    paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
+    """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
+    ros1: Ros1Config | None = None
+
+    @field_validator("fallback", mode="before")
+    @classmethod
+    def _name_alone(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("limits")
+    @classmethod
+    def _they_limit(cls, limits: dict[str, float]) -> dict[str, float]:
+        known = [f.name for f in fields(Limits)]
+        for name in limits:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                guess = f", did you mean {near[0]!r}?" if near else ""
+                raise ValueError(f"{name}: unknown key{guess}; allowed are {', '.join(known)}")
+        try:
+            Limits(**limits)
+        except ValueError as error:
+            raise ValueError(str(error).removeprefix("limits: ")) from None
+        return limits
+
+    @model_validator(mode="after")
+    def _has_a_graph(self) -> RobotConfig:
+        if self.ros1 is None:
+            raise ValueError("ros1: is missing; it says which graph the robot is (an empty one is written: ros1: {})")
+        return self
+
+
+def load_config(path: Path) -> RobotConfig:
+    """Read and check a robot.yaml.
+
+    Raises:
+        ConfigError: It cannot be read, is no YAML, or a key is wrong.
+    """
+    return read_config(path, RobotConfig)
+
+
+def load_token(settings: RobotConfig, folder: Path) -> str:
+    """Read the robot's token.
+
+    Args:
+        settings: Name the file.
+        folder: That its path is relative to.
+
+    Raises:
+        ConfigError: It is missing, empty, open to others, or no text.
+    """
+    path = folder / settings.token_file
+    try:
+        with path.open("rb") as file:
+            others = os.fstat(file.fileno()).st_mode & 0o077
+            token = file.read(4096).decode("ascii").strip()
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read token_file {path}: {error.strerror}; register the robot with: skytether robot add "
+            f"{settings.robot} > {path}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"token_file {path} holds no token but other bytes") from error
+    if others:
+        raise ConfigError(f"token_file {path} is open to other users; close it with: chmod 600 {path}")
+    if not token:
+        raise ConfigError(f"token_file {path} is empty; it must hold the token that 'skytether robot add' printed")
+    return token

@@ -1,0 +1,54 @@
+import pytest
+from pydantic import ValidationError
+
+from skytether.api.manifest import ROS1_ENTRYPOINT, ServiceSpec, TopicSpec
+from skytether.bridge.spec import topics_from_api
+from skytether.wire.topic import Role
+
+MOVE = {"name": "move_base", "kind": "action", "type": "move_base_msgs/action/MoveBase", "direction": "in"}
+
+
+def test_an_action_is_carried_on_its_five_topics_each_as_it_needs():
+    goal, cancel, feedback, result, status = topics_from_api([TopicSpec(**MOVE, priority=90)])
+    assert (goal.name, goal.type) == ("move_base/goal", "move_base_msgs/msg/MoveBaseActionGoal")
+    assert (cancel.name, cancel.type) == ("move_base/cancel", "actionlib_msgs/msg/GoalID")
+    assert (feedback.name, feedback.type) == ("move_base/feedback", "move_base_msgs/msg/MoveBaseActionFeedback")
+    assert (result.name, result.type) == ("move_base/result", "move_base_msgs/msg/MoveBaseActionResult")
+    assert (status.name, status.type) == ("move_base/status", "actionlib_msgs/msg/GoalStatusArray")
+    assert [t.direction.sender for t in (goal, cancel)] == [Role.ROBOT, Role.ROBOT]
+    assert [t.direction.sender for t in (feedback, result, status)] == 3 * [Role.SERVICE]
+    assert [t.reliable for t in (goal, cancel, feedback, result, status)] == [True, True, False, True, False]
+    assert {t.priority for t in (goal, cancel, feedback, result, status)} == {90}
+    assert (goal.depth, feedback.depth, feedback.lifespan, goal.lifespan) == (64, 1, 1.0, 60.0)
+
+
+def test_an_action_of_the_service_goes_the_other_way():
+    rows = TopicSpec(**{**MOVE, "direction": "out"}).rows()
+    assert [row.direction for row in rows] == ["out", "out", "in", "in", "in"]
+
+
+def test_an_action_is_neither_latched_nor_unreliable():
+    for more in ({"latched": True}, {"reliable": False}):
+        with pytest.raises(ValidationError, match="kind: action is reliable and not latched"):
+            TopicSpec(**MOVE, **more)
+
+
+def test_a_service_with_a_graph_needs_only_its_launch_file():
+    spec = ServiceSpec(graph="ros1", launch="/launch/nav.launch", topics=[MOVE], remap={"move_base": "/move_base"})
+    assert spec.entrypoint == ROS1_ENTRYPOINT
+    assert ServiceSpec(graph="ros1", launch="a/b.launch", entrypoint="own").entrypoint == "own"
+
+
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        ({"graph": "ros1"}, "needs launch"),
+        ({"entrypoint": "x", "launch": "/a.launch"}, "add graph: ros1"),
+        ({"entrypoint": "x", "remap": {"a": "/b"}}, "add graph: ros1"),
+        ({"graph": "ros1", "launch": "/a.launch", "remap": {"scan": "/x"}}, "the service has no topic 'scan'"),
+        ({"graph": "yarp", "launch": "/a.launch", "entrypoint": "x"}, "graph"),
+    ],
+)
+def test_what_does_not_fit_together_is_named(spec, says):
+    with pytest.raises(ValidationError, match=says):
+        ServiceSpec(**spec)

@@ -1,0 +1,103 @@
+import pytest
+
+from skytether.cli.config_file import ConfigError
+from skytether.cli.robot_config import DEFAULT_MASTER, load_config, load_token
+
+LEAST = """
+robot: walker
+orchestrator: http://127.0.0.1:8080
+token_file: walker.token
+service: virtual-trail
+"""
+
+
+@pytest.fixture
+def read(tmp_path, monkeypatch):
+    monkeypatch.delenv("ROS_MASTER_URI", raising=False)
+
+    def read(more="ros1: {}"):
+        path = tmp_path / "robot.yaml"
+        path.write_text(LEAST + more)
+        return load_config(path)
+
+    return read
+
+
+def test_little_need_be_written(read):
+    settings = read()
+    assert settings.ros1.master == DEFAULT_MASTER
+    assert settings.fallback.name == "stop"
+    assert settings.limits == {}
+
+
+def test_the_environment_names_the_master(read, monkeypatch):
+    monkeypatch.setenv("ROS_MASTER_URI", "http://robot:11311")
+    assert read().ros1.master == "http://robot:11311"
+
+
+def test_everything_can_be_written(read):
+    settings = read(
+        """
+params: {stiffness: 3}
+fallback: {name: admittance, options: {mass: 3.0}}
+limits: {linear_max: 0.5}
+rate_hz: 50
+ros1:
+  master: http://10.0.0.2:11311
+  host: 10.0.0.2
+  node: cloud/skytether
+  namespace: /
+  remap: {force: /wrench}
+  cmd_vel: /base/cmd_vel
+  idle_s: null
+  readings: {force: geometry_msgs/msg/WrenchStamped}
+  topics: [/camera/image]
+  params: [/robot_description]
+  use_sim_time: true
+"""
+    )
+    assert settings.fallback.options == {"mass": 3.0}
+    assert settings.ros1.idle_s is None
+    assert read("fallback: admittance\nros1: {}").fallback.name == "admittance"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "ros1: is missing"),
+        ("ros1: {mastr: http://x}", "ros1.mastr: unknown key, did you mean 'master'"),
+        ("ros1: {master: localhost}", "ros1.master: must be an address such as http://"),
+        ("ros1: {}\nservise: x", "servise: unknown key, did you mean 'service'"),
+        ("ros1: {}\nlimits: {linear_mx: 1}", "linear_mx: unknown key, did you mean 'linear_max'"),
+        ("ros1: {}\nlimits: {linear_max: .nan}", "linear_max must be above 0"),
+        ("ros1: {}\nlimits: {linear_max: .inf}", "linear_max must be above 0 and finite"),
+        ("ros1: {remap: {scan: 3 d}}", "remap.scan: '3 d' is no name of a graph"),
+        ("ros1: {params: ['/a//b']}", "params.0: '/a//b' is no name"),
+        ("ros1: {readings: {force: std_msgs/msg/Nothing}}", "ros1.readings: force: no message type"),
+        ("ros1: {idle_s: 0}", "ros1.idle_s"),
+    ],
+)
+def test_a_mistake_is_named_by_its_key(read, text, says):
+    with pytest.raises(ConfigError) as told:
+        read(text)
+    assert says in str(told.value)
+
+
+def test_a_token_is_read_from_a_file_that_nobody_else_may_read(read, tmp_path):
+    settings = read()
+    path = tmp_path / "walker.token"
+    with pytest.raises(ConfigError, match="skytether robot add walker"):
+        load_token(settings, tmp_path)
+    path.write_text("secret\n")
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600") as told:
+        load_token(settings, tmp_path)
+    assert "secret" not in str(told.value)
+    path.chmod(0o600)
+    assert load_token(settings, tmp_path) == "secret"
+    path.write_text("\n")
+    with pytest.raises(ConfigError, match="is empty"):
+        load_token(settings, tmp_path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="no token"):
+        load_token(settings, tmp_path)
