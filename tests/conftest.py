@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import signal
+import socket
 import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
@@ -77,3 +82,74 @@ def docker_engine() -> str:
     if subprocess.run(["docker", "image", "inspect", "debian:bookworm-slim"], capture_output=True).returncode:
         require("docker", "the engine has no image debian:bookworm-slim")
     return asked.stdout.strip()
+
+
+@dataclass(frozen=True)
+class PostgresServer:
+    """A server of its own on loopback, which a test may stop, kill and start again."""
+
+    folder: Path
+    port: int
+
+    @property
+    def url(self) -> str:
+        return f"postgresql://skytether@127.0.0.1:{self.port}/postgres"
+
+    def control(self, *arguments: str) -> None:
+        """``pg_ctl``, as the user that the server runs as."""
+        program = max(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
+        command = [
+            str(program),
+            "-D",
+            str(self.folder / "data"),
+            "-s",
+            "-w",
+            "-l",
+            str(self.folder / "log"),
+            *arguments,
+        ]
+        subprocess.run([*as_postgres(), *command], check=True, cwd="/", stdout=subprocess.DEVNULL)
+
+    def start(self) -> None:
+        self.control("-o", f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories=", "start")
+
+    def stop(self, mode: str = "immediate") -> None:
+        self.control("-m", mode, "stop")
+
+
+def as_postgres() -> list[str]:
+    """The server refuses to run as root."""
+    return ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if os.geteuid() == 0 else []
+
+
+@pytest.fixture(scope="session")
+def postgres_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PostgresServer]:
+    """A PostgreSQL server, for tests marked ``postgres``; see ``postgres`` for an empty database."""
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+    if not programs:
+        require("postgres", "there is no PostgreSQL server: install postgresql")
+    folder = Path(tempfile.mkdtemp(prefix="skytether-pg-"))
+    if os.geteuid() == 0:
+        shutil.chown(folder, "postgres", "postgres")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    make = [str(programs[-1] / "initdb"), "-D", str(folder / "data"), "-U", "skytether", "-A", "trust", "--no-sync"]
+    subprocess.run([*as_postgres(), *make], check=True, cwd="/", stdout=subprocess.DEVNULL)
+    server = PostgresServer(folder, port)
+    server.start()
+    yield server
+    server.stop()
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def postgres(postgres_server: PostgresServer) -> Iterator[str]:
+    """The address of an empty database."""
+    import psycopg
+
+    name = f"test_{secrets.token_hex(6)}"
+    with psycopg.connect(postgres_server.url, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+    yield f"{postgres_server.url.rpartition('/')[0]}/{name}"
+    with psycopg.connect(postgres_server.url, autocommit=True) as connection:
+        connection.execute(f"DROP DATABASE {name} WITH (FORCE)")

@@ -20,6 +20,13 @@ def record_with(new_record: NewRecord, manifest: Any, *topics: str, **changes: A
     return new_record(manifest=manifest(topics=rows), site="lab", **changes)
 
 
+def reported(running: list[Running], max_topics: int = 64) -> tuple[Metrics, Callable[[Record, Report], None]]:
+    """Metrics, and what takes a robot's report as the orchestrator does."""
+    reports: dict[str, Report] = {}
+    metrics = Metrics(lambda: running, max_topics, reports=lambda: reports)
+    return metrics, lambda record, report: reports.update({record.id: metrics.bounded(record, report)})
+
+
 def topic(name: str = "scan", **more: Any) -> TopicReport:
     return TopicReport(topic=name, direction="in", priority=100, **more)
 
@@ -27,10 +34,10 @@ def topic(name: str = "scan", **more: Any) -> TopicReport:
 def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord, manifest: Any) -> None:
     record = record_with(new_record, manifest, "scan")
     running = [Running(record, Observation(1, Phase.RUNNING, cpu_s=1.5, memory_bytes=1000))]
-    metrics = Metrics(lambda: running, 64)
+    metrics, report = reported(running)
     metrics.phase(record, "total", 0.4)
     metrics.refused("toy", [Refusal(site="far", reason="rtt", detail="")])
-    metrics.report(
+    report(
         record,
         Report(
             rtt_s=0.1,
@@ -79,8 +86,8 @@ def sample(text: str, name: str, labels: str) -> float | None:
 def test_series_vanish_with_the_instance(new_record: NewRecord, manifest: Any) -> None:
     record = record_with(new_record, manifest, "scan")
     running = [Running(record, None)]
-    metrics = Metrics(lambda: running, 64)
-    metrics.report(record, Report(rtt_s=0.1, topics=(topic(sent=1),), control_source="cloud"))
+    metrics, report = reported(running)
+    report(record, Report(rtt_s=0.1, topics=(topic(sent=1),), control_source="cloud"))
     assert 'robot="walker"' in metrics.text().decode()
     running.clear()
     assert 'robot="walker"' not in metrics.text().decode()
@@ -100,9 +107,9 @@ def test_series_vanish_with_the_site_and_the_service(new_record: NewRecord) -> N
 
 def test_two_instances_of_one_robot_add_up(new_record: NewRecord, manifest: Any) -> None:
     records = [record_with(new_record, manifest, "scan", name=name) for name in ("a", "b")]
-    metrics = Metrics(lambda: [Running(r, Observation(1, Phase.RUNNING, memory_bytes=10)) for r in records], 64)
+    metrics, report = reported([Running(r, Observation(1, Phase.RUNNING, memory_bytes=10)) for r in records])
     for record in records:
-        metrics.report(record, Report(topics=(topic(sent=3, jitter_s=0.5),), rtt_s=0.2))
+        report(record, Report(topics=(topic(sent=3, jitter_s=0.5),), rtt_s=0.2))
     text = metrics.text().decode()
     one = 'direction="in",outcome="sent",priority="100",robot="walker",service="toy",topic="scan"'
     assert sample(text, "topic_messages_total", one) == 6
@@ -113,11 +120,11 @@ def test_two_instances_of_one_robot_add_up(new_record: NewRecord, manifest: Any)
 def test_no_robot_can_blow_up_the_number_of_series(new_record: NewRecord, manifest: Any) -> None:
     fixed = record_with(new_record, manifest, "scan", name="a")
     wild = record_with(new_record, manifest, "*", name="b", robot="other")
-    metrics = Metrics(lambda: [Running(fixed, None), Running(wild, None)], max_topics=5)
+    metrics, report = reported([Running(fixed, None), Running(wild, None)], max_topics=5)
     many = tuple(topic(f"t{n}") for n in range(1000))
     reasons = {f"reason_{n}": 1 for n in range(1000)} | {'evil"\n': 1}
     for record in (fixed, wild):
-        metrics.report(record, Report(topics=many, fallback_transitions=reasons, control_source="x" * 1000))
+        report(record, Report(topics=many, fallback_transitions=reasons, control_source="x" * 1000))
     text = metrics.text().decode()
     assert 'robot="walker",service="toy",topic=' not in text
     assert len(set(re.findall(r'topic="(t\d+)"', text))) == 5

@@ -42,6 +42,9 @@ class FixedSites:
     def find(self, name: str | None) -> Site | None:
         return self._sites.get(name or "")
 
+    def refresh(self) -> None:
+        """Nobody adds or deletes any."""
+
 
 class Bench:
     """A reconciler over one site, ``lab``."""

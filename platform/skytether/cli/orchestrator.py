@@ -30,6 +30,10 @@ def run(
         str | None,
         typer.Option(help="SQLAlchemy URL; without it SQLite in the state folder.", envvar="SKYTETHER_DATABASE"),
     ] = None,
+    secrets_dir: Annotated[
+        Path | None,
+        typer.Option(help="Folder of secret.key and operator.token, the same for all orchestrators over one database."),
+    ] = None,
     stop_instances: Annotated[
         bool, typer.Option("--stop-instances", help="End all instances at shutdown; otherwise they run on.")
     ] = False,
@@ -55,6 +59,7 @@ def run(
         host=host,
         port=port,
         database_url=database,
+        secrets_dir=secrets_dir.absolute() if secrets_dir else None,
         catalogue_dir=catalog,
         stop_instances=stop_instances,
         open_metrics=open_metrics,

@@ -142,12 +142,11 @@ def _stream(flows: list[_Flow], first: LinkEmulator, robot: Bridge, variant: str
     start, wait = time.monotonic(), threading.Event()
     planned = start + at if variant == "planned" else float("inf")
     cut = start + at + (BREAK_AFTER if variant == "planned" else 0.0)
-    due = start
-    while due < start + seconds:
+    for number in range(round(seconds / PERIOD)):
+        due = start + number * PERIOD  # reckoned anew: sums of a tenth of a tenth drift
         wait.wait(max(0.0, due - time.monotonic()))
         for flow in flows:
             flow.send()
-        due += PERIOD
         if due >= planned:
             robot.set_cost(first.address[0], 200)
             planned = float("inf")

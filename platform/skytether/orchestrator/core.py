@@ -6,15 +6,18 @@ import logging
 import time
 from collections.abc import Callable
 
+from skytether.api.rest import Report
+
 from .access import Access
 from .catalogue import Catalogue
 from .events import Broker
 from .instances import Instances
+from .leader import Leadership
 from .loops import Loop
 from .metrics import Metrics, Running, SiteGauges
 from .reconcile import Reconciler
 from .runtimes.base import Runtime
-from .security import Secrets
+from .security import SecretFileError, Secrets
 from .settings import Settings
 from .sites import Sites, load_runtime
 from .store import Store
@@ -22,6 +25,8 @@ from .store import Store
 log = logging.getLogger(__name__)
 
 _STOP_POLL = 0.02
+_FIRST_LOOK = 5.0
+"""Seconds that the database gets to say who leads, before requests are answered all the same."""
 
 
 class Orchestrator:
@@ -41,16 +46,17 @@ class Orchestrator:
             find_runtime: Gives a runtime by its name; by entry point unless told otherwise.
 
         Raises:
-            SecretFileError: A file in the state folder cannot be used.
+            SecretFileError: A file that holds a secret cannot be used.
         """
         settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.settings = settings
         self._clock = clock
-        secrets = Secrets(settings.state_dir)
+        secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         self.store = Store(settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}")
         self.broker = Broker()
         self.store.on_change = self.broker.publish
-        self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges)
+        self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges, self._reports)
+        self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
         self.access = Access(self.store, secrets, clock)
         self.reconciler = Reconciler(
@@ -62,12 +68,14 @@ class Orchestrator:
             settings.weights,
             clock,
             self._wake_placer,
+            lambda: self.leadership.leads,
         )
         self.sites = Sites(
             settings.state_dir / "sites", self.store, self.reconciler.site_step, settings.timing, find_runtime
         )
         self.reconciler.sites = self.sites
         self.placer = Loop("placer", self.reconciler.place_step, time.monotonic)
+        self.elector = Loop("elector", self.leadership.step, time.monotonic)
         self.instances = Instances(
             self.store, self.catalogue, self.sites, self.reconciler, self.metrics, secrets, clock, self._wake_placer
         )
@@ -80,12 +88,22 @@ class Orchestrator:
 
         Raises:
             InvalidError: The catalogue's folder is wrong.
+            SecretFileError: The database belongs to orchestrators with another secret key.
         """
         self.catalogue.load(self.settings.catalogue_dir)
         self.store.migrate()
-        self.store.extend_leases(self._clock())
+        if not self.store.agree("secret.key", self._secrets.fingerprint):
+            raise SecretFileError(
+                "the database belongs to orchestrators with another secret.key: give this one the same (--secrets-dir)"
+            )
+        self.elector.start()
+        self.elector.wait_first(_FIRST_LOOK)
         self.sites.start()
         self.placer.start()
+
+    def _elected(self) -> None:
+        self.store.extend_leases(self._clock())  # nobody could renew while there was no orchestrator at all
+        self.sites.reopen()
 
     def stop(self) -> None:
         """Stop reconciling; with ``stop_instances`` end all instances first, otherwise they run on."""
@@ -94,6 +112,8 @@ class Orchestrator:
             self._stop_instances()
         self.placer.stop(timeout=1.0)
         self.sites.stop()
+        self.elector.stop(timeout=1.0)
+        self.leadership.end()
         self.store.close()
 
     def _stop_instances(self) -> None:
@@ -119,6 +139,8 @@ class Orchestrator:
         return ""
 
     def _running(self) -> list[Running]:
+        if not self.leadership.leads:
+            return []  # the one that leads exports them
         running = []
         for record in self.store.live():
             site = self.sites.find(record.site)
@@ -126,7 +148,14 @@ class Orchestrator:
             running.append(Running(record, seen))
         return running
 
+    def _reports(self) -> dict[str, Report]:
+        if not self.leadership.leads:
+            return {}
+        return {instance: Report.model_validate(report) for instance, report in self.store.reports().items()}
+
     def _site_gauges(self) -> list[SiteGauges]:
+        if not self.leadership.leads:
+            return []
         return [
             SiteGauges(site.name, None if site.unreachable else site.capacity, site.load) for site in self.sites.all()
         ]

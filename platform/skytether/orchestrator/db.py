@@ -4,7 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import InterfaceError, OperationalError
+
+GONE = (OperationalError, InterfaceError)
+"""What the drivers raise when the database does not answer (or, SQLite, its disk is full)."""
+
+MIGRATING, LEADING = 0x736B7901, 0x736B7902
+"""Keys of PostgreSQL's advisory locks: who migrates, who leads."""
+_POSTGRES = {
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "options": "-c statement_timeout=10000 -c idle_in_transaction_session_timeout=30000",
+}
+"""A server that is gone is noticed within seconds, and a statement that hangs is ended (milliseconds)."""
 
 
 def make_engine(url: str) -> Engine:
@@ -13,8 +28,14 @@ def make_engine(url: str) -> Engine:
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
     sync to disk (a power cut may lose the last moments, a crash of the program does not). Transactions on an engine
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
+
+    PostgreSQL: a connection is tried before it is used, for the server may have been restarted since.
     """
-    engine = create_engine(url)
+    address = make_url(url)
+    if address.get_backend_name() == "postgresql":
+        address = address.set(drivername="postgresql+psycopg")
+        return create_engine(address, pool_pre_ping=True, connect_args=dict(_POSTGRES))
+    engine = create_engine(address)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
@@ -33,13 +54,15 @@ def _begin_sqlite(connection: Connection) -> None:
 
 
 def migrate(engine: Engine) -> None:
-    """Bring the database to the newest schema; does nothing to one that has it."""
+    """Bring the database to the newest schema; does nothing to one that has it. One at a time, where several start."""
     from alembic import command  # Alembic is slow to import, and only needed here
     from alembic.config import Config
 
     config = Config()
     config.set_main_option("script_location", "skytether.orchestrator:migrations")
     config.set_main_option("path_separator", "os")
-    with engine.begin() as connection:
+    with engine.execution_options(immediate=True).begin() as connection:
+        if engine.dialect.name == "postgresql":
+            connection.execute(text(f"SELECT pg_advisory_xact_lock({MIGRATING})"))
         config.attributes["connection"] = connection
         command.upgrade(config, "head")

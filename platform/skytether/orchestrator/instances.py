@@ -122,7 +122,8 @@ class Instances:
         if renewed is None:
             return self._store.get(instance) or seen
         if renew.report is not None:
-            self._metrics.report(renewed, renew.report)
+            report = self._metrics.bounded(renewed, renew.report)
+            self._store.report(instance, self._clock(), report.model_dump(mode="json"))
         return renewed
 
     def delete(self, principal: Principal, instance: str) -> None:

@@ -1,13 +1,12 @@
 """What Prometheus gets. Series exist while what they describe exists; labels never hold an id.
 
 The robot's end of the bridge knows both directions, so topics come from the robots' reports, which arrive with each
-renewal; they are kept in memory only, and complete again one renewal after a restart.
+renewal, at any of several orchestrators; the one that leads exports them.
 """
 
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -55,13 +54,20 @@ class Metrics(Collector):
         running: Callable[[], Iterable[Running]],
         max_topics: int,
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
+        reports: Callable[[], Mapping[str, Report]] = dict,
     ) -> None:
-        """``running`` and ``sites`` are asked at each scrape; ``max_topics`` bounds the topics of a robot's report."""
+        """All callables are asked at each scrape.
+
+        Args:
+            running: What has not ended.
+            max_topics: Bounds the topics of a robot's report.
+            sites: What is known of the sites.
+            reports: The last report on each instance, as ``bounded`` left it.
+        """
         self._running = running
         self._sites = sites
+        self._reports = reports
         self._max_topics = max_topics
-        self._lock = threading.Lock()
-        self._reports: dict[str, Report] = {}
         self._registry = CollectorRegistry()
         self._start = Histogram(
             "skytether_instance_start_seconds",
@@ -90,21 +96,13 @@ class Metrics(Collector):
         for refusal in refusals:
             self._refusals.labels(service, refusal.site, refusal.reason).inc()
 
-    def report(self, record: Record, report: Report) -> None:
-        """A robot's report on one instance, instead of the one before."""
+    def bounded(self, record: Record, report: Report) -> Report:
+        """A robot's report on one instance, without what would make series that nobody declared."""
         known = {topic.name for topic in record.spec.topics}
         topics = [t for t in report.topics if t.topic in known or ANY_TOPIC in known][: self._max_topics]
         reasons = {r: n for r, n in report.fallback_transitions.items() if _REASON.fullmatch(r)}
         bounded = dict(list(reasons.items())[:_MAX_REASONS])
-        with self._lock:
-            self._reports[record.id] = report.model_copy(
-                update={"topics": tuple(topics), "fallback_transitions": bounded}
-            )
-
-    def forget(self, instance: str) -> None:
-        """An instance has ended."""
-        with self._lock:
-            self._reports.pop(instance, None)
+        return report.model_copy(update={"topics": tuple(topics), "fallback_transitions": bounded})
 
     def forget_site(self, site: str) -> None:
         self._start.remove_by_labels({"site": site})
@@ -120,8 +118,8 @@ class Metrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         running = list(self._running())
-        with self._lock:
-            reports = [(r.record, self._reports[r.record.id]) for r in running if r.record.id in self._reports]
+        known = self._reports()
+        reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield from _instances(running)
         yield from _sites(self._sites(), running)
         yield from _control(reports)

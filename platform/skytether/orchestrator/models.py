@@ -105,3 +105,20 @@ idempotency = Table(
     Column("instance", String(32), ForeignKey("instances.id", ondelete="CASCADE"), nullable=False),
     Column("created_at", Float, nullable=False),
 )
+
+reports = Table(
+    "reports",
+    metadata,
+    Column("instance", String(32), ForeignKey("instances.id", ondelete="CASCADE"), primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("report", JSON, nullable=False),
+    comment="The last of each instance's robot: any orchestrator may get it, and the one that leads exports it",
+)
+
+facts = Table(
+    "facts",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("value", String(255), nullable=False),
+    comment="What all orchestrators over this database must agree on",
+)

@@ -14,6 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skytether.api.rest import Problem
 
+from .db import GONE
 from .errors import (
     ConflictError,
     DomainError,
@@ -73,6 +74,11 @@ def install(app: FastAPI, body_limit: int) -> None:
         values = {"path": request.url.path, "method": request.method, "limit": body_limit, "detail": error.detail}
         return answer(request, error.status_code, title, text.format(**values), headers=dict(error.headers or {}))
 
+    async def on_database(request: Request, error: Exception) -> JSONResponse:
+        log.warning("%s %s: the database does not answer (%s)", request.method, request.url.path, type(error).__name__)
+        text = "the orchestrator's database does not answer: try again in a few seconds"
+        return answer(request, 503, "Not possible now", text, headers={"Retry-After": "2"})
+
     async def on_anything(request: Request, error: Exception) -> JSONResponse:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return answer(request, 500, "Internal error", "a mistake in the orchestrator: its log has the details")
@@ -80,6 +86,8 @@ def install(app: FastAPI, body_limit: int) -> None:
     app.add_exception_handler(DomainError, on_domain)
     app.add_exception_handler(RequestValidationError, on_invalid)
     app.add_exception_handler(HTTPException, on_http)
+    for gone in GONE:
+        app.add_exception_handler(gone, on_database)
     app.add_exception_handler(Exception, on_anything)
     app.add_middleware(BodyLimit, limit=body_limit)
 

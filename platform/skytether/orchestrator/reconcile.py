@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from skytether.api.grant import Grant
 from skytether.api.rest import Measurement, Refusal, State
 
+from .db import GONE
 from .metrics import Metrics
 from .placement import NOTHING, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Ready, Remove, Start, Stop, after_crash, plan
@@ -29,7 +30,10 @@ _PRUNE = 60.0
 
 
 class Reconciler:
-    """Makes what is what should be. ``sites`` is set before the first pass: each needs the other."""
+    """Makes what is what should be, while this orchestrator leads; otherwise it looks only.
+
+    ``sites`` is set before the first pass: each needs the other.
+    """
 
     sites: Sites
 
@@ -43,6 +47,7 @@ class Reconciler:
         weights: Weights,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
+        leads: Callable[[], bool] = lambda: True,
     ) -> None:
         """``clock`` gives seconds since the epoch."""
         self._store = store
@@ -53,12 +58,39 @@ class Reconciler:
         self._weights = weights
         self._clock = clock
         self._wake_placer = wake_placer
+        self._leads = leads
         self._pruned_at = 0.0
-
-    # What has no site yet
+        self._database_gone = False
 
     def place_step(self) -> float:
         """One pass of the placer; returns seconds until the next."""
+        return self._with_database(self._place_pass)
+
+    def site_step(self, site: Site) -> float:
+        """One pass over a site; returns seconds until the next."""
+        return self._with_database(lambda: self._site_pass(site))
+
+    def _with_database(self, step: Callable[[], float]) -> float:
+        """Wait where the database does not answer; once it does, leases count anew: nobody could renew meanwhile."""
+        try:
+            if self._database_gone and self._leads():
+                self._store.extend_leases(self._clock())
+                log.warning("the database answers again")
+            delay = step()
+            self._database_gone = False
+            return delay
+        except GONE as error:
+            if not self._database_gone:
+                log.error("the database does not answer, trying again: %s", str(error.orig).splitlines()[0])
+            self._database_gone = True
+            return self._timing.place
+
+    # What has no site yet
+
+    def _place_pass(self) -> float:
+        self.sites.refresh()
+        if not self._leads():
+            return self._timing.place
         now = self._clock()
         live = self._store.live()
         waiting = [record for record in live if record.site is None]
@@ -107,8 +139,7 @@ class Reconciler:
 
     def _prune(self, now: float) -> None:
         limits = self._limits
-        for instance, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
-            self._metrics.forget(instance)
+        for _, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
             if name is not None:
                 # The site's own pass finds it as a stranger, and removes it.
                 self._wake_site(name)
@@ -120,8 +151,7 @@ class Reconciler:
 
     # What is at a site
 
-    def site_step(self, site: Site) -> float:
-        """One pass over a site; returns seconds until the next."""
+    def _site_pass(self, site: Site) -> float:
         live = self._store.live_at(site.name)  # before the look: nothing can be observed that is not in it
         try:
             if site.capacity is None:
@@ -136,6 +166,8 @@ class Reconciler:
             site.capacity = site.load = None  # it may come back as another machine
             return self._timing.place
         site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
+        if not self._leads():
+            return self._timing.observe
         strangers = observed.keys() - {record.id for record in live}
         ended = self._store.known(strangers) if strangers else set()
         actions = plan(live, observed, ended, self._clock(), self._timing)
@@ -162,7 +194,7 @@ class Reconciler:
                 case End(record):
                     site.runtime.stop(record.id, force=True)  # what its main process left behind
                     if self._store.change(record, self._clock(), state=State.STOPPED):
-                        self._ended(record)
+                        self._wake_placer()  # there is room for another
                 case Stop(instance, force):
                     site.runtime.stop(instance, force=force)
                 case Remove(instance):
@@ -216,7 +248,7 @@ class Reconciler:
         log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
         if after.state.final:
             site.runtime.stop(after.id, force=True)
-            self._ended(after)
+            self._wake_placer()
 
     def _expire(self, record: Record) -> None:
         now = self._clock()
@@ -224,10 +256,6 @@ class Reconciler:
         to = State.STOPPED if record.site is None else State.STOPPING
         if self._store.change(record, now, state=to, stopping_at=now, reason=reason):
             log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)
-
-    def _ended(self, record: Record) -> None:
-        self._metrics.forget(record.id)
-        self._wake_placer()  # there is room for another
 
 
 def _used(records: Sequence[Record]) -> dict[str, Capacity]:

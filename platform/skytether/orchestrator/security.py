@@ -84,7 +84,7 @@ def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
 
 
 class Secrets:
-    """The two secrets of a state folder."""
+    """The two secrets of an orchestrator."""
 
     def __init__(self, folder: Path) -> None:
         """Read or make ``operator.token`` and ``secret.key``.
@@ -104,6 +104,12 @@ class Secrets:
 
     def is_operator(self, token: str) -> bool:
         return self._operator.matches(token)
+
+    @property
+    def fingerprint(self) -> str:
+        """By which orchestrators tell whether they have the same secret key; it tells nothing of the key."""
+        info = b"skytether fingerprint"
+        return HKDF(algorithm=SHA256(), length=16, salt=None, info=info).derive(self._key).hex()
 
     def session_key(self, session_id: str) -> bytes:
         """32 bytes; always the same for the same session, so that no database needs to hold them."""

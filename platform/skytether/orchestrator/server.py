@@ -80,6 +80,8 @@ def _start(core: Orchestrator) -> None:
         core.start()
     except InvalidError as error:
         raise StartError(str(error), usage=True) from error
+    except SecretFileError as error:
+        raise StartError(str(error)) from error
     except (SQLAlchemyError, CommandError) as error:
         text = str(getattr(error, "orig", None) or error).splitlines()[0]
         raise StartError(f"the database cannot be used: {text}") from error

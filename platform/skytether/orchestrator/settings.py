@@ -86,6 +86,9 @@ class Settings:
     """0: any free one; the real address is written to ``address`` in the state folder."""
     database_url: str | None = None
     """SQLAlchemy URL; None: SQLite in the state folder."""
+    secrets_dir: Path | None = None
+    """Folder of ``secret.key`` and ``operator.token``, the same for all orchestrators over one database; None: the
+    state folder."""
     catalogue_dir: Path | None = None
     """Folder of manifests (``*.yaml``, ``*.yml``) beside the built-in ones; None: none."""
     stop_instances: bool = False

@@ -154,20 +154,33 @@ class Sites:
 
     def start(self) -> None:
         """Open every site of the store, the default one if there is none, and give them a moment to answer."""
-        asked = self._store.sites()
-        if not asked:
+        if not self._store.sites():
             self._store.add_site(DEFAULT_SITE)
-            asked = [DEFAULT_SITE]
-        for one in asked:
-            try:
-                runtime = self._make_runtime(one)
-            except InvalidError as error:
-                log.error("site %s cannot be used: %s", one.name, error)
-                runtime = Unusable(str(error))
-            self._open(one, runtime)
+        self.refresh()
         deadline = time.monotonic() + _FIRST_LOOK
         for site in self.all():
             site.loop.wait_first(max(0.0, deadline - time.monotonic()))
+
+    def refresh(self) -> None:
+        """Open and close what another orchestrator over the same database added and deleted."""
+        with self._lock:
+            wanted = {site.name: site for site in self._store.sites()}
+            gone = [site for name, site in self._sites.items() if wanted.get(name) != site.asked]
+            for site in gone:
+                del self._sites[site.name]
+            for one in wanted.values():
+                if one.name not in self._sites:
+                    self._open(one, self._make_usable(one))
+        for site in gone:
+            self._close(site)
+
+    def reopen(self) -> None:
+        """Look at all sites anew: another orchestrator has started and stopped what is there until now."""
+        with self._lock:
+            old, self._sites = list(self._sites.values()), {}
+        for site in old:
+            self._close(site)
+        self.refresh()
 
     def stop(self) -> None:
         """Let go of all sites; what runs there runs on."""
@@ -187,7 +200,11 @@ class Sites:
                     f"there is a site '{asked.name}' already: choose another name, or delete that first"
                 )
             runtime = self._make_runtime(asked)
-            self._store.add_site(asked)
+            if not self._store.add_site(asked):  # by way of another orchestrator
+                runtime.close()
+                raise ConflictError(
+                    f"there is a site '{asked.name}' already: choose another name, or delete that first"
+                )
             site = self._open(asked, runtime)
         site.loop.wait_first(_FIRST_LOOK)
         return site
@@ -237,6 +254,13 @@ class Sites:
             return kind(asked.name, folder, options)
         except RuntimeFailure as error:
             raise InvalidError([Fault("runtime", str(error))]) from error
+
+    def _make_usable(self, asked: SiteCreate) -> Runtime:
+        try:
+            return self._make_runtime(asked)
+        except InvalidError as error:
+            log.error("site %s cannot be used: %s", asked.name, error)
+            return Unusable(str(error))
 
     def _open(self, asked: SiteCreate, runtime: Runtime) -> Site:
         site = Site(asked, runtime, self._step, self._timing.site_silent)

@@ -17,7 +17,8 @@ from sqlalchemy.exc import IntegrityError
 from skytether.api.rest import SiteCreate, State
 
 from .db import make_engine, migrate
-from .models import events, idempotency, instances, robots, services, sites
+from .leader import Lock, lock_of
+from .models import events, facts, idempotency, instances, reports, robots, services, sites
 from .records import Record, check_move
 from .security import TokenHash
 
@@ -62,6 +63,17 @@ class Store:
 
     def migrate(self) -> None:
         migrate(self._engine)
+
+    def lock(self) -> Lock:
+        """The lock of whoever leads over this database."""
+        return lock_of(self._engine)
+
+    def agree(self, name: str, value: str) -> bool:
+        """Note a fact at first, and from then on say whether it is still the same."""
+        if self._insert(facts, {"name": name, "value": value}):
+            return True
+        with self._engine.connect() as connection:
+            return connection.scalar(select(facts.c.value).where(facts.c.name == name)) == value
 
     def close(self) -> None:
         self._engine.dispose()
@@ -171,6 +183,21 @@ class Store:
         with self._writer.begin() as connection:
             row = connection.execute(statement.returning(instances)).mappings().one_or_none()
         return None if row is None else _record(row)
+
+    def report(self, instance: str, now: float, report: dict[str, Any]) -> None:
+        """Keep a robot's report on an instance, instead of the one before; whichever orchestrator leads exports it."""
+        values = {"at": now, "report": report}
+        with self._writer.begin() as connection:
+            mine = reports.c.instance == instance
+            if connection.execute(update(reports).where(mine).values(**values)).rowcount == 0:
+                connection.execute(insert(reports).values(instance=instance, **values))
+
+    def reports(self) -> dict[str, dict[str, Any]]:
+        """The last report on each instance that has not ended."""
+        query = select(reports.c.instance, reports.c.report).join(instances)
+        with self._engine.connect() as connection:
+            rows = connection.execute(query.where(instances.c.state.not_in(_FINAL)))
+            return {row.instance: row.report for row in rows}
 
     def extend_leases(self, now: float) -> None:
         """Give every live instance its whole lease from now: nobody could renew while the orchestrator was down."""

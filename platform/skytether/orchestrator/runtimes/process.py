@@ -48,6 +48,8 @@ class ProcessOptions(Strict):
 
     bind_host: str = "127.0.0.1"
     """Address that services listen on."""
+    folder: Path | None = None
+    """Of the instances, the same for several orchestrators on this machine; None: in the orchestrator's own state."""
     advertise_host: str | None = None
     """Address that robots are told; None: the one bound. Needed when that is a wildcard."""
     cpu: Annotated[float, Field(gt=0)] | None = None
@@ -94,9 +96,10 @@ class ProcessRuntime(Runtime):
         if not sys.platform.startswith("linux"):
             raise RuntimeFailure("the process runtime needs Linux: use a container site")
         self._options = options
+        folder = self._options.folder or folder
         self._folder = folder / "instances"
         self._data = folder / "data"
-        self._folder.mkdir(mode=0o700, exist_ok=True)
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
 
     def _adopt(self, folder: Path) -> _Run:

@@ -1,0 +1,193 @@
+"""Several orchestrators over one PostgreSQL database, and a database that goes away. Real servers, killed for real."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from orchestrator_program import PATIENCE, Program, environment, until, with_toy
+
+from skytether.api.client import Client
+from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
+from skytether.orchestrator.db import make_engine, migrate
+from skytether.orchestrator.models import metadata
+from skytether.orchestrator.store import Store
+
+pytestmark = [pytest.mark.slow, pytest.mark.postgres]
+
+ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
+
+
+class Replica(Program):
+    """One of several orchestrators."""
+
+    client: Client | None = None
+
+    def up(self) -> Client:
+        self.spawn()
+        until(lambda: (self.folder / "address").exists(), self)
+        self.client = Client(self.url, self.token)
+        return self.client
+
+    @property
+    def url(self) -> str:
+        return (self.folder / "address").read_text().strip()
+
+    @property
+    def token(self) -> str:
+        return (self.folder.parents[1] / "secrets" / "operator.token").read_text().strip()
+
+    def clean_up(self) -> None:
+        if self.client is not None:
+            self.client.close()
+        super().clean_up()
+
+
+@pytest.fixture
+def replicas(tmp_path: Path, postgres: str) -> Iterator[Callable[..., Replica]]:
+    """Makes orchestrators over one database, with the same secrets; what they started ends with the test."""
+    made: list[Replica] = []
+
+    def make(name: str, *options: str) -> Replica:
+        shared = ("--database", postgres, "--secrets-dir", str(tmp_path / "secrets"))
+        (tmp_path / name).mkdir()
+        program = Replica(tmp_path / name / "state", *shared, *options)
+        made.append(program)
+        return program
+
+    (tmp_path / "secrets").mkdir(mode=0o700)
+    yield make
+    for program in made:
+        program.clean_up()
+    for pid in services(tmp_path):
+        os.kill(pid, signal.SIGKILL)
+
+
+def services(folder: Path) -> set[int]:
+    """All processes that have a grant in a folder."""
+    mine = b"SKYTETHER_GRANT=" + os.fsencode(folder)
+    return {int(p.name) for p in Path("/proc").glob("[0-9]*") if mine in environment(p)}
+
+
+def running(client: Client, instance: str) -> Any:
+    found = client.get_instance(instance)
+    return found if found.state is State.RUNNING else None
+
+
+def test_the_schema_in_postgresql_is_that_of_the_models(postgres: str) -> None:
+    engine = make_engine(postgres)
+    migrate(engine)
+    migrate(engine)
+    with engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+    engine.dispose()
+
+
+def test_one_leads_all_answer_and_when_the_leader_is_killed_another_adopts(
+    replicas: Callable[..., Replica], manifest: Any, tmp_path: Path
+) -> None:
+    one, two = replicas("one"), replicas("two")
+    first = with_toy(one.up(), manifest)
+    second = two.up()
+    site = SiteCreate(name="shared", tier="cloud", runtime="process", options={"folder": str(tmp_path / "instances")})
+    first.create_site(site)
+    first.delete_site("local")
+    until(lambda: [s.name for s in second.sites()] == ["shared"])
+
+    made = second.create_instance(ASK)  # by way of the one that does not lead
+    until(lambda: running(first, made.id))
+    host, port = running(first, made.id).session.host, running(first, made.id).session.port
+    assert running(second, made.id).session == running(first, made.id).session
+    second.renew_instance(made.id, Renew(report=Report(rtt_s=0.02, control_source="cloud")))
+    assert "skytether_path_rtt_seconds{" in first.metrics()
+    assert "skytether_path_rtt_seconds{" not in second.metrics()
+
+    assert one.process is not None
+    pids = services(tmp_path / "instances")
+    assert len(pids) == 1
+    one.process.send_signal(signal.SIGKILL)
+    one.process.wait(PATIENCE)
+    until(lambda: "this orchestrator leads" in two.log)
+    until(lambda: "skytether_path_rtt_seconds{" in second.metrics())
+    adopted = running(second, made.id)
+    assert (adopted.session.host, adopted.session.port, adopted.restarts) == (host, port, 0)
+    assert services(tmp_path / "instances") == pids
+    again = second.create_instance(ASK)
+    until(lambda: running(second, again.id))
+    second.delete_instance(made.id)
+    until(lambda: second.get_instance(made.id).state is State.STOPPED)
+
+
+def test_orchestrators_with_different_secrets_do_not_share_a_database(
+    replicas: Callable[..., Replica], tmp_path: Path
+) -> None:
+    replicas("one").up()
+    (tmp_path / "other").mkdir(mode=0o700)
+    stranger = replicas("two", "--secrets-dir", str(tmp_path / "other"))
+    status, text = stranger.fails()
+    assert status == 1
+    assert "another secret.key" in text
+
+
+def test_the_database_is_away_for_longer_than_a_lease_and_nothing_is_lost(
+    replicas: Callable[..., Replica], manifest: Any, postgres_server: Any
+) -> None:
+    program = replicas("one")
+    client = with_toy(program.up(), manifest)
+    made = client.create_instance(ASK.model_copy(update={"lease_s": 3}))
+    until(lambda: running(client, made.id))
+    pids = program.services()
+    postgres_server.stop()
+    try:
+        time.sleep(4)  # longer than the lease: what cannot be renewed must not end
+        answer = httpx.get(
+            f"{program.url}/api/v1/instances/{made.id}", headers={"Authorization": f"Bearer {program.token}"}
+        )
+        assert answer.status_code == 503
+        assert answer.headers["retry-after"] == "2"
+        assert "database does not answer" in answer.json()["detail"]
+        assert httpx.get(f"{program.url}/readyz").status_code == 503
+    finally:
+        postgres_server.start()
+    until(lambda: httpx.get(f"{program.url}/readyz").status_code == 200, program)
+    back = client.renew_instance(made.id, Renew(lease_s=1000))
+    assert (back.state, back.restarts) == (State.RUNNING, 0)
+    assert program.services() == pids
+    assert program.log.count("the database does not answer, trying again") <= 3
+    assert "Traceback" not in program.log
+
+
+def test_a_database_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    (tmp_path / "one").mkdir()
+    program = Program(tmp_path / "one" / "state", "--database", f"postgresql://nobody@127.0.0.1:{port}/none")
+    status, text = program.fails()
+    assert status == 1
+    assert "the database cannot be used" in text
+    assert "Traceback" not in text
+
+
+def test_two_that_migrate_at_once_do_not_collide(postgres: str) -> None:
+    pids = []
+    for _ in range(2):
+        pid = os.fork()
+        if pid == 0:
+            status = 1
+            try:
+                Store(postgres).migrate()
+                status = 0
+            finally:
+                os._exit(status)
+        pids.append(pid)
+    assert [os.waitpid(pid, 0)[1] for pid in pids] == [0, 0]
