@@ -1,4 +1,5 @@
 import logging
+import re
 from itertools import count, pairwise
 from math import nan
 
@@ -10,6 +11,8 @@ from skytether.robot.arbiter import Needs, Reason
 from skytether.robot.command import Source
 from skytether.robot.driver import Driver
 from skytether.robot.fallback import Admittance, Stop
+from skytether.robot.link import Quality
+from skytether.robot.service_manager import Terms
 from skytether.robot.session import LiveSession
 from skytether.robot.supervisor import Limits
 from skytether.wire.events import Connected, Disconnected, MessageReceived
@@ -27,10 +30,10 @@ class BrokenFallback:
 class Rig:
     """A driver with made-up time, a base and, after `connect`, a cloud."""
 
-    def __init__(self, base, cloud, fallback=None, observer=None):
+    def __init__(self, base, cloud, fallback=None, observer=None, limits=None):
         self.base = base
         self.now = 100.0
-        self.driver = Driver(base, fallback or Admittance(), Limits(), Needs(), self.now, observer)
+        self.driver = Driver(base, fallback or Admittance(), limits or Limits(), Needs(), self.now, observer)
         self._make_cloud = cloud
         self._epochs = count(1)
         self.cloud = None
@@ -104,9 +107,9 @@ def test_silence_hands_over_to_the_person_within_300_ms_without_a_jump_and_back(
     status = driven.run(1.5, linear=0.25, angular=-0.5)
     assert status.source is Source.CLOUD
     assert status.transition_counts == {"start": 1, "no_command": 1, "recovered": 2}
-    assert [record.message for record in caplog.records] == [
-        "control: cloud -> fallback (no_command)",
-        "control: fallback -> cloud (recovered)",
+    assert [re.sub(r"for 1\d0 ms", "for 1x0 ms", message) for message in caplog.messages] == [
+        "control: cloud -> fallback (no_command): no command for 1x0 ms, 150 ms at most",
+        "control: fallback -> cloud (recovered): all has been well for 1 s",
     ]
     limits = Limits()
     for (v0, w0), (v1, w1) in pairwise(driven.base.written):
@@ -142,6 +145,33 @@ def test_nonsense_from_the_cloud_is_counted_and_not_followed(driven, nan_twist):
     assert status.errors == {"decode": 1}
     assert status.objections["not_finite"] == 1
     assert status.source is Source.FALLBACK
+
+
+def test_each_trouble_is_named_once_not_at_every_tick(driven, nan_twist, caplog):
+    for _ in range(200):
+        driven.cloud.send_bytes(driven.now, nan_twist)
+        driven.run(TICK, linear=9.0)
+    assert driven.driver.status().objections["not_finite"] == 200
+    named = [message for message in caplog.messages if message.startswith("commands of")]
+    assert named == [
+        "commands of cloud: a velocity is NaN or infinite; such are not followed",
+        "commands of cloud: faster than limits.linear_min and linear_max allow; they are cut down",
+    ]
+
+
+@pytest.mark.parametrize(("period", "patience"), [(0.02, 0.025), (0.05, 0.085), (0.1, 0.185)])
+def test_a_slower_service_is_left_within_two_of_its_periods(base, make_cloud, bridge, period, patience):
+    rig = Rig(base, make_cloud, limits=Limits(max_gap_s=1.0))
+    rig.connect(bridge)
+    rig.driver.hold_to(Terms(period_s=period))
+    for _ in range(round(3 / period)):
+        rig.cloud.send(rig.now, delay=0.0)
+        rig.run(period)
+    assert rig.driver.status().source is Source.CLOUD
+    silent = rig.now - period
+    status = rig.run(2 * period)
+    assert status.source is Source.FALLBACK
+    assert status.transitions[-1].at - silent <= patience + TICK + 1e-9 < 2 * period
 
 
 def test_a_sensor_that_raises_brakes_the_wheels_and_is_logged_once(driven, caplog):
@@ -206,19 +236,27 @@ def test_a_clock_that_jumps_back_brakes(driven):
 
 
 def test_the_services_needs_decide(driven):
-    driven.driver.set_needs(0.1, None)
-    driven.driver.rtt = 0.3
+    driven.driver.hold_to(Terms(max_rtt_s=0.1))
+    driven.driver.quality = Quality(rtt=0.3)
     status = driven.run(0.6, linear=0.2)
     assert status.transitions[-1].reason is Reason.RTT
-    driven.driver.rtt = nan
-    driven.driver.set_needs(None, 0.2)
+    driven.driver.quality = Quality()
+    driven.driver.hold_to(Terms(max_loss=0.2))
     assert driven.run(1.2, linear=0.2).source is Source.CLOUD
-    driven.driver.loss = 0.3
-    assert driven.run(0.6, linear=0.2).transitions[-1].reason is Reason.LOSS
+    driven.driver.quality = Quality(loss=0.3, lossy_topic="force")
+    status = driven.run(0.6, linear=0.2)
+    assert status.transitions[-1].reason is Reason.LOSS
+    assert status.why == "30% of force lost, the service bears 20%"
+    driven.driver.quality = Quality()
+    assert driven.run(1.2, linear=0.2).source is Source.CLOUD
+    driven.driver.quality = Quality(late=0.6, late_topic="scan")
+    status = driven.run(0.6, linear=0.2)
+    assert status.transitions[-1].reason is Reason.LATE
+    assert status.why == "60% of scan too late, the service bears 50%"
 
 
 def test_a_command_older_than_the_service_needs_is_not_followed(driven):
-    driven.driver.set_needs(0.1, None)  # 0.25 s in all, with the time that a command may be repeated
+    driven.driver.hold_to(Terms(max_rtt_s=0.1))  # 0.25 s in all, with the time that a command may be repeated
     status = driven.run(0.3, linear=0.2, delay=0.26)
     assert status.objections["stale"] == 30
     assert status.transitions[-1].reason is Reason.NO_COMMAND

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from math import isfinite, nan
+from math import isfinite
 from random import Random
 from types import TracebackType
 from typing import Any
@@ -33,7 +33,9 @@ from .asker import Asker, Orchestrator
 from .command import Source
 from .driver import Base, Driver, DriverStatus, Observer
 from .graph_base import Graph
-from .link import LinkMonitor
+from .link import Quality
+from .notices import Notices
+from .service_manager import ServiceManager, terms
 from .session import Endpoint, LiveSession
 from .supervisor import Limits
 from .table import Offer, robot_table
@@ -183,7 +185,8 @@ class Agent:
         )
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
-        self._monitor = LinkMonitor()
+        self._manager: ServiceManager | None = None
+        self._notices = Notices(_log)
         self._stats: SessionStats | None = None
         self._trouble = ""
         self._asked_at: float | None = None
@@ -235,14 +238,14 @@ class Agent:
             asked_at=self._asked_at,
             connected=session is not None and session.connected,
             session=self._stats,
-            rtt=self._driver.rtt,
-            loss=self._driver.loss,
+            rtt=self._driver.quality.rtt,
+            loss=self._driver.quality.loss,
             overruns=self._overruns,
         )
 
     def report(self) -> rest.Report:
         """What the orchestrator is told with each renewal."""
-        return report(self._driver.status(), self._stats, self._driver.rtt)
+        return report(self._driver.status(), self._stats, self._driver.quality.rtt)
 
     def _control(self) -> None:
         period = 1 / self._config.rate_hz
@@ -273,7 +276,10 @@ class Agent:
         if session is None or session.bridge is None:
             return
         self._stats = session.bridge.stats()
-        self._driver.rtt, self._driver.loss = self._monitor.sample(self._stats, now)
+        if self._manager is not None:
+            self._driver.quality = self._manager.watch(self._stats, now)
+            for kind, sentence in self._manager.troubles():
+                self._notices.say(kind, sentence, now)
 
     def _follow(self, instance: rest.Instance) -> None:
         """The orchestrator said something about the instance: open a new session, or follow the service's address."""
@@ -295,10 +301,10 @@ class Agent:
                 self._trouble = sentence
             return
         self._trouble = ""
-        self._monitor = LinkMonitor()
-        self._driver.rtt = self._driver.loss = nan
-        needs = granted.needs
-        self._driver.set_needs(None if needs.max_rtt_ms is None else needs.max_rtt_ms / 1000, needs.max_loss)
+        held_to = terms(granted.needs, granted.topics, self._config.command_topic)
+        self._manager = ServiceManager(held_to, self._config.command_topic, self._config.limits.max_gap_s)
+        self._driver.quality = Quality()
+        self._driver.hold_to(held_to)
         self._driver.session = session
         if current is not None:
             current.close()

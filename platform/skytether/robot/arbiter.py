@@ -2,9 +2,10 @@
 
 (Mello, thesis, section 3.3: the Service Manager monitors the communication and triggers the robot's own controller.)
 
-Two kinds of trouble. Without a valid command or a session the robot is on its own at once. A round trip, a loss or a
-clock that is worse than the service's manifest allows must last before it counts. The way back is the same for all: the
-link must have been good without a break for ``good_s``, so that the cloud never takes over more often than that.
+Two kinds of trouble. Without a valid command or a session the robot is on its own at once. A round trip, a loss, a
+lateness or a clock that is worse than the service's manifest allows must last before it counts. The way back is the
+same for all: the link must have been good without a break for ``good_s``, so that the cloud never takes over more often
+than that.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ class Reason(StrEnum):
     """The round trip is longer than the service needs."""
     LOSS = "loss"
     """More messages are lost than the service bears."""
+    LATE = "late"
+    """More messages of a topic are too old before they are through than the service bears."""
     CLOCK = "clock"
     """The peer's clock is not known well enough to judge the age of commands."""
     RECOVERED = "recovered"
@@ -42,15 +45,17 @@ class Needs:
     Attributes:
         max_rtt_s: From the manifest [s]; None: any.
         max_loss: From the manifest, share of messages; None: any but all.
+        max_late: Share of a topic's messages that may miss their lifespan.
         max_clock_error_s: Largest bound of the clock offset's error [s].
         command_timeout_s: Without a valid command for this long the robot is on its own [s].
-        bad_s: How long round trip, loss or clock must be bad in one piece [s].
+        bad_s: How long round trip, loss, lateness or clock must be bad in one piece [s].
         good_s: How long everything must be good in one piece before the cloud drives (again) [s].
         local: Who drives when the cloud does not.
     """
 
     max_rtt_s: float | None = None
     max_loss: float | None = None
+    max_late: float = 0.5
     max_clock_error_s: float = 0.5
     command_timeout_s: float = 0.15
     bad_s: float = 0.5
@@ -79,6 +84,7 @@ class Link:
         command_at: When the last valid command arrived [monotonic s]; None: none yet.
         rtt: Round trip [s].
         loss: Share of messages lost over a recent window.
+        late: Share of messages that missed their lifespan over a recent window.
         clock_error: Bound of the clock offset's error [s].
     """
 
@@ -86,6 +92,7 @@ class Link:
     command_at: float | None = None
     rtt: float = nan
     loss: float = nan
+    late: float = nan
     clock_error: float = inf
 
 
@@ -146,6 +153,8 @@ def _trouble(needs: Needs, link: Link, now: float) -> Reason | None:
         return Reason.RTT
     if link.loss >= 1 or (needs.max_loss is not None and link.loss > needs.max_loss):
         return Reason.LOSS
+    if link.late > needs.max_late:
+        return Reason.LATE
     if not link.clock_error <= needs.max_clock_error_s:
         return Reason.CLOCK
     return None

@@ -16,15 +16,28 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import DecodeError, Encoding, Message, Twist, Vector3, decode
 from skytether.wire.events import MessageReceived
 
-from . import arbiter, supervisor
+from . import arbiter, service_manager, supervisor
 from .arbiter import Choice, Link, Needs
 from .command import Command, Source
 from .fallback import Fallback, Reading
+from .link import Quality
+from .notices import Notices
+from .service_manager import Patience, Terms
 from .session import LiveSession
 from .supervisor import Limits, Objection, Supervised
 
 _log = logging.getLogger(__name__)
 
+_NAMED = {
+    Objection.NOT_FINITE: "a velocity is NaN or infinite; such are not followed",
+    Objection.SEQUENCE: "one came again, or after a newer one; such are not followed",
+    Objection.STALE: "made from information that is too old; such are not followed",
+    Objection.FUTURE: "sent later than now; such are not followed",
+    Objection.CLOCK: "their age cannot be known, because a clock is not known or did not go on; such are not followed",
+    Objection.LINEAR_LIMIT: "faster than limits.linear_min and linear_max allow; they are cut down",
+    Objection.ANGULAR_LIMIT: "turning faster than limits.angular_max allows; they are cut down",
+}
+"""Named in the log, once while it lasts. A gap is told by the hand-over; limits of acceleration are no trouble."""
 _TRANSITIONS_KEPT = 1000
 """The newest; all are counted."""
 
@@ -69,6 +82,7 @@ class DriverStatus:
         source: Who drives.
         transitions: Changes of the source, oldest first (the newest 1000).
         transition_counts: All of them, by reason.
+        why: Of the last change, one line with the numbers behind it.
         seconds: Under each source.
         velocity: What the wheels were last told.
         objections: The supervisor's, by kind.
@@ -81,6 +95,7 @@ class DriverStatus:
     source: Source
     transitions: tuple[Transition, ...]
     transition_counts: Mapping[str, int]
+    why: str
     seconds: Mapping[Source, float]
     velocity: Velocity
     objections: Mapping[str, int]
@@ -112,15 +127,18 @@ class Driver:
         observer: Observer | None = None,
     ) -> None:
         self.session: LiveSession | None = None
-        self.rtt = nan
-        self.loss = nan
+        self.quality = Quality()
         self._base = base
         self._fallback = fallback
         self._limits = limits
         self._observer = observer
         self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
+        self._command_timeout_s = needs.command_timeout_s
+        self._patience = Patience(None, needs.command_timeout_s, limits.period_s)
+        self._notices = Notices(_log)
         self._choice: Choice = arbiter.start(self._needs, now)
         self._supervised = Supervised()
+        self._why = "no command has come yet"
         self._now = now
         self._ticks = 0
         self._readings: dict[str, Reading] = {}
@@ -137,9 +155,10 @@ class Driver:
         """Who drives now."""
         return self._choice.source
 
-    def set_needs(self, max_rtt_s: float | None, max_loss: float | None) -> None:
-        """Take over what the service's manifest needs of the link."""
-        self._needs = replace(self._needs, max_rtt_s=max_rtt_s, max_loss=max_loss)
+    def hold_to(self, terms: Terms) -> None:
+        """Take over what the service's manifest says of the link and of its commands."""
+        self._patience = Patience(terms.period_s, self._command_timeout_s, self._limits.period_s)
+        self._needs = replace(self._needs, max_rtt_s=terms.max_rtt_s, max_loss=terms.max_loss, max_late=terms.max_late)
 
     def tick(self, now: float) -> None:
         """One turn of the loop: exactly one velocity is written. Never raises.
@@ -171,6 +190,7 @@ class Driver:
             source=self._choice.source,
             transitions=tuple(self._transitions),
             transition_counts=dict(self._counts),
+            why=self._why,
             seconds=dict(self._seconds),
             velocity=self._supervised.velocity,
             objections=dict(self._objections),
@@ -200,8 +220,10 @@ class Driver:
                 self._caught("decode", error)
                 continue
             objection = self._admit(command, now)
-            if objection is None and self._first_command_at is None:
-                self._first_command_at = command.received_at
+            if objection is None:
+                self._patience.arrived(command.received_at)
+                if self._first_command_at is None:
+                    self._first_command_at = command.received_at
             if self._observer is not None:
                 try:
                     self._observer(command, objection)
@@ -213,16 +235,22 @@ class Driver:
         link = Link(
             connected=self.session is not None and self.session.connected,
             command_at=held.received_at if held else None,
-            rtt=self.rtt,
-            loss=self.loss,
+            rtt=self.quality.rtt,
+            loss=self.quality.loss,
+            late=self.quality.late,
             clock_error=held.sent_at_error if held else nan,
         )
+        timeout = min(self._patience.limit_s, self._limits.max_gap_s)
+        if timeout != self._needs.command_timeout_s:
+            self._needs = replace(self._needs, command_timeout_s=timeout)
         before = self._choice
         self._choice = arbiter.choose(self._needs, before, link, now)
         if self._choice.source is not before.source:
             self._counts[self._choice.reason] += 1
             self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
-            _log.warning("control: %s -> %s (%s)", before.source, self._choice.source, self._choice.reason)
+            why = service_manager.explain(self._choice.reason, self._needs, link, self.quality, now)
+            _log.warning("control: %s -> %s (%s): %s", before.source, self._choice.source, self._choice.reason, why)
+            self._why = why
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
@@ -238,15 +266,22 @@ class Driver:
         self._supervised, objections = supervisor.step(
             self._limits, self._supervised, source, self._max_age(source), now
         )
-        self._objections.update(objections)
+        self._object(objections, source, now)
         return self._supervised.velocity
 
     def _admit(self, command: Command, now: float) -> Objection | None:
         age = self._max_age(command.source)
         self._supervised, objection = supervisor.admit(self._limits, self._supervised, command, age, now)
         if objection is not None:
-            self._objections[objection] += 1
+            self._object((objection,), command.source, now)
         return objection
+
+    def _object(self, objections: Iterable[Objection], source: Source, now: float) -> None:
+        """Count always; name each kind once."""
+        for objection in objections:
+            self._objections[objection] += 1
+            if objection in _NAMED:
+                self._notices.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
 
     def _max_age(self, source: Source) -> float:
         return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)

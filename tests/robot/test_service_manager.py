@@ -1,0 +1,91 @@
+from dataclasses import replace
+from math import inf, nan
+
+import pytest
+
+from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import TopicSpec
+from skytether.robot.arbiter import Link, Needs, Reason
+from skytether.robot.link import LinkMonitor, Quality
+from skytether.robot.service_manager import Patience, ServiceManager, Terms, explain, terms
+from skytether.wire.stats import SessionStats, TopicStats
+
+CMD_VEL = TopicSpec(name="cmd_vel", type="geometry_msgs/msg/Twist", direction="out", period_ms=50)
+TICK = 0.01
+
+
+def test_terms_are_read_from_the_manifest():
+    asked = ServiceNeeds(max_rtt_ms=100, max_loss=0.05)
+    assert terms(asked, [CMD_VEL], "cmd_vel") == Terms(0.1, 0.05, 0.05, 0.05)
+    assert terms(ServiceNeeds(), [CMD_VEL], "other") == Terms(None, None, 0.5, None)
+
+
+@pytest.mark.parametrize("period", [None, 0.002, 0.01])
+def test_fast_services_and_those_that_do_not_say_have_all_the_patience(period):
+    patience = Patience(period, 0.15, TICK)
+    for i in range(100):
+        patience.arrived(i * 0.01)
+    assert patience.limit_s == 0.15
+
+
+@pytest.mark.parametrize("period", [0.02, 0.03, 0.05, 0.1, 0.2, 1.0])
+def test_slower_services_are_waited_for_less_than_two_periods(period):
+    patience = Patience(period, 0.15, TICK)
+    assert patience.limit_s == max(0.15, patience.least_s), "nothing is known yet"
+    for i in range(40):
+        patience.arrived(i * period)
+    assert period < patience.limit_s <= 2 * period - TICK
+
+
+def test_uneven_commands_are_waited_for_as_long_as_they_have_been_uneven():
+    patience, at = Patience(0.05, 0.15, TICK), 0.0
+    for i in range(100):
+        at += 0.11 if i == 50 else 0.05
+        patience.arrived(at)
+    assert patience.limit_s == pytest.approx(0.11 + TICK / 2)
+    for _ in range(1300):  # 65 s
+        at += 0.05
+        patience.arrived(at)
+    assert patience.limit_s == pytest.approx(patience.least_s)
+    at += 3.0
+    patience.arrived(at)
+    assert patience.limit_s == pytest.approx(patience.least_s), "an outage says nothing about ordinary days"
+
+
+def stats(delivered: int, offered: int = 0, expired: int = 0) -> SessionStats:
+    topic = TopicStats("cmd_vel", "out", 127, delivered=delivered)
+    return SessionStats(True, (topic, TopicStats("scan", "in", 1, offered=offered, expired=expired)))
+
+
+def test_lateness_is_what_missed_its_lifespan_within_the_window():
+    monitor = LinkMonitor(window_s=2.0, least=20)
+    monitor.sample(stats(0, 100, 100), 0.0)
+    assert monitor.sample(stats(0, 200, 130), 1.0)[2:] == (pytest.approx(0.3), "", "scan")
+    assert monitor.sample(stats(0, 200, 130), 4.0).late is not None
+
+
+def test_a_service_that_sends_at_ten_times_its_rate_is_told():
+    manager = ServiceManager(Terms(period_s=0.05), "cmd_vel", 0.15)
+    for i in range(21):
+        manager.watch(stats(2 * i), i / 10)
+    assert manager.troubles() == []
+    for i in range(21):
+        manager.watch(stats(42 + 20 * i), 2 + i / 10)
+    ((kind, sentence),) = manager.troubles()
+    assert kind == "overrate"
+    assert "sends cmd_vel 200 times a second, its manifest says 20" in sentence
+
+
+def test_a_service_too_slow_for_the_robots_limits_is_told():
+    ((kind, sentence),) = ServiceManager(Terms(period_s=0.2), "cmd_vel", 0.15).troubles()
+    assert kind == "slow"
+    assert "raise limits.max_gap_s to 0.4 or more" in sentence
+
+
+@pytest.mark.parametrize("reason", list(Reason))
+def test_every_hand_over_is_explained_whatever_is_unknown(reason):
+    for link in (Link(), Link(True, 1.0, nan, nan, nan, nan), Link(True, 5.0, 0.3, 0.2, 0.1, inf)):
+        for needs in (Needs(), replace(Needs(), max_rtt_s=0.1, max_loss=0.1)):
+            sentence = explain(reason, needs, link, Quality(), 5.2)
+            assert sentence
+            assert "\n" not in sentence
