@@ -22,7 +22,7 @@ class Command:
     """A velocity that somebody wants, and where it comes from. All times in this robot's monotonic seconds.
 
     Attributes:
-        source: Who wants it.
+        source: Who wants it; a `Source`, or whoever a gate after the agent tells apart.
         linear: Forward velocity in the robot's base frame [m/s].
         angular: Rate about the vertical axis, positive to the left [rad/s].
         epoch: Counts the handshakes of the bridge; a higher one starts the sequence anew.
@@ -32,7 +32,7 @@ class Command:
         received_at: When it reached this robot.
     """
 
-    source: Source
+    source: StrEnum
     linear: float
     angular: float
     epoch: int

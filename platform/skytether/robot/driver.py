@@ -9,6 +9,7 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from math import nan
 from typing import Protocol
 
@@ -276,14 +277,14 @@ class Driver:
             self._object((objection,), command.source, now)
         return objection
 
-    def _object(self, objections: Iterable[Objection], source: Source, now: float) -> None:
+    def _object(self, objections: Iterable[Objection], source: StrEnum, now: float) -> None:
         """Count always; name each kind once."""
         for objection in objections:
             self._objections[objection] += 1
             if objection in _NAMED:
                 self._notices.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
 
-    def _max_age(self, source: Source) -> float:
+    def _max_age(self, source: StrEnum) -> float:
         return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)
 
     def _brake(self, now: float) -> Velocity:

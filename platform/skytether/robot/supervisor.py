@@ -103,7 +103,7 @@ class Supervised:
 
     velocity: Velocity = STANDSTILL
     now: float | None = None
-    held: dict[Source, Command] = field(default_factory=dict)
+    held: dict[StrEnum, Command] = field(default_factory=dict)
 
 
 def admit(
@@ -128,7 +128,7 @@ def admit(
 
 
 def step(
-    limits: Limits, state: Supervised, charge: Source, max_age_s: float, now: float
+    limits: Limits, state: Supervised, charge: StrEnum, max_age_s: float, now: float
 ) -> tuple[Supervised, tuple[Objection, ...]]:
     """Decide what the wheels are told now: the ``velocity`` of the new state.
 
@@ -142,8 +142,8 @@ def step(
     Returns:
         The new state, and everything that was objected to.
     """
-    state, elapsed = _advance(limits, state, now)
-    dt = min(elapsed, limits.max_step_s)
+    dt = elapsed(limits, state, now)
+    state = _advance(state, now)
     command = state.held.get(charge)
     objection = _objection_while_held(limits, command, max_age_s, now)
     objections: tuple[Objection, ...]
@@ -154,7 +154,7 @@ def step(
     return replace(state, velocity=velocity), objections
 
 
-def max_age(limits: Limits, source: Source, max_rtt_s: float | None) -> float:
+def max_age(limits: Limits, source: StrEnum, max_rtt_s: float | None) -> float:
     """Oldest information that a source may act on [s].
 
     From the cloud: what a service needs of the round trip, and the time that a command may be repeated. The clock
@@ -170,15 +170,21 @@ DEFAULT_MAX_RTT_S = 1.0
 """For services that state no need: no robot is driven by what is older."""
 
 
-def _advance(limits: Limits, state: Supervised, now: float) -> tuple[Supervised, float]:
+def elapsed(limits: Limits, state: Supervised, now: float) -> float:
+    """Time [s] that the step at ``now`` counts for: since the last one, or a period when the clock does not say."""
+    if state.now is not None and isfinite(now) and now > state.now:
+        return min(now - state.now, limits.max_step_s)
+    return limits.period_s
+
+
+def _advance(state: Supervised, now: float) -> Supervised:
     """Take the time in. When the clock did not advance, nothing that is held can be judged by it any more."""
     if state.now is None:
-        return replace(state, now=now if isfinite(now) else None), limits.period_s
-    elapsed = now - state.now
-    if isfinite(now) and elapsed > 0:
-        return replace(state, now=now), elapsed
+        return replace(state, now=now if isfinite(now) else None)
+    if isfinite(now) and now > state.now:
+        return replace(state, now=now)
     held = {source: replace(command, received_at=nan) for source, command in state.held.items()}
-    return replace(state, now=now if isfinite(now) else state.now, held=held), limits.period_s
+    return replace(state, now=now if isfinite(now) else state.now, held=held)
 
 
 def _objection_at_arrival(

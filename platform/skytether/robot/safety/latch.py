@@ -1,0 +1,72 @@
+"""The emergency stop: whoever engages it, only a person at the robot releases it. Pure.
+
+The button is a topic that says, again and again, whether it is pressed. Silence of a button that was configured stops
+the robot too, but is not latched: a driver that starts a second later than the gate is no emergency.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import nan
+
+_TOLERANCE_S = 0.05
+"""How far ahead of now something may have been heard."""
+
+
+@dataclass(frozen=True, slots=True)
+class ButtonParams:
+    """The emergency stop button.
+
+    Attributes:
+        pressed_is: The value of the topic that means pressed; False for a circuit that opens.
+        max_age_s: Silence after which the robot stops [s]; inf: the topic speaks only when it changes.
+    """
+
+    pressed_is: bool = True
+    max_age_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Latch:
+    """What is remembered.
+
+    Attributes:
+        reason: Why the robot is stopped until somebody resets it; empty: it is not.
+        pressed: What the button last said.
+        heard_at: When; NaN: never.
+    """
+
+    reason: str = ""
+    pressed: bool = False
+    heard_at: float = nan
+
+
+def engage(before: Latch, reason: str) -> Latch:
+    """Stop until reset. The first reason is kept."""
+    return before if before.reason else replace(before, reason=reason)
+
+
+def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:
+    """Take in what the button says."""
+    pressed = value is params.pressed_is
+    heard = replace(before, pressed=pressed, heard_at=now)
+    return engage(heard, "the emergency stop button was pressed") if pressed else heard
+
+
+def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch, str]:
+    """Release it.
+
+    Returns:
+        The new state, and why it was refused (empty: it was not).
+    """
+    if params is not None:
+        if before.pressed:
+            return before, "the emergency stop button is still pressed; release it first"
+        if silent(params, before, now):
+            return before, "the emergency stop button is not heard; see that its driver runs"
+    return replace(before, reason=""), ""
+
+
+def silent(params: ButtonParams, latch: Latch, now: float) -> bool:
+    """Whether the button has not been heard for too long; NaN and a clock that went back are silence."""
+    return not -_TOLERANCE_S <= now - latch.heard_at <= params.max_age_s

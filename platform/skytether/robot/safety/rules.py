@@ -1,0 +1,321 @@
+"""The order before the wheels: who drives -> supervisor -> zones -> wheels. Pure: time is an argument.
+
+Why it holds: at every step the robot has a stop on its present curve that the step before found free. A new velocity is
+taken only if the same is true of it and the wheels can reach it; else the robot brakes on the old curve.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from math import inf, isfinite
+
+import numpy as np
+
+from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.messages import Bool, Joy, LaserScan, Message, Range
+from skytether.robot import supervisor
+from skytether.robot.command import Command
+from skytether.robot.supervisor import Limits, Objection, Supervised
+
+from . import joystick, latch
+from . import limits as reach
+from .footprint import Footprint, Points
+from .joystick import Grip, Joystick, JoystickParams
+from .latch import ButtonParams, Latch
+from .ranges import UNKNOWN, Mount, Sight, View, view
+from .zones import Allowed, Zone, ZoneParams, Zones
+
+_NOTHING: Points = np.empty((0, 2))
+_ORDINARY = frozenset({Objection.LINEAR_ACCELERATION, Objection.ANGULAR_ACCELERATION})
+"""Every start and every turn meets these limits; they are counted and not named."""
+_EVENTS = 32
+"""Troubles of single messages that are kept until the next step names them."""
+
+
+class Hand(StrEnum):
+    """Who drives."""
+
+    AGENT = "agent"
+    JOYSTICK = "joystick"
+    NOBODY = "nobody"
+
+
+class Action(StrEnum):
+    """What to do about a sensor that does not see."""
+
+    STOP = "stop"
+    SLOW = "slow"
+    FREE = "free"
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSensor:
+    """A laser or a sonar.
+
+    Attributes:
+        mount: Where it is and how far it is to be believed.
+        max_age_s: Silence after which it is stale [s].
+        on_unknown: When it is blind, silent or makes no sense.
+        on_empty: When it reports nothing within reach in any direction.
+    """
+
+    mount: Mount = field(default_factory=Mount)
+    max_age_s: float = 0.3
+    on_unknown: Action = Action.STOP
+    on_empty: Action = Action.SLOW
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """Everything that is configured.
+
+    Attributes:
+        footprint: Outline of the robot with all that it carries.
+        limits: The supervisor's; `max_gap_s` is the age at which a command of the agent ends.
+        zones: Sizes of the zones.
+        sensors: By topic.
+        joystick: None: there is none.
+        joystick_topic: Its topic.
+        button: The emergency stop button; None: there is none.
+        button_topic: Its topic.
+    """
+
+    footprint: Footprint
+    limits: Limits = field(default_factory=Limits)
+    zones: ZoneParams = field(default_factory=ZoneParams)
+    sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
+    joystick: JoystickParams | None = None
+    joystick_topic: str = "joy"
+    button: ButtonParams | None = None
+    button_topic: str = "estop"
+
+    def topics(self) -> dict[str, tuple[type[Message], ...]]:
+        """What is listened to, and the message types that are understood there."""
+        topics: dict[str, tuple[type[Message], ...]] = dict.fromkeys(self.sensors, (LaserScan, Range))
+        if self.joystick is not None:
+            topics[self.joystick_topic] = (Joy,)
+        if self.button is not None:
+            topics[self.button_topic] = (Bool,)
+        return topics
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What one step decided.
+
+    Attributes:
+        velocity: For the wheels.
+        hand: Who drives.
+        zone: What lies ahead.
+        way: Of the outermost corner until the stop zone [m]; inf: nothing near.
+        share: Of the wanted velocity that zones and sensors left.
+        troubles: All that stands in the way now: a sentence for people, by kind.
+    """
+
+    velocity: Velocity
+    hand: Hand
+    zone: Zone
+    way: float
+    share: float
+    troubles: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    view: View
+    at: float
+    stamp: tuple[int, int]
+
+
+class Gate:
+    """Takes in commands and readings as they come, and says at each step what the wheels are told.
+
+    Args:
+        rules: What is configured; nothing that arrives changes it.
+        stopped: Why the robot is to stand until somebody resets it; empty: it is not.
+    """
+
+    def __init__(self, rules: Rules, stopped: str = "") -> None:
+        self.counts: Counter[str] = Counter()
+        """What was objected to, by kind."""
+        self._rules = rules
+        self._zones = Zones(rules.zones, rules.footprint, rules.limits)
+        self._supervised = Supervised()
+        self._joystick = Joystick()
+        self._latch = Latch(reason=stopped)
+        self._seen: dict[str, _Seen] = {}
+        self._zone = Zone.CLEAR
+        self._count = 0
+        self._events: dict[str, str] = {}
+
+    @property
+    def stopped(self) -> str:
+        """Why the robot stands until somebody resets it; empty: it does not."""
+        return self._latch.reason
+
+    def command(self, command: Command, now: float) -> Objection | None:
+        """Take a velocity in that the agent wants; its ``source`` must be `Hand.AGENT`."""
+        limits = self._rules.limits
+        self._supervised, objection = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
+        if objection is not None:
+            self._event(f"command:{objection}", f"a command of the agent is refused: {_SAYS[objection]}")
+        return objection
+
+    def sense(self, topic: str, message: Message, now: float) -> None:
+        """Take a message in from one of the robot's own sensors. Never raises for what it holds."""
+        rules = self._rules
+        if topic in rules.sensors:
+            self._look(topic, message, now)
+        elif rules.joystick is not None and topic == rules.joystick_topic and isinstance(message, Joy):
+            self._hear_joystick(rules.joystick, message, now)
+        elif rules.button is not None and topic == rules.button_topic and isinstance(message, Bool):
+            self._latch = latch.hear(rules.button, self._latch, bool(message.data), now)
+        else:
+            self._event(f"topic:{topic[:64]}", f"{topic[:64]}: a {message.TYPE} is not expected there and not used")
+
+    def engage(self, reason: str) -> None:
+        """Emergency stop, until `reset`."""
+        self._latch = latch.engage(self._latch, reason)
+
+    def reset(self, now: float) -> str:
+        """End the emergency stop and forget all commands; only new ones move the robot.
+
+        Returns:
+            Why it was refused; empty: it was not.
+        """
+        self._latch, refused = latch.reset(self._rules.button, self._latch, now)
+        if not refused:
+            self._joystick = Joystick()
+            self._supervised = replace(
+                self._supervised, held={k: replace(v, received_at=-inf) for k, v in self._supervised.held.items()}
+            )
+        return refused
+
+    def step(self, now: float) -> Decision:
+        """Decide what the wheels are told until the next step. Never raises; whatever fails stands still."""
+        troubles: dict[str, str] = self._events
+        self._events = {}
+        try:
+            decision = self._decide(now, troubles)
+        except Exception as error:  # a bug in here must not keep the wheels turning
+            troubles["internal"] = f"the gate itself failed and stops the robot: {type(error).__name__}: {error}"
+            decision = Decision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
+            self._supervised = Supervised(held=self._supervised.held)
+        self.counts.update(troubles.keys())
+        return decision
+
+    def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
+        before, dt = self._supervised.velocity, supervisor.elapsed(self._rules.limits, self._supervised, now)
+        hand = self._hand(now, troubles)
+        wanted = self._supervise(hand, now, troubles)
+        allowed = self._see(wanted, now, troubles)
+        velocity = Velocity(wanted.linear * allowed.share, wanted.angular * allowed.share)
+        if not reach.within_reach(self._rules.limits, before, velocity, dt):
+            velocity = reach.brake_on_curve(self._rules.limits, before, dt)
+        if not (isfinite(velocity.linear) and isfinite(velocity.angular)):
+            velocity = STANDSTILL
+        self._supervised = replace(self._supervised, velocity=velocity)
+        self._zone = allowed.zone
+        return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
+
+    def _hand(self, now: float, troubles: dict[str, str]) -> Hand:
+        rules = self._rules
+        if rules.joystick is not None:
+            self._joystick = joystick.look(rules.joystick, self._joystick, now)
+        if self._latch.reason:
+            troubles["stopped"] = f"emergency stop: {self._latch.reason}; `skytether robot reset` ends it"
+            return Hand.NOBODY
+        if rules.button is not None and latch.silent(rules.button, self._latch, now):
+            troubles["button"] = f"{rules.button_topic}: the emergency stop button is not heard; the robot stands"
+            return Hand.NOBODY
+        if self._joystick.grip is Grip.LOST:
+            troubles["joystick"] = (
+                f"{rules.joystick_topic}: fell silent with the button held; the robot stands until it is heard with the"
+                " button up, or until `skytether robot reset`"
+            )
+            return Hand.NOBODY
+        return Hand.JOYSTICK if self._joystick.grip is Grip.HELD else Hand.AGENT
+
+    def _supervise(self, hand: Hand, now: float, troubles: dict[str, str]) -> Velocity:
+        limits = self._limits(hand)
+        self._supervised, objections = supervisor.step(limits, self._supervised, hand, limits.max_gap_s, now)
+        for objection in objections:
+            if objection in _ORDINARY:
+                self.counts[f"{hand}:{objection}"] += 1
+            elif hand is not Hand.NOBODY:
+                troubles[f"{hand}:{objection}"] = f"{hand}: {_SAYS[objection]}"
+        return self._supervised.velocity
+
+    def _see(self, wanted: Velocity, now: float, troubles: dict[str, str]) -> Allowed:
+        """What zones and sensors leave of a velocity."""
+        points, oldest, most = [_NOTHING], 0.0, 1.0
+        for topic, sensor in self._rules.sensors.items():
+            seen = self._seen.get(topic)
+            age = inf if seen is None else now - seen.at
+            if seen is None or not -self._rules.limits.clock_tolerance_s <= age <= sensor.max_age_s:
+                sight, detail = Sight.STALE, "nothing has come yet" if seen is None else f"silent for {age:.1f} s"
+            else:
+                sight, detail = seen.view.sight, seen.view.detail
+                points.append(seen.view.points)
+                oldest = max(oldest, age)
+            action = _action(sensor, sight)
+            if action is not Action.FREE:
+                verb = "the robot stands" if action is Action.STOP else "the robot goes slowly"
+                troubles[f"sensor:{topic}:{sight}"] = f"{topic}: is {sight}: {detail}; {verb}"
+                most = min(most, 0.0 if action is Action.STOP else self._zones.slow(wanted))
+        allowed = self._zones.allow(wanted, np.concatenate(points), oldest, self._zone)
+        return replace(allowed, share=min(allowed.share, most))
+
+    def _look(self, topic: str, message: Message, now: float) -> None:
+        header = message.header if isinstance(message, LaserScan | Range) else None
+        stamp = (header.stamp.sec, header.stamp.nanosec) if header else (0, 0)
+        before = self._seen.get(topic)
+        if before is not None and stamp == before.stamp and any(stamp):
+            self._event(f"sensor:{topic}:repeated", f"{topic}: sends the same scan again, which counts as silence")
+            return
+        self._seen[topic] = _Seen(view(self._rules.sensors[topic].mount, message), now, stamp)
+
+    def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> None:
+        self._joystick, wrong = joystick.hear(params, self._joystick, message, now)
+        if wrong:
+            self._event("joystick:message", f"{self._rules.joystick_topic}: {wrong}")
+        if self._joystick.grip is Grip.HELD:
+            self._count += 1
+            linear, angular = self._joystick.wanted
+            command = Command(Hand.JOYSTICK, linear, angular, 0, self._count, now, 0.0, now)
+            limits = self._limits(Hand.JOYSTICK)
+            self._supervised, _ = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
+
+    def _limits(self, hand: Hand) -> Limits:
+        params = self._rules.joystick
+        if hand is Hand.JOYSTICK and params is not None:
+            return replace(self._rules.limits, max_gap_s=params.max_age_s)
+        return self._rules.limits
+
+    def _event(self, kind: str, sentence: str) -> None:
+        if len(self._events) < _EVENTS:
+            self._events[kind] = sentence
+
+
+def _action(sensor: RangeSensor, sight: Sight) -> Action:
+    if sight in UNKNOWN:
+        return sensor.on_unknown
+    return sensor.on_empty if sight is Sight.EMPTY else Action.FREE
+
+
+_SAYS: Mapping[Objection, str] = {
+    Objection.NOT_FINITE: "its velocity is NaN or infinite",
+    Objection.SEQUENCE: "it is not newer than one that was taken before",
+    Objection.STALE: "it was made too long ago",
+    Objection.GAP: "the last valid command is too old; the robot stops",
+    Objection.FUTURE: "it claims to come from the future",
+    Objection.CLOCK: "the clock did not advance, or its time cannot be judged",
+    Objection.NO_COMMAND: "no valid command has come yet",
+    Objection.LINEAR_LIMIT: "it wants to go faster than the limit, and gets the limit",
+    Objection.ANGULAR_LIMIT: "it wants to turn faster than the limit, and gets the limit",
+    Objection.LINEAR_ACCELERATION: "it wants to change speed faster than the limit",
+    Objection.ANGULAR_ACCELERATION: "it wants to change its turn faster than the limit",
+}

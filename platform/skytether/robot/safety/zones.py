@@ -1,0 +1,140 @@
+"""Slow and stop zones in the direction of motion: what share of a velocity the robot may have. Pure.
+
+The stop zone is the footprint with room around. A velocity is allowed as far as the robot, going on along the same
+curve, would come to a standstill before anything that is seen gets into that zone: with c the time until contact at
+this velocity, r the reaction time and d the slow-down that braking allows, the share s solves
+``s r + s^2 / (2 d) = c``.
+Within the slow zone, that many metres of way before the stop zone, the speed has a limit as well.
+
+The way is that of the outermost corner, so that the same metres hold for turning on the spot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import inf, isinf, sqrt
+
+import numpy as np
+
+from skytether.control.admittance import Velocity
+from skytether.robot.supervisor import Limits
+
+from . import limits as reach
+from .footprint import Footprint, Points
+
+_TOUCH_M = 0.005
+"""Way before the stop zone at which the robot stands, instead of creeping up to it for ever."""
+
+
+class Zone(StrEnum):
+    """What lies ahead."""
+
+    CLEAR = "clear"
+    SLOW = "slow"
+    STOP = "stop"
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneParams:
+    """Sizes of the zones.
+
+    Attributes:
+        stop_m: Room around the footprint that nothing may get into [m].
+        slow_m: Length of the slow zone before the stop zone, along the way [m].
+        slow_speed: Of the outermost corner within the slow zone [m/s].
+        hysteresis_m: More way than this must be free, or be free beyond the slow zone, before a zone is left [m].
+        reaction_s: From the light of the laser to the first effect of the brake, without the age of the scan [s].
+    """
+
+    stop_m: float = 0.1
+    slow_m: float = 0.5
+    slow_speed: float = 0.1
+    hysteresis_m: float = 0.05
+    reaction_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse zones that would not stop.
+
+        Raises:
+            ValueError: A field is out of its range; the text names it.
+        """
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if not 0 < value < inf:
+                raise ValueError(f"zones: {name} must be above 0 and finite, not {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class Allowed:
+    """What the zones say.
+
+    Attributes:
+        share: Of the velocity, 0 to 1.
+        zone: What lies ahead.
+        way: Of the outermost corner until something gets into the stop zone [m]; inf: nothing near.
+    """
+
+    share: float
+    zone: Zone
+    way: float
+
+
+class Zones:
+    """The zones of one robot.
+
+    Args:
+        params: Sizes.
+        footprint: Outline of the robot with all that it carries.
+        limits: What the wheels may do; the braking among them is relied upon.
+    """
+
+    def __init__(self, params: ZoneParams, footprint: Footprint, limits: Limits) -> None:
+        self.stop = footprint.inflated(params.stop_m)
+        self._params = params
+        self._limits = limits
+        self._radius = footprint.radius
+
+    def speed(self, velocity: Velocity) -> float:
+        """Of the outermost corner, at most [m/s]."""
+        return abs(velocity.linear) + abs(velocity.angular) * self._radius
+
+    def slow(self, velocity: Velocity) -> float:
+        """The share of a velocity that is not faster than the slow zone allows."""
+        speed = self.speed(velocity)
+        return min(1.0, self._params.slow_speed / speed) if speed else 1.0
+
+    def allow(self, velocity: Velocity, points: Points, age: float, before: Zone) -> Allowed:
+        """Say what share of a velocity is safe.
+
+        Args:
+            velocity: What is wanted.
+            points: Everything that is seen, shape (n, 2), base frame [m].
+            age: Of the oldest of them [s].
+            before: What was said the time before.
+        """
+        speed = self.speed(velocity)
+        if speed == 0:
+            return Allowed(1.0, before, inf)
+        p = self._params
+        reaction = p.reaction_s + age
+        slowdown = reach.slowdown(self._limits, velocity)
+        horizon = max(p.slow_m + p.hysteresis_m, speed * (reaction + 0.5 / slowdown))
+        near = points[np.hypot(points[:, 0], points[:, 1]) <= self.stop.radius + horizon]
+        contact = self.stop.time_to_contact(near, velocity.linear, velocity.angular)
+        way = contact * speed
+        zone = self._zone(way, before)
+        if zone is Zone.STOP:
+            return Allowed(0.0, zone, way)
+        share = 1.0 if isinf(contact) else min(1.0, slowdown * (sqrt(reaction**2 + 2 * contact / slowdown) - reaction))
+        if zone is Zone.SLOW:
+            share = min(share, self.slow(velocity))
+        return Allowed(share, zone, way)
+
+    def _zone(self, way: float, before: Zone) -> Zone:
+        p = self._params
+        if way <= _TOUCH_M + (p.hysteresis_m if before is Zone.STOP else 0.0):
+            return Zone.STOP
+        if way <= p.slow_m + (p.hysteresis_m if before is not Zone.CLEAR else 0.0):
+            return Zone.SLOW
+        return Zone.CLEAR

@@ -1,0 +1,131 @@
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.messages import Joy
+from skytether.robot.safety import joystick, latch, limits
+from skytether.robot.safety.joystick import Grip, Joystick, JoystickParams
+from skytether.robot.safety.latch import ButtonParams, Latch
+from skytether.robot.supervisor import Limits
+
+LIMITS = Limits()  # accelerates 1 m/s^2 and 2 rad/s^2, brakes 2 m/s^2 and 4 rad/s^2
+PAD = JoystickParams(deadman=1, linear_axis=1, angular_axis=0, linear=0.2, angular=0.4, max_age_s=0.3)
+
+
+def joy(axes, buttons) -> Joy:
+    return Joy(axes=np.array(axes, dtype=np.float32), buttons=np.array(buttons, dtype=np.int32))
+
+
+def test_the_slowest_axis_says_how_fast_a_curve_can_be_left():
+    # 0.2 m/s at 2 m/s^2: 10 per second; 0.5 rad/s at 4 rad/s^2: 8 per second.
+    assert limits.slowdown(LIMITS, Velocity(0.2, 0.0)) == pytest.approx(10.0)
+    assert limits.slowdown(LIMITS, Velocity(-0.2, 0.5)) == pytest.approx(8.0)
+    assert limits.slowdown(LIMITS, STANDSTILL) == inf
+
+
+def test_braking_keeps_the_curvature():
+    # 8 per second over 10 ms: 92 % is left of both.
+    assert limits.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.01) == pytest.approx((0.184, 0.46))
+    assert limits.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.2) == STANDSTILL
+    assert limits.brake_on_curve(LIMITS, STANDSTILL, 0.2) == STANDSTILL
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "reached"),
+    [
+        ((0.1, 0.0), (0.11, 0.0), True),
+        ((0.1, 0.0), (0.12, 0.0), False),  # 1 m/s^2 over 10 ms is 0.01
+        ((0.1, 0.0), (0.08, 0.0), True),  # braking is 0.02
+        ((0.1, 0.0), (0.07, 0.0), False),
+        ((-0.1, 0.0), (-0.12, 0.0), False),
+        ((-0.1, 0.0), (-0.08, 0.0), True),
+        ((0.01, 0.0), (-0.005, 0.0), True),  # 5 ms to zero, 5 ms on
+        ((0.01, 0.0), (-0.006, 0.0), False),
+        ((0.1, 0.3), (0.1, 0.33), False),  # 2 rad/s^2: 0.02
+        ((0.1, 0.3), (0.1, 0.26), True),  # 4 rad/s^2: 0.04
+    ],
+)
+def test_what_the_wheels_can_reach_in_one_tick(before, after, reached):
+    assert limits.within_reach(LIMITS, Velocity(*before), Velocity(*after), 0.01) is reached
+
+
+def test_a_held_button_drives_and_letting_go_gives_back():
+    state, wrong = joystick.hear(PAD, Joystick(), joy([0.5, 1.0], [0, 1]), 1.0)
+    assert (state.grip, wrong) == (Grip.HELD, "")
+    assert state.wanted == pytest.approx((0.2, 0.2))  # full forward, half left
+    assert joystick.look(PAD, state, 1.29).grip is Grip.HELD
+    state, _ = joystick.hear(PAD, state, joy([0.5, 1.0], [0, 0]), 1.4)
+    assert (state.grip, state.wanted) == (Grip.OFF, STANDSTILL)
+
+
+@pytest.mark.parametrize("now", [1.31, 0.69, nan, inf, -inf])
+def test_a_held_joystick_that_falls_silent_is_lost_until_it_is_heard_with_the_button_up(now):
+    held, _ = joystick.hear(PAD, Joystick(), joy([0, 1], [0, 1]), 1.0)
+    lost = joystick.look(PAD, held, now)
+    assert (lost.grip, lost.wanted) == (Grip.LOST, STANDSTILL)
+    assert joystick.look(PAD, lost, 1.0) == lost  # time alone does not give it back
+    again, _ = joystick.hear(PAD, lost, joy([0, 0], [0, 0]), 5.0)
+    assert again.grip is Grip.OFF
+
+
+def test_a_joystick_that_was_not_held_may_be_silent():
+    assert joystick.look(PAD, Joystick(), 1e6).grip is Grip.OFF
+
+
+@pytest.mark.parametrize(
+    ("message", "grip", "says"),
+    [
+        (joy([0, 0], []), Grip.OFF, "0 buttons"),
+        (joy([0], [0, 1]), Grip.HELD, "1 axes"),
+        (joy([0, nan], [0, 1]), Grip.HELD, "no number"),
+        (joy([inf, 0], [0, 1]), Grip.HELD, "no number"),
+    ],
+)
+def test_a_joystick_of_another_make_drives_nothing(message, grip, says):
+    state, wrong = joystick.hear(PAD, Joystick(), message, 1.0)
+    assert (state.grip, state.wanted) == (grip, STANDSTILL)
+    assert says in wrong
+
+
+def test_axes_beyond_their_end_are_at_their_end():
+    state, _ = joystick.hear(PAD, Joystick(), joy([-7, 3], [0, 1]), 1.0)
+    assert state.wanted == pytest.approx((0.2, -0.4))
+
+
+def test_the_first_reason_of_an_emergency_stop_is_kept_until_reset():
+    state = latch.engage(latch.engage(Latch(), "a person said so"), "another did")
+    assert state.reason == "a person said so"
+    assert latch.reset(None, state, 0.0) == (Latch(), "")
+
+
+def test_a_pressed_button_latches_and_is_not_reset_while_pressed():
+    button = ButtonParams(pressed_is=True, max_age_s=0.5)
+    state = latch.hear(button, Latch(), True, 1.0)
+    assert "button was pressed" in state.reason
+    assert "still pressed" in latch.reset(button, state, 1.1)[1]
+    state = latch.hear(button, state, False, 1.2)
+    assert state.reason  # letting go is not enough
+    assert "not heard" in latch.reset(button, state, 1.8)[1]
+    state, refused = latch.reset(button, state, 1.3)
+    assert (state.reason, refused) == ("", "")
+
+
+def test_a_circuit_that_opens_is_pressed_when_false():
+    button = ButtonParams(pressed_is=False)
+    assert latch.hear(button, Latch(), False, 0.0).reason
+    assert not latch.hear(button, Latch(), True, 0.0).reason
+
+
+@pytest.mark.parametrize(
+    ("now", "silent"), [(1.5, False), (1.51, True), (0.97, False), (0.9, True), (nan, True), (inf, True)]
+)
+def test_a_button_is_silent_when_it_is_not_heard(now, silent):
+    assert latch.silent(ButtonParams(max_age_s=0.5), Latch(heard_at=1.0), now) is silent
+    assert latch.silent(ButtonParams(max_age_s=0.5), Latch(), now) is True
+
+
+def test_a_button_that_speaks_only_when_it_changes_is_never_silent_once_heard():
+    assert latch.silent(ButtonParams(max_age_s=inf), Latch(heard_at=1.0), 1e6) is False
+    assert latch.silent(ButtonParams(max_age_s=inf), Latch(), 1e6) is True
