@@ -1,6 +1,8 @@
 import errno
 import select
 import socket
+import sys
+import time
 
 import pytest
 
@@ -61,6 +63,16 @@ def test_the_sender_is_told(sockets):
     sender.send(b"x", receiver.address)
     select.select([receiver], (), (), 2)
     assert receiver.receive()[1] == sender.address
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells when a datagram came")
+def test_how_long_a_datagram_waited_for_us_is_told(sockets):
+    sender, receiver = sockets(), sockets()
+    sender.send(b"x", receiver.address)
+    assert select.select([receiver], (), (), 30)[0]
+    time.sleep(0.05)
+    assert receiver.receive() is not None
+    assert 0.045 <= receiver.waited < 30
 
 
 class RefusingSocket:

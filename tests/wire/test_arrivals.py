@@ -200,3 +200,16 @@ def test_times_wrap_and_any_times_are_borne():
     for i in range(40):
         flood.add_all(array("H", [7] * 4000).tobytes(), 1200, i * 1e-3)
         assert len(flood._times) <= COLLECT
+
+
+@pytest.mark.parametrize(("pause", "queue"), [(0.015, False), (0.2, True)])
+def test_what_waits_for_a_busy_receiver_is_no_queue_unless_it_cannot_keep_up(pause, queue):
+    path = Path(0, Config(), 0.0)
+    for number in range(2000):
+        sent = number * 0.001
+        late = pause if sent >= 1.0 else 0.0
+        path.comes(500, 1, sent + 0.01 + late, late)
+        path.arrived(number, ticks(sent), 500)
+        if number % 100 == 99:
+            path.feedback(sent + 0.01 + late)
+    assert (path.feedback(2.5).queue > 0.05) is queue

@@ -11,6 +11,8 @@ import contextlib
 import errno
 import socket
 import struct
+import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 
@@ -19,6 +21,7 @@ UDP_SEGMENT = 103
 UDP_GRO = 104
 SO_SNDBUFFORCE = 32
 SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
 IP_MTU_DISCOVER = 10
 IPV6_MTU_DISCOVER = 23
 PMTUDISC_DO = 2
@@ -34,7 +37,9 @@ Address = tuple[str, int] | tuple[str, int, int, int]
 
 _SEGMENT_SIZE = struct.Struct("=H")
 _GRO_SIZE = struct.Struct("=i")
-_GRO_SPACE = socket.CMSG_SPACE(_GRO_SIZE.size)
+_STAMP = struct.Struct("@ll")
+"""Seconds and nanoseconds of the system's wall clock."""
+_ANCILLARY_SPACE = socket.CMSG_SPACE(_GRO_SIZE.size) + socket.CMSG_SPACE(_STAMP.size)
 _NO_BATCHES = (errno.EINVAL, errno.EIO, errno.EOPNOTSUPP)
 """What a kernel or network device answers that cannot cut this batch."""
 
@@ -57,6 +62,7 @@ class DatagramSocket:
         coalescing: Whether receiving uses UDP_GRO.
         errors: Datagrams or batches that the system refused, by name of the error (``EMSGSIZE``).
         too_large: Size of the latest datagram that was refused as larger than the path takes; None if none was.
+        waited: Seconds for which what `receive` returned last had been in the kernel; 0 where that does not tell.
     """
 
     def __init__(
@@ -93,6 +99,9 @@ class DatagramSocket:
                     self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.encode())
             self.segmentation = batches and self._kernel_has(UDP_SEGMENT, 0)
             self.coalescing = batches and self._kernel_has(UDP_GRO, 1)
+            if sys.platform == "linux":
+                with contextlib.suppress(OSError):
+                    self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._socket.bind(address)
         except BaseException:
             self._socket.close()
@@ -101,6 +110,7 @@ class DatagramSocket:
         self.address: tuple[str, int] = (name[0], name[1])
         self.errors: Counter[str] = Counter()
         self.too_large: int | None = None
+        self.waited = 0.0
         self._buffer = memoryview(bytearray(65_536)) if scratch is None else scratch
 
     @property
@@ -136,16 +146,20 @@ class DatagramSocket:
         """
         while True:
             try:
-                size, ancillary, _, address = self._socket.recvmsg_into([self._buffer], _GRO_SPACE)
+                size, ancillary, _, address = self._socket.recvmsg_into([self._buffer], _ANCILLARY_SPACE)
             except BlockingIOError:
                 return None
             except OSError as error:  # an ICMP answer to something sent before; the next datagram is not affected
                 self._count(error)
                 continue
             segment = None
+            self.waited = 0.0
             for level, kind, data in ancillary:
-                if level == socket.IPPROTO_UDP and kind == UDP_GRO:
+                if kind == UDP_GRO and level == socket.IPPROTO_UDP:
                     segment = _GRO_SIZE.unpack(data)[0]
+                elif kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
+                    seconds, nanoseconds = _STAMP.unpack(data)
+                    self.waited = max(0.0, time.time() - seconds - nanoseconds / 1e9)
             return self._buffer[:size], address, segment if segment is not None and segment < size else None
 
     def send(self, data: bytes | memoryview, address: Address, segment: int | None = None) -> int:

@@ -118,11 +118,10 @@ class Driver:
         by = None if self._service else path
         for _ in range(_TURN):
             sock = self._sockets.get(path)
-            batch = sock.receive() if sock is not None else None
-            if batch is None:
+            if sock is None or (batch := sock.receive()) is None:
                 break
             data, address, segment = batch
-            self._session.receive(data, address, time.monotonic(), segment=segment, path=by)
+            self._session.receive(data, address, time.monotonic(), segment=segment, path=by, waited=sock.waited)
             self._pass_events()
         self._advance()
 

@@ -29,9 +29,9 @@ class ClockOffset:
         self.error = math.inf
         """The true offset is within ``offset +- error``, as of the last exchange; inf before the first."""
 
-    def error_at(self, now: float) -> float:
-        """The same as of now: the clocks have drifted since."""
-        return self.error + max(0.0, now - self._updated) * MAX_DRIFT
+    def error_at(self, when: float) -> float:
+        """The same for another moment, before or after: the clocks drift in between."""
+        return self.error + abs(when - self._updated) * MAX_DRIFT
 
     def exchange(self, t1: float, t2: float, t3: float, t4: float) -> None:
         """Take one exchange: t1, t4 on our clock, t2, t3 on the peer's."""

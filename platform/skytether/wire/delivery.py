@@ -91,7 +91,8 @@ class Delivery:
             payload = whole
         micros, clock = stamp & ~FLAG, self.clock
         if epoch is self._epoch and clock.known:
-            sent_at, error = micros / 1e6 - clock.offset, clock.error_at(now)
+            sent_at = micros / 1e6 - clock.offset
+            error = clock.error_at(sent_at)
         else:
             sent_at, error = now, math.inf
         if topic.topic.reliable:

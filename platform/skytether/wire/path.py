@@ -28,6 +28,9 @@ MUCH_AT_FIRST = 8
 """The same on a path not known well yet: that it is too slow for the first bursts should be known before the next."""
 FAMILIAR = 500
 """Packets from which a path is known well."""
+OWN_DELAY = 0.02
+"""Most seconds for which packets may wait for this end without that counting as a queue on the path: what waits longer
+fills the system's buffer, so the peer has to slow down."""
 
 
 class Transmit(NamedTuple):
@@ -43,10 +46,10 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "_assumed_loss", "_fed_back_at", "_settle_at", "address", "bytes_received", "bytes_sent", "control", "cost",
-        "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest",
-        "next_number", "pacer", "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy",
-        "rtt", "rtts",
+        "_arrived_at", "_assumed_loss", "_fed_back_at", "_settle_at", "address", "bytes_received", "bytes_sent",
+        "control", "cost", "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out",
+        "losses", "mtu", "newest", "next_number", "pacer", "packets_received", "packets_sent", "peer",
+        "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -76,6 +79,7 @@ class Path:
         self.control = RateControl(config.rate_bps, now)
         self.redundancy = Redundancy(config)
         self._assumed_loss = config.assumed_loss
+        self._arrived_at = now
         self._measure(now)
 
     def _measure(self, now: float) -> None:
@@ -87,15 +91,24 @@ class Path:
         self._fed_back_at = now
         self._settle_at = now
 
-    def arrived(self, number: int, time: int, size: int, now: float) -> None:
+    def comes(self, size: int, packets: int, now: float, waited: float) -> None:
+        """So many bytes in so many packets are here, of which `arrived` or `arrived_all` tells more.
+
+        They ``waited`` for this end to look: a busy machine is no slow path, unless it cannot keep up.
+        """
+        self.bytes_received += size
+        self.packets_received += packets
+        self._arrived_at = now - min(waited, OWN_DELAY)
+
+    def arrived(self, number: int, time: int, size: int) -> None:
         """A packet of ``size`` bytes came; ``time`` is that of its sending in ticks."""
         self.losses.add(number, time)
-        self.delays.add(time, size, now)
+        self.delays.add(time, size, self._arrived_at)
 
-    def arrived_all(self, numbers: bytes, times: bytes, size: int, now: float) -> None:
+    def arrived_all(self, numbers: bytes, times: bytes, size: int) -> None:
         """Several packets came: native unsigned 32-bit numbers, 16-bit times."""
         self.losses.add_all(numbers, times)
-        self.delays.add_all(times, size, now)
+        self.delays.add_all(times, size, self._arrived_at)
 
     @property
     def much_arrived(self) -> bool:

@@ -85,7 +85,15 @@ class Receiver:
         self.messages = Reassembly(config.reassembly_limit, on_expired)
         self._handshakes = Reassembly(2 * MAX_HANDSHAKE, _nothing)
 
-    def receive(self, data: memoryview, address: Hashable, path: int | None, now: float, segment: int | None) -> None:
+    def receive(
+        self,
+        data: memoryview,
+        address: Hashable,
+        path: int | None,
+        now: float,
+        segment: int | None,
+        waited: float = 0.0,
+    ) -> None:
         """Take a datagram, or a batch of datagrams of ``segment`` bytes (the last may be shorter).
 
         Args:
@@ -94,14 +102,14 @@ class Receiver:
             path: By which path they came; None: the headers say it, and all of a batch came by the same.
             now: Time.
             segment: Size of the datagrams of a batch.
+            waited: Seconds for which this end did not get round to it.
         """
         total = len(data)
         by = path if path is not None else data[PATH_AT] if total > PATH_AT else 0
         known = self._find_path(by)
         several = segment is not None and 0 < segment < total
         if known is not None:
-            known.bytes_received += total
-            known.packets_received += -(-total // segment) if several and segment else 1
+            known.comes(total, -(-total // segment) if several and segment else 1, now, waited)
         if not several or segment is None:
             self._packet(data, address, by, known, now)
             return
@@ -144,7 +152,7 @@ class Receiver:
             self.rejected["path"] += 1
             return
         if path is not None:
-            path.arrived(packet, time, len(data), now)
+            path.arrived(packet, time, len(data))
         number = high << 32 | low
         if length != size:
             entry = self._entry(epoch, number, topic, length, block, bytes(data[:COMMON_SIZE]), size, 1, now)
@@ -171,7 +179,7 @@ class Receiver:
         if path is not None:
             numbers = np.ascontiguousarray(rows[:, NUMBER_AT:TIME_AT]).view(">u4").astype(np.uint32)
             times = np.ascontiguousarray(rows[:, TIME_AT:HEADER_SIZE]).view(">u2").astype(np.uint16)
-            path.arrived_all(numbers.tobytes(), times.tobytes(), rows.shape[1], now)
+            path.arrived_all(numbers.tobytes(), times.tobytes(), rows.shape[1])
         common = rows[0, :COMMON_SIZE].tobytes()
         entry = self._entry(epoch, number, topic, length, block, common, size, len(rows), now)
         if entry is not None:

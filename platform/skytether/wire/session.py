@@ -231,14 +231,16 @@ class Session:
         *,
         segment: int | None = None,
         path: int | None = None,
+        waited: float = 0.0,
     ) -> None:
         """Take one datagram, or a batch of datagrams of ``segment`` bytes each (the last may be shorter).
 
         Never raises, whatever the bytes. ``data`` may be reused after the call. ``path`` is that of the socket; None
-        (the service's end has one socket for all) takes the packets' word for it.
+        (the service's end has one socket for all) takes the packets' word for it. ``waited`` are the seconds for which
+        it lay in this machine before: they are not the path's.
         """
         if not self._closed:
-            self._receiver.receive(memoryview(data), address, path, now, segment)
+            self._receiver.receive(memoryview(data), address, path, now, segment, waited)
             if self._connected:
                 self._paths.tell(now)
 
