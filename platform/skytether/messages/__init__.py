@@ -13,6 +13,8 @@ from .codec import (
     definition_of,
     encode,
     hash_of,
+    transcode,
+    transcodes,
     type_hash,
     warm,
 )
@@ -83,6 +85,8 @@ __all__ = [
     "encode",
     "hash_of",
     "quaternion_from_yaw",
+    "transcode",
+    "transcodes",
     "type_hash",
     "type_of",
     "warm",

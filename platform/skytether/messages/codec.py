@@ -7,16 +7,19 @@ them directly. The stores are loaded at first use: 60 ms each, and a few millise
 
 from __future__ import annotations
 
+import copy
 import struct
 from collections.abc import Iterable
 from functools import cache
 from typing import Any, Literal, TypeVar, overload
 
+from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from .base import Message, all_types, type_of
+from .services import BOTH, ROS2_ONLY, service_types, without_char
 from .std import Header, Time
 
 Encoding = Literal["cdr", "ros1"]
@@ -73,6 +76,60 @@ def decode(what: type[Message] | str, data: bytes | memoryview, encoding: Encodi
     return message  # type: ignore[return-value]
 
 
+def transcode(typename: str, data: bytes | memoryview, source: Encoding, target: Encoding) -> bytes:
+    """Bytes of one ROS generation as those of the other; what only one of them has is left out or zero.
+
+    Raises:
+        DecodeError: The bytes are no such message.
+        KeyError: The generations do not have the same type of this name; see `transcodes`.
+    """
+    if source == target:
+        return bytes(data)
+    if not transcodes(typename):
+        raise KeyError(f"{typename} is not the same type in ROS 1 and ROS 2")
+    try:
+        if typename in _types_with_class():
+            return encode(decode(typename, data, source), target)
+        # The same layout but for the sequence numbers of headers, which `rosbags` drops, and makes zero.
+        store = _store("cdr")
+        return bytes((store.ros1_to_cdr if source == "ros1" else store.cdr_to_ros1)(memoryview(data), typename))
+    except DecodeError:
+        raise
+    except (*_BAD_VALUES, AssertionError) as error:
+        raise DecodeError(f"{len(data)} bytes are no {typename} in {source}: {error}") from error
+
+
+@cache
+def transcodes(typename: str) -> bool:
+    """Whether `transcode` knows a type: it has a class here, or the same fields in ROS 1 and ROS 2."""
+    return _same_fields(typename, frozenset())
+
+
+def _same_fields(typename: str, above: frozenset[str]) -> bool:
+    """Whether a type has the same fields in both generations (but for upper case), all the way down."""
+    if typename in _types_with_class():
+        return True
+    both = [_store(e).fielddefs.get(typename) for e in ("ros1", "cdr")]
+    if both[0] is None or both[1] is None or typename in above:
+        return False
+    ros1, ros2 = ([(name.lower(), kind) for name, kind in d[1]] for d in both if d is not None)
+    return ros1 == ros2 and all(_same_fields(n, above | {typename}) for n in _names_in(ros1))
+
+
+def _names_in(definition: Any) -> list[str]:
+    """Types that a definition refers to."""
+    if isinstance(definition, tuple) and len(definition) == 2 and definition[0] == Nodetype.NAME:
+        return [definition[1]]
+    if isinstance(definition, tuple | list):
+        return [name for part in definition for name in _names_in(part)]
+    return []
+
+
+@cache
+def _types_with_class() -> frozenset[str]:
+    return frozenset(cls.TYPE for cls in all_types())
+
+
 def warm(types: Iterable[type[Message]], encoding: Encoding) -> None:
     """Do at start what would otherwise make the first message of each type late."""
     for cls in types:
@@ -86,16 +143,23 @@ def type_hash(cls: type[Message], encoding: Encoding) -> str:
 
 @cache
 def hash_of(typename: str, encoding: Encoding) -> str:
-    """Hash by type name, also for types that have no class here; empty if the definition is not known."""
-    store = _store(encoding)
+    """Hash by type name, also for types that have no class here; empty if the definition is not known.
+
+    Of services the name without ``_Request`` or ``_Response`` has a hash, in ROS 2 only.
+    """
+    store = _store(encoding) if encoding == "ros1" else _hashing_store()
     if typename not in store.fielddefs:
         return ""
-    return store.hash_rihs01(typename) if encoding == "cdr" else store.generate_msgdef(typename)[1]
+    if encoding == "cdr":
+        return store.hash_rihs01(typename)
+    return store.generate_msgdef(typename)[1] if "/msg/" in typename else ""
 
 
 @cache
 def definition_of(typename: str, encoding: Encoding) -> str:
     """Definition in the ``.msg`` language with those it needs, as recordings hold it; empty if not known."""
+    if "/msg/" not in typename:
+        return ""
     try:
         return _store(encoding).generate_msgdef(typename, ros_version=1 if encoding == "ros1" else 2)[0]
     except TypesysError:
@@ -113,10 +177,20 @@ def _store(encoding: Encoding) -> Typestore:
         store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
     else:
         raise ValueError(f"no encoding '{encoding}'; there are 'cdr' (ROS 2) and 'ros1'")
+    for name, (request, response) in (BOTH | ROS2_ONLY if encoding == "cdr" else BOTH).items():
+        store.register(service_types(name, request, response, hashed=encoding == "cdr"))
     ours: dict[str, Any] = {cls.TYPE: cls for cls in all_types()}
     if encoding == "ros1":
         ours[Header.TYPE] = _ros1_header
     store.types.update(ours)
+    return store
+
+
+@cache
+def _hashing_store() -> Typestore:
+    """Definitions of ROS 2 as they are hashed."""
+    store = copy.copy(_store("cdr"))
+    store.fielddefs = {name: without_char(definition) for name, definition in store.fielddefs.items()}
     return store
 
 

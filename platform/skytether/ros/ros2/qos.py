@@ -1,0 +1,109 @@
+"""Quality of service: that of ROS 2 from a row of the bridge's table and back, and its forms in liveliness tokens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from skytether.wire.topic import Topic
+
+DEFAULT_DEPTH = 42
+"""What ``rmw_zenoh_cpp`` takes for granted, and leaves out of its tokens."""
+MAX_DEPTH = 10_000
+"""Of a topic of the bridge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """What ROS 2 knows of an endpoint that matters here.
+
+    Attributes:
+        reliable: Else best effort.
+        transient_local: A newcomer gets the newest ``depth`` messages; else volatile.
+        depth: Messages kept; of a history that keeps all, as many as a topic of the bridge may.
+    """
+
+    reliable: bool = True
+    transient_local: bool = False
+    depth: int = DEFAULT_DEPTH
+
+
+SERVICE = Qos(depth=10)
+"""ROS 2's profile for services."""
+
+
+def qos_of(row: Topic, *, publishes: bool) -> Qos:
+    """What we are on the graph for a row of the bridge's table.
+
+    In ROS 2 an endpoint that offers more matches one that asks for less. So we always publish reliably (either kind of
+    subscription matches) and subscribe reliably only where the row is reliable (a best-effort subscription matches
+    either kind of publisher). A latched row is transient local with a depth of 1: the bridge keeps its newest message.
+    """
+    if row.latched:
+        return Qos(reliable=True, transient_local=True, depth=1)
+    return Qos(reliable=publishes or row.reliable, depth=row.depth)
+
+
+def row_settings(qos: Qos) -> dict[str, bool | int]:
+    """What a row of the bridge's table should say for a publisher of this quality.
+
+    A best-effort topic of sensor data is a newest-value topic of the bridge, whatever its depth: who reads late wants
+    the newest. A reliable one keeps its depth; transient local is latched.
+    """
+    if not qos.reliable:
+        return {"reliable": False, "latched": False, "depth": 1}
+    depth = 1 if qos.transient_local else max(1, min(qos.depth, MAX_DEPTH))
+    return {"reliable": True, "latched": qos.transient_local, "depth": depth}
+
+
+# --- rmw_zenoh: rmw_zenoh_cpp/src/detail/liveliness_utils.cpp, qos_to_keyexpr and keyexpr_to_qos ----------------------
+# <reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>, numbers of rmw/types.h; a default
+# (reliable, volatile, keep last, 42, no deadline, no lifespan, automatic liveliness) is left out.
+
+
+def push_rmw(qos: Qos) -> str:
+    """Quality of service in a token of ``rmw_zenoh``."""
+    reliability = "" if qos.reliable else "2"
+    durability = "1" if qos.transient_local else ""
+    depth = "" if qos.depth == DEFAULT_DEPTH else str(qos.depth)
+    return f"{reliability}:{durability}:,{depth}:,:,:,,"
+
+
+def pull_rmw(text: str) -> Qos | None:
+    """Inverse of `push_rmw`; None for what is no quality of service."""
+    parts = text.split(":")
+    history, comma, depth = parts[2].partition(",") if len(parts) >= 6 else ("", "", "")
+    if not comma or not _numbers(parts[0], parts[1], history, depth):
+        return None
+    if history == "2":
+        kept = MAX_DEPTH
+    else:
+        kept = int(depth or DEFAULT_DEPTH)
+    return Qos(reliable=parts[0] != "2", transient_local=parts[1] == "1", depth=kept)
+
+
+# --- zenoh-plugin-ros2dds: src/liveliness_mgt.rs, qos_to_key_expr and key_expr_to_qos ---------------------------------
+# <K if keyed>:<reliability>:<durability>:<history>,<depth>[:<user data>], numbers of DDS; what is not set is empty. The
+# user data of a ROS 2 endpoint holds "typehash=RIHS01_...;".
+
+
+def push_dds(qos: Qos, type_hash: str) -> str:
+    """Quality of service in a token of ``zenoh-bridge-ros2dds``, with the type's hash if it is known."""
+    text = f":{int(qos.reliable)}:{int(qos.transient_local)}:0,{qos.depth}"
+    return f"{text}:typehash={type_hash};" if type_hash else text
+
+
+def pull_dds(text: str) -> tuple[Qos, str] | None:
+    """Inverse of `push_dds`; None for what is no quality of service."""
+    parts = text.split(":", 4)
+    if len(parts) < 4 or not _numbers(parts[1], parts[2], *parts[3].split(",")):
+        return None
+    history, _, depth = parts[3].partition(",")
+    kept = MAX_DEPTH if history == "1" else int(depth or 1)
+    data = parts[4] if len(parts) > 4 else ""
+    hashes = [item.strip().removeprefix("typehash=") for item in data.split(";") if "typehash=" in item]
+    # An absent reliability is DDS's default of readers, best effort; ROS 2 sets it always.
+    return Qos(parts[1] == "1", parts[2] == "1", kept), hashes[0] if hashes else ""
+
+
+def _numbers(*texts: str) -> bool:
+    return all(not t or (t.isascii() and t.isdigit() and len(t) < 10) for t in texts)
