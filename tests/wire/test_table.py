@@ -76,3 +76,12 @@ def test_a_hash_that_one_end_does_not_know_is_no_difference():
 def test_a_topic_listed_twice_is_refused():
     with pytest.raises(ValueError, match="topic a: is in the table twice"):
         index_topics([Topic("a", "x/y", IN), Topic("a", "x/z", OUT)])
+
+
+def test_hashes_of_two_encodings_are_not_compared():
+    """An MD5 of ROS 1 and a RIHS01 of ROS 2 say nothing of each other; the robot's encoding is agreed on, and its hash."""
+    robot, service = Topic("a", "x/y", IN, "11", "ros1"), Topic("a", "x/y", IN, "RIHS01_22", "cdr")
+    ((_, agreed),) = join([robot], {"a": service})
+    assert (agreed.type_hash, agreed.encoding) == ("11", "ros1")
+    ((_, agreed),) = join([replace(robot, type_hash="")], {"a": service})
+    assert agreed.type_hash == ""

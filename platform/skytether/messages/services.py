@@ -48,8 +48,9 @@ def service_types(name: str, request: str, response: str, *, hashed: bool) -> di
     if not hashed:
         return types
     event: list[Any] = [("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo"))]
-    for part in ("request", "response"):
-        event.append((part, (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{name}_{part.capitalize()}"), 1))))
+    event += [
+        (p, (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{name}_{p.capitalize()}"), 1))) for p in ("request", "response")
+    ]
     types[f"{name}_Event"] = ([], event)
     parts = ("request", "response", "event")
     types[name] = ([], [(f"{p}_message", (Nodetype.NAME, f"{name}_{p.capitalize()}")) for p in parts])

@@ -61,13 +61,14 @@ def join(robot: Sequence[Topic], service: Mapping[str, Topic]) -> list[tuple[int
             ("direction", ours.direction.value, row.direction.value),
             ("type hash", ours.type_hash, row.type_hash),
         ):
-            if robots != services and (what != "type hash" or (robots and services)):
+            # Hashes of the two generations of ROS say nothing of each other.
+            comparable = robots and services and ours.encoding == row.encoding
+            if robots != services and (what != "type hash" or comparable):
                 raise TablesDifferError(
                     f"topic {ours.name}: the robot has {what} {robots[:80]}, the service {services[:80]}"
                 )
-        joined = replace(
-            row, name=ours.name, type=ours.type, type_hash=ours.type_hash or row.type_hash, encoding=ours.encoding
-        )
+        known = row.type_hash if ours.encoding == row.encoding else ""
+        joined = replace(row, name=ours.name, type=ours.type, type_hash=ours.type_hash or known, encoding=ours.encoding)
         agreed.append((index, joined))
     return agreed
 

@@ -18,7 +18,7 @@ def full_name(name: str, namespace: str = "/") -> str:
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     if not _TOPIC.fullmatch(full):
         raise ValueError(
-            f"'{full}' is no name of ROS 2: parts of letters, digits and '_', none starting with a digit, divided by '/'"
+            f"'{full}' is no name of ROS 2: parts of letters, digits and '_', none with a digit first, divided by '/'"
         )
     return full
 
@@ -30,7 +30,7 @@ def check_type(name: str) -> str:
         ValueError: It is none.
     """
     if not _TYPE.fullmatch(name):
-        raise ValueError(f"'{name}' is no type of ROS 2; it is written like std_msgs/msg/String or std_srvs/srv/Trigger")
+        raise ValueError(f"'{name}' is no type of ROS 2; types look like std_msgs/msg/String or std_srvs/srv/Trigger")
     return name
 
 

@@ -74,10 +74,7 @@ def pull_rmw(text: str) -> Qos | None:
     history, comma, depth = parts[2].partition(",") if len(parts) >= 6 else ("", "", "")
     if not comma or not _numbers(parts[0], parts[1], history, depth):
         return None
-    if history == "2":
-        kept = MAX_DEPTH
-    else:
-        kept = int(depth or DEFAULT_DEPTH)
+    kept = MAX_DEPTH if history == "2" else int(depth or DEFAULT_DEPTH)
     return Qos(reliable=parts[0] != "2", transient_local=parts[1] == "1", depth=kept)
 
 

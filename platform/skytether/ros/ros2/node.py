@@ -1,0 +1,349 @@
+"""Our node on a ROS 2 graph: the Zenoh session, kept in one thread, and what was made of it.
+
+The router need not be there yet: the node tries on, says so once, and says when it has joined. A router that goes and
+comes back is found again by Zenoh, which declares everything anew.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import json
+import logging
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import zenoh
+
+from .dialect import Dialect, Endpoint, Kind, NodeName
+from .endpoints import Client, Handle, Publication, Server, Subscription
+from .graph import Graph, learned_hash, mismatches
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
+MAX_OUTBOX = 1000
+"""Messages of reliable topics that wait for Zenoh."""
+MAX_WORKING = 64
+"""Calls from the graph that are worked on or wait for it."""
+WORKERS = 16
+"""Of these at the same time: an action's result is a call that waits as long as the action."""
+MAX_CHANGES = 100_000
+"""Changes of the graph that wait for the node's thread."""
+MAX_SAID = 1000
+"""Troubles that are remembered, so that each is told once."""
+_POLL_S = 0.5
+_RETRY_S = (0.25, 0.5, 1.0, 2.0)
+_H = TypeVar("_H", bound=Handle)
+
+
+class Ros2Error(Exception):
+    """The node cannot be what it was told to be; the text says what to change."""
+
+
+class Ros2Node:
+    """One node of a ROS 2 graph; every method may be called from any thread.
+
+    Args:
+        dialect: How the graph is written in Zenoh.
+        router: Address of the graph's Zenoh router, as Zenoh writes it (``tcp/HOST:PORT``, ``tls/HOST:PORT``); None:
+            as the configuration file says, or `DEFAULT_ROUTER`.
+        config_file: Zenoh's configuration (JSON5), for certificates and the like; we are a client whatever it says.
+        name: Who we are.
+        say: Told each trouble once, and its end; by default it is logged.
+
+    Raises:
+        Ros2Error: The configuration file cannot be used.
+    """
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        *,
+        router: str | None = None,
+        config_file: Path | None = None,
+        name: NodeName | None = None,
+        say: Callable[[str], object] | None = None,
+    ) -> None:
+        self.dialect = dialect
+        self._name = name or NodeName()
+        self._say = say or _log.warning
+        self._router = router or ("the one that its configuration names" if config_file else DEFAULT_ROUTER)
+        self._config = _config(router or (None if config_file else DEFAULT_ROUTER), config_file)
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._joined = threading.Event()
+        self._handles: list[Handle] = []
+        self._changes: deque[tuple[str, bool]] = deque(maxlen=MAX_CHANGES)
+        self._endpoints: list[Endpoint] = []
+        self._said: dict[str, str] = {}
+        self._outbox: queue.Queue[Callable[[], object] | None] = queue.Queue(MAX_OUTBOX)
+        self._working = threading.Semaphore(MAX_WORKING)
+        self._workers: concurrent.futures.ThreadPoolExecutor | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Begin to join the graph; returns at once."""
+        self._workers = concurrent.futures.ThreadPoolExecutor(WORKERS, thread_name_prefix="ros2-call")
+        for job in (self._run, self._post):
+            self._threads.append(threading.Thread(target=job, name=f"ros2{job.__name__}", daemon=True))
+            self._threads[-1].start()
+
+    def close(self) -> None:
+        """Leave the graph, and wait until that is done."""
+        self._closing.set()
+        self._wake.set()
+        for thread in self._threads:
+            thread.join()
+        if self._workers is not None:
+            self._workers.shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> Ros2Node:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def publish(self, endpoint: Endpoint, *, waits: bool = False) -> Publication:
+        """Be a publisher.
+
+        Args:
+            endpoint: Which; a type hash that is not known is learned from subscriptions on the graph.
+            waits: No message is dropped because Zenoh has no room for it now, unless very many wait.
+        """
+        publication = Publication(self, endpoint)
+        publication.waits = waits
+        return self._add(publication)
+
+    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Subscription:
+        """Be a subscription; the function gets each serialised message, in a thread of Zenoh's."""
+        return self._add(Subscription(self, endpoint, take))
+
+    def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:
+        """Be a service; see `Server`."""
+        return self._add(Server(self, endpoint, answer))
+
+    def client(self, endpoint: Endpoint) -> Client:
+        """Be a client of a service."""
+        return self._add(Client(self, endpoint))
+
+    def wait_until_joined(self, timeout: float) -> bool:
+        """Whether the router was reached, and everything declared, within so many seconds."""
+        return self._joined.wait(timeout)
+
+    def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
+        """What others have on the graph now."""
+        return [e for e in self._endpoints if name in (None, e.name) and kind in (None, e.kind)]
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong now, a sentence each."""
+        with self._lock:
+            return tuple(self._said.values())
+
+    # --- Host --------------------------------------------------------------------------------------------------------
+
+    def changed(self) -> None:
+        """Host: have the node's thread look at its handles."""
+        self._wake.set()
+
+    def outbox(self, send: Callable[[], object], name: str) -> bool:
+        """Host: have something sent that may have to wait."""
+        try:
+            self._outbox.put_nowait(send)
+        except queue.Full:
+            self._trouble(f"outbox {name}", f"{name}: the ROS 2 graph takes messages too slowly; some were dropped")
+            return False
+        return True
+
+    def work(self, job: Callable[[], object]) -> bool:
+        """Host: have something done in a worker's thread."""
+        if self._workers is None or not self._working.acquire(blocking=False):
+            return False
+        try:
+            self._workers.submit(job).add_done_callback(lambda _: self._working.release())
+        except RuntimeError:  # closing
+            self._working.release()
+            return False
+        return True
+
+    def report(self, key: str, text: str) -> None:
+        """Tell a trouble once: again only after `settle`, or with another text."""
+        self._trouble(key, text)
+
+    def settle(self, key: str) -> None:
+        """A trouble is over; nothing is said."""
+        with self._lock:
+            self._said.pop(key, None)
+
+    # --- threads -----------------------------------------------------------------------------------------------------
+
+    def _add(self, handle: _H) -> _H:
+        with self._lock:
+            self._handles.append(handle)
+        self._wake.set()
+        return handle
+
+    def _post(self) -> None:
+        """Thread of the outbox."""
+        while not self._closing.is_set():
+            try:
+                send = self._outbox.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            if send is not None:
+                send()
+
+    def _run(self) -> None:
+        """Thread of the session."""
+        tried = 0
+        while not self._closing.is_set():
+            try:
+                session = zenoh.open(self._config())
+            except zenoh.ZError as error:
+                reason = str(error).partition(" at ")[0].strip()
+                self._trouble("router", f"the ROS 2 graph's router ({self._router}) is not there: {reason}; trying on")
+                self._closing.wait(_RETRY_S[min(tried, len(_RETRY_S) - 1)])
+                tried += 1
+                continue
+            try:
+                self._keep(session)
+            except zenoh.ZError as error:
+                self._trouble("router", f"the ROS 2 graph was lost: {error}; trying on")
+                self._closing.wait(_RETRY_S[0])
+            finally:
+                self._joined.clear()
+                session.close()  # type: ignore[no-untyped-call]
+
+    def _keep(self, session: zenoh.Session) -> None:
+        ours = str(session.zid())
+        graph = Graph(self.dialect, ours)
+        declared: dict[Handle, list[Any]] = {}
+        numbers: dict[Handle, int] = {}
+        self._changes.clear()
+        live = session.liveliness()
+        token = live.declare_token(self.dialect.node_token(ours, self._name))
+        watch = live.declare_subscriber(self.dialect.watched, self._on_token, history=True)
+        try:
+            while not self._closing.is_set():
+                self._look_at_router(session)
+                changed = self._take_changes(graph)
+                with self._lock:
+                    self._handles = [h for h in self._handles if not h.closed]
+                    wanted = list(self._handles)
+                for handle in set(declared) - set(wanted):
+                    _retract(handle, declared.pop(handle))
+                for handle in wanted:
+                    learned = (changed or handle not in declared) and self._review(handle, graph)
+                    if learned:
+                        _retract(handle, declared.pop(handle, []))
+                    if handle not in declared:
+                        number = numbers.setdefault(handle, len(numbers) + 1)
+                        declared[handle] = self._declare(session, ours, number, handle)
+                self._joined.set()
+                self._wake.wait(_POLL_S)
+                self._wake.clear()
+        finally:
+            for handle, things in declared.items():
+                _retract(handle, things)
+            watch.undeclare()  # type: ignore[no-untyped-call]
+            token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _declare(self, session: zenoh.Session, ours: str, number: int, handle: Handle) -> list[Any]:
+        token = self.dialect.token(ours, number, self._name, handle.endpoint)
+        return [*handle.declare(session, token), session.liveliness().declare_token(token)]
+
+    def _take_changes(self, graph: Graph) -> bool:
+        """Whether the graph is another than before."""
+        changed = False
+        while self._changes:
+            changed |= graph.update(*self._changes.popleft()) is not None
+        if changed:
+            self._endpoints = graph.endpoints()
+        return changed
+
+    def _review(self, handle: Handle, graph: Graph) -> bool:
+        """See whether a handle of ours fits the graph. True if it learned its type's hash."""
+        ours = handle.endpoint
+        others = graph.endpoints(ours.name)
+        found = mismatches(ours, others)
+        for mismatch in found:
+            self._trouble(f"{ours.name} {mismatch.reason}", mismatch.reason)
+        with self._lock:
+            gone = [k for k in self._said if k.startswith(f"{ours.name} ") and k not in _keys(ours.name, found)]
+            for key in gone:
+                self._said.pop(key)
+        # In rmw_zenoh's keys the types stand, so what does not fit never meets; with DDS one has to look.
+        handle.refused = found[0].reason if found and not self.dialect.attaches else ""
+        if ours.type_hash:
+            return False
+        handle.endpoint = replace(ours, type_hash=learned_hash(ours, others))
+        return handle.endpoint.type_hash != ""
+
+    def _look_at_router(self, session: zenoh.Session) -> None:
+        info = session.info
+        if info.routers_zid() or info.peers_zid():
+            with self._lock:
+                was_away = self._said.pop("router", None)
+            if was_away:
+                self._say(f"the ROS 2 graph's router ({self._router}) is there now")
+        else:
+            self._trouble("router", f"the ROS 2 graph's router ({self._router}) went away; waiting for it")
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        """In a thread of Zenoh's."""
+        self._changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        self._wake.set()
+
+    def _trouble(self, key: str, text: str) -> None:
+        with self._lock:
+            if key in self._said or len(self._said) >= MAX_SAID:
+                return
+            self._said[key] = text
+        self._say(text)
+
+
+def _keys(name: str, found: list[Any]) -> set[str]:
+    return {f"{name} {mismatch.reason}" for mismatch in found}
+
+
+def _retract(handle: Handle, things: list[Any]) -> None:
+    handle.retract()
+    for thing in things:
+        thing.undeclare()
+
+
+def _config(router: str | None, file: Path | None) -> Callable[[], zenoh.Config]:
+    """What makes Zenoh's configuration; made once now, so that a mistake in it is told at once."""
+    settings: dict[str, Any] = {
+        "mode": "client",
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,  # caches of transient-local publishers go by time stamps
+    }
+    if router is not None:
+        settings["connect/endpoints"] = [router]
+
+    def make() -> zenoh.Config:
+        config = zenoh.Config.from_file(file) if file is not None else zenoh.Config()
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        return config
+
+    try:
+        config = make()
+        if router is None and not json.loads(config.get_json("connect/endpoints")):
+            raise Ros2Error(f"Zenoh configuration {file} names no connect/endpoints; name the graph's router")
+    except zenoh.ZError as error:
+        what = f"configuration {file}" if file is not None else f"address {router}"
+        raise Ros2Error(f"Zenoh does not take the {what}: {str(error).partition(' at ')[0].strip()}") from error
+    return make
