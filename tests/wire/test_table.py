@@ -1,5 +1,7 @@
 """Joining the topic tables."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -79,7 +81,7 @@ def test_a_topic_listed_twice_is_refused():
 
 
 def test_hashes_of_two_encodings_are_not_compared():
-    """An MD5 of ROS 1 and a RIHS01 of ROS 2 say nothing of each other; the robot's encoding is agreed on, and its hash."""
+    """An MD5 of ROS 1 and a RIHS01 of ROS 2 say nothing of each other; what the robot has is agreed on."""
     robot, service = Topic("a", "x/y", IN, "11", "ros1"), Topic("a", "x/y", IN, "RIHS01_22", "cdr")
     ((_, agreed),) = join([robot], {"a": service})
     assert (agreed.type_hash, agreed.encoding) == ("11", "ros1")
