@@ -6,7 +6,7 @@ READY := .venv/.ready
 # A busy machine can make a test on real sockets or processes miss its moment: it is run again, and reported as such.
 AGAIN := --reruns 2 --reruns-delay 3
 
-.PHONY: demo test unit fuzz check fmt lock clean
+.PHONY: demo test unit fuzz check fmt docs lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -30,6 +30,9 @@ check: $(READY) ## style, types and layers: the same for people and CI
 fmt: $(READY) ## format, and mend what can be mended
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: $(READY) ## the pages that are made from the code
+	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
 
 lock: $(READY) ## resolve pyproject.toml anew into requirements.lock
 	$(BIN)/pip install --quiet uv

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import ssl
 import time
 import uuid
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -56,11 +58,19 @@ class Client:
     Every method raises :class:`ApiError` or :class:`Unreachable`, and nothing else.
     """
 
-    def __init__(self, base_url: str, token: str | None = None, *, timeout: float = 10.0) -> None:
-        """``timeout``: seconds for each step of a request: connect, send, receive.
+    def __init__(
+        self, base_url: str, token: str | None = None, *, timeout: float = 10.0, ca_file: Path | str | None = None
+    ) -> None:
+        """One orchestrator.
+
+        Args:
+            base_url: ``https://host:port``.
+            token: An operator's or a robot's.
+            timeout: Seconds for each step of a request: connect, send, receive.
+            ca_file: PEM file of the authority that the orchestrator's certificate is by; None: the system's.
 
         Raises:
-            ApiError: The token holds characters that no token has.
+            ApiError: The token holds characters that no token has, or the file holds no certificate.
         """
         self._url = base_url.rstrip("/")
         if token and not (token.isascii() and token.isprintable()):
@@ -70,7 +80,7 @@ class Client:
             headers={"Authorization": f"Bearer {token}"} if token else {},
             timeout=timeout,
             # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
-            verify=not self._url.startswith("http://"),
+            verify=False if self._url.startswith("http://") else _trust(ca_file),
             # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
             trust_env=False,
         )
@@ -129,7 +139,7 @@ class Client:
             if deadline is None or time.monotonic() < deadline:
                 raise self._unreachable() from None
         except httpx.TransportError as error:
-            raise self._unreachable() from error
+            raise self._unreachable(error) from error
 
     def _watch(self, path: str, after: int, deadline: float | None) -> Iterator[InstanceEvent]:
         patience = _PING_LIMIT if deadline is None else max(0.001, min(_PING_LIMIT, deadline - time.monotonic()))
@@ -242,16 +252,30 @@ class Client:
         try:
             response = self._http.request(method, prefix + path, json=document, headers=headers)
         except (httpx.TransportError, httpx.InvalidURL) as error:
-            raise self._unreachable() from error
+            raise self._unreachable(error) from error
         if not response.is_success:
             raise ApiError(_problem(response))
         return response
 
-    def _unreachable(self) -> Unreachable:
+    def _unreachable(self, error: Exception | None = None) -> Unreachable:
+        if "CERTIFICATE_VERIFY_FAILED" in str(error):
+            why = str(error).partition("CERTIFICATE_VERIFY_FAILED] ")[2].partition(" (_ssl")[0]
+            return Unreachable(
+                f"the certificate of {self._url} is not trusted ({why}): "
+                "give the file of its authority (SKYTETHER_CA_FILE), or correct the address"
+            )
         return Unreachable(
             f"no orchestrator answers at {self._url}: "
             "start one with `skytether orchestrator run`, or give its address with --url"
         )
+
+
+def _trust(ca_file: Path | str | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=ca_file)
+    except (OSError, ssl.SSLError) as error:
+        detail = f"{ca_file} is no file of certificates: {getattr(error, 'strerror', None) or error}"
+        raise ApiError(Problem(title="No certificate", status=495, detail=detail)) from error
 
 
 def _json(response: httpx.Response) -> Any:

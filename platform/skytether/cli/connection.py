@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skytether.orchestrator.settings import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
+from skytether.orchestrator.defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
 
 from .output import fail
 
@@ -45,7 +45,7 @@ def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
     from skytether.api.client import ApiError, Client, NotRunning, Unreachable
 
     try:
-        with Client(url or _local_url(), _token(token_file)) as client:
+        with Client(url or _local_url(), _token(token_file), ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
             yield client
     except (ApiError, NotRunning, Unreachable) as error:
         fail(str(error))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -19,54 +20,73 @@ def _group() -> None:
 
 @app.command()
 def run(
+    config: Annotated[
+        Path | None,
+        typer.Option(help="YAML file; `skytether orchestrator config` prints one.", envvar="SKYTETHER_CONFIG"),
+    ] = None,
     state_dir: Annotated[
         Path | None,
         typer.Option(help="Folder for database, tokens and instances.  [default: ~/.local/state/skytether]"),
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one; see the file `address`.")] = 8600,
+    host: Annotated[str | None, typer.Option(help="Address to listen on.  [default: 127.0.0.1]")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="0: any free one; see the file `address`.  [default: 8600]")
+    ] = None,
     catalog: Annotated[Path | None, typer.Option(help="Folder of manifests beside the built-in ones.")] = None,
     database: Annotated[
         str | None,
-        typer.Option(help="SQLAlchemy URL; without it SQLite in the state folder.", envvar="SKYTETHER_DATABASE"),
+        typer.Option(help="postgresql://USER@HOST/NAME; without it SQLite in the state folder."),
     ] = None,
     secrets_dir: Annotated[
         Path | None,
         typer.Option(help="Folder of secret.key and operator.token, the same for all orchestrators over one database."),
     ] = None,
     stop_instances: Annotated[
-        bool, typer.Option("--stop-instances", help="End all instances at shutdown; otherwise they run on.")
-    ] = False,
-    open_metrics: Annotated[bool, typer.Option("--open-metrics", help="Let /metrics be read without a token.")] = False,
+        bool | None,
+        typer.Option("--stop-instances", help="End all instances at shutdown; otherwise they run on."),
+    ] = None,
+    open_metrics: Annotated[
+        bool | None, typer.Option("--open-metrics", help="Let /metrics be read without a token.")
+    ] = None,
 ) -> None:
     """Serve until SIGTERM or Ctrl-C.
 
     The first start makes the operator's token, in the file operator.token of the state folder. Instances outlive the
     orchestrator, and are adopted by the next one over the same folder, unless --stop-instances is given.
-    """
-    import logging
 
+    Every key of the configuration is a variable of the environment too, which goes before the file; options go before
+    both. TLS, logs, limits and the reconciler's patience are set there: see `skytether orchestrator config`.
+    """
+    from skytether.orchestrator.config import load
+    from skytether.orchestrator.errors import InvalidError
     from skytether.orchestrator.server import StartError
     from skytether.orchestrator.server import run as serve
-    from skytether.orchestrator.settings import Settings, default_state_dir
 
-    # A server's log instead of a command's warnings.
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True)
-    for chatty in ("alembic", "uvicorn"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
-    settings = Settings(
-        state_dir=(state_dir or default_state_dir()).absolute(),
-        host=host,
-        port=port,
-        database_url=database,
-        secrets_dir=secrets_dir.absolute() if secrets_dir else None,
-        catalogue_dir=catalog,
-        stop_instances=stop_instances,
-        open_metrics=open_metrics,
-    )
+    given = {
+        "state_dir": state_dir,
+        "host": host,
+        "port": port,
+        "database_url": database,
+        "secrets_dir": secrets_dir,
+        "catalogue_dir": catalog,
+        "stop_instances": stop_instances,
+        "open_metrics": open_metrics,
+    }
     try:
-        serve(settings)
+        serve(load(config, os.environ, given))
+    except InvalidError as error:
+        fail(str(error), 2)
     except StartError as error:
         fail(str(error), 2 if error.usage else 1)
     except KeyboardInterrupt:  # before there was anything to end
         raise typer.Exit(130) from None
+
+
+@app.command("config")
+def show_config(
+    markdown: Annotated[bool, typer.Option("--markdown", help="As the page of the documentation.")] = False,
+) -> None:
+    """Print a configuration file with every key, its default and what it means."""
+    from skytether.orchestrator.config import example, page
+
+    typer.echo(page() if markdown else example(), nl=False)

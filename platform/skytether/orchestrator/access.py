@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .errors import ConflictError, ForbiddenError, UnauthenticatedError
+from .errors import ConflictError, ForbiddenError, TooManyError, UnauthenticatedError
 from .security import PREFIX_LENGTH, Secrets, TokenHash, new_token
 from .store import RobotRow, Store
+from .throttle import Throttle
 
 ANY_SERVICE = "*"
 _SEEN_EVERY = 10.0
@@ -59,18 +60,40 @@ class Principal:
 class Access:
     """Robots and tokens."""
 
-    def __init__(self, store: Store, secrets: Secrets, clock: Callable[[], float]) -> None:
+    def __init__(self, store: Store, secrets: Secrets, clock: Callable[[], float], throttle: Throttle) -> None:
+        """``clock`` gives seconds since the epoch."""
         self._store = store
         self._secrets = secrets
         self._clock = clock
+        self._throttle = throttle
         self._noted: dict[str, float] = {}
 
-    def authenticate(self, token: str | None) -> Principal:
+    def authenticate(self, token: str | None, address: str = "") -> Principal:
         """Find out who asks.
+
+        Args:
+            token: What came with the request.
+            address: Where it came from: those without a good token share a budget by it.
 
         Raises:
             UnauthenticatedError: Nobody we know.
+            TooManyError: They asked too often; an operator never does.
         """
+        try:
+            principal = self._find(token)
+        except UnauthenticatedError:
+            self._spend(f"address {address}")
+            raise
+        if principal.robot is not None:
+            self._spend(principal.owner)
+        return principal
+
+    def _spend(self, caller: str) -> None:
+        wait = self._throttle.wait(caller)
+        if wait:
+            raise TooManyError(wait)
+
+    def _find(self, token: str | None) -> Principal:
         if not token:
             raise UnauthenticatedError("a token is needed: send `Authorization: Bearer TOKEN`")
         if self._secrets.is_operator(token):

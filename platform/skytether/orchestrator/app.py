@@ -8,6 +8,7 @@ import skytether
 
 from . import problems
 from .core import Orchestrator
+from .logs import Audit
 from .routers import catalog, health, instances, robots, sites
 
 
@@ -22,4 +23,5 @@ def create_app(core: Orchestrator) -> FastAPI:
     problems.install(app, core.settings.limits.body_bytes)
     for router in (catalog.router, sites.router, instances.router, robots.router, health.router):
         app.include_router(router)
+    app.add_middleware(Audit)
     return app

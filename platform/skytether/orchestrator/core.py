@@ -21,6 +21,7 @@ from .security import SecretFileError, Secrets
 from .settings import Settings
 from .sites import Sites, load_runtime
 from .store import Store
+from .throttle import Throttle
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,8 @@ class Orchestrator:
         self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges, self._reports)
         self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
-        self.access = Access(self.store, secrets, clock)
+        throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
+        self.access = Access(self.store, secrets, clock, throttle)
         self.reconciler = Reconciler(
             self.store,
             secrets,

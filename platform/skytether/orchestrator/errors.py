@@ -5,6 +5,7 @@ Each text is one sentence for the person who asked, with what to do.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -48,6 +49,15 @@ class ForbiddenError(DomainError):
 
 class UnauthenticatedError(DomainError):
     """No token, or one that nobody was given."""
+
+
+class TooManyError(DomainError):
+    """More requests than one caller may make."""
+
+    def __init__(self, wait_s: float) -> None:
+        """``wait_s``: until the next may be made."""
+        self.retry_after = max(1, math.ceil(wait_s))
+        super().__init__(f"too many requests: try again in {self.retry_after} s, and ask less often")
 
 
 class InvalidError(DomainError):

@@ -23,6 +23,7 @@ from .errors import (
     InvalidError,
     NoSiteError,
     NotFoundError,
+    TooManyError,
     UnauthenticatedError,
 )
 from .validation import faults
@@ -34,6 +35,7 @@ STATUS: dict[type[DomainError], tuple[int, str]] = {
     UnauthenticatedError: (401, "No valid token"),
     ForbiddenError: (403, "Not allowed"),
     NotFoundError: (404, "Not found"),
+    TooManyError: (429, "Too many requests"),
     NoSiteError: (409, "No site fits"),
     ConflictError: (409, "Not possible now"),
     InvalidError: (422, "Invalid input"),
@@ -57,7 +59,9 @@ def install(app: FastAPI, body_limit: int) -> None:
             errors = [_fault(fault) for fault in error.faults]
         elif isinstance(error, NoSiteError):
             errors = list(error.refused)
-        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
+        if isinstance(error, TooManyError):
+            headers["Retry-After"] = str(error.retry_after)
         return answer(request, status, title, str(error), errors, headers)
 
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import ipaddress
 import logging
 import os
 import signal
 import socket
+import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +17,7 @@ import uvicorn
 from alembic.util import CommandError
 from sqlalchemy.exc import SQLAlchemyError
 
+from . import logs
 from .app import create_app
 from .core import Orchestrator
 from .errors import InvalidError
@@ -49,6 +52,10 @@ def run(settings: Settings) -> None:
         settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise StartError(f"cannot make {settings.state_dir}: {error.strerror}; give another --state-dir") from error
+    try:
+        logs.set_up(settings.logs)
+    except OSError as error:
+        raise StartError(f"cannot write {settings.logs.audit_file}: {error.strerror}", usage=True) from error
     with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
         try:
             core = Orchestrator(settings)
@@ -91,6 +98,7 @@ class _Server(uvicorn.Server):
     """Uvicorn that tells its address, and lets event streams end when it is to end."""
 
     def __init__(self, core: Orchestrator, listener: socket.socket) -> None:
+        tls = core.settings.tls
         config = uvicorn.Config(
             create_app(core),
             log_config=None,
@@ -98,24 +106,46 @@ class _Server(uvicorn.Server):
             lifespan="off",
             server_header=False,
             timeout_graceful_shutdown=_DRAIN,
+            ssl_certfile=tls.certificate,
+            ssl_keyfile=tls.key,
+            proxy_headers=bool(core.settings.proxies),
+            forwarded_allow_ips=list(core.settings.proxies),
         )
         super().__init__(config)
+        try:
+            config.load()  # now, rather than in the loop: a wrong certificate is found before anything is started
+        except (OSError, ssl.SSLError) as error:
+            why = getattr(error, "strerror", None) or str(error)
+            raise StartError(
+                f"the certificate {tls.certificate} with the key {tls.key} cannot be used: {why}", usage=True
+            ) from error
         self._core = core
         self._address = core.settings.state_dir / "address"
         host, port = listener.getsockname()[:2]
-        self._url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        scheme = "https" if tls.certificate else "http"
+        self._url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         draft = self._address.with_name("address.new")
         draft.write_text(f"{self._url}\n")
         draft.replace(self._address)
+        settings = self._core.settings
+        if not (settings.tls.certificate or settings.proxies or _loopback(settings.host)):
+            log.warning("listening on %s without TLS: tokens can be read on the way", settings.host)
         log.info("listening on %s, state in %s", self._url, self._core.settings.state_dir)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._address.unlink(missing_ok=True)
         self._core.broker.close()
         await super().shutdown(sockets)
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 @contextmanager

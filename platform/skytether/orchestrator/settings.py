@@ -1,100 +1,151 @@
-"""Everything that can be set, in groups, with unit and reason of each default. Times are in seconds."""
+"""Everything that can be set, in groups, with unit and reason of each default. Times are in seconds.
+
+The text under each field is its documentation: ``skytether orchestrator config`` prints it, and the page
+``docs/configuration.md`` is made from it.
+"""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Literal
 
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8600
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from skytether.api.manifest import Strict
+
+from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
+
+Seconds = Annotated[float, Field(gt=0, le=1e9)]
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+Weight = Annotated[float, Field(ge=0, le=1e6)]
 
 
-def default_state_dir() -> Path:
-    """Where a person's orchestrator keeps its state, by the XDG base directory specification."""
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "skytether"
+class Group(Strict):
+    """Settings that belong together; the docstrings under the fields are their descriptions."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
 
-@dataclass(frozen=True)
-class Timing:
-    """How patient the reconciler is."""
+class Timing(Group):
+    """How patient the reconciler is, in seconds."""
 
-    observe: float = 0.2
+    observe: Seconds = 0.2
     """Between two looks at a site where nothing is changing; a killed service is seen within this."""
-    observe_changing: float = 0.015
+    observe_changing: Seconds = 0.015
     """The same while something starts or stops: it adds to the time until a robot's first command."""
-    place: float = 1.0
+    place: Seconds = 1.0
     """Between two attempts to place what is waiting for a free site."""
-    start_timeout: float = 30.0
+    start_timeout: Seconds = 30.0
     """A service that is not ready by then counts as crashed."""
-    stop_grace: float = 5.0
+    stop_grace: Seconds = 5.0
     """From the polite request to end until it is enforced."""
-    stable: float = 10.0
+    stable: Seconds = 10.0
     """A run that was ready for this long is no quick failure: the count of failures in a row starts again."""
-    max_failures: int = 5
+    max_failures: Count = 5
     """Quick failures in a row after which an instance is given up as failed."""
-    backoff: float = 0.5
+    backoff: Seconds = 0.5
     """Wait before the second restart in a row; it doubles with each. The first comes at once: a robot waits."""
-    backoff_max: float = 30.0
-    site_silent: float = 10.0
+    backoff_max: Seconds = 30.0
+    """The longest wait before a restart."""
+    site_silent: Seconds = 10.0
     """A site whose runtime has not answered for this long is unreachable."""
-    lock_up: float = 30.0
+    lock_up: Seconds = 30.0
     """A reconcile loop without a pass for this long makes the orchestrator not ready."""
 
 
-@dataclass(frozen=True)
-class Weights:
+class Weights(Group):
     """What placement weighs against milliseconds of delay."""
 
-    cost_ms: float = 1.0
-    """Delay that one unit of a site's ``cost`` is worth."""
-    spread_ms: float = 2.0
+    cost_ms: Weight = 1.0
+    """Delay that one unit of a site's `cost` is worth."""
+    spread_ms: Weight = 2.0
     """Delay that an empty site is worth beside a full one: a few milliseconds, so that near sites fill evenly."""
-    unmeasured_ms: float = 200.0
-    """Round trip reckoned for a site that was not measured, when the service names no ``max_rtt_ms``."""
-    migrate_ms: float = 20.0
-    """By how much another site must be better before an instance is moved there."""
+    unmeasured_ms: Weight = 200.0
+    """Round trip reckoned for a site that was not measured, when the service names no `max_rtt_ms`."""
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(Group):
     """Bounds of what is kept and taken."""
 
-    body_bytes: int = 1 << 20
+    body_bytes: Count = 1 << 20
     """Largest request."""
-    ended_age: float = 86_400.0
+    requests_per_s: Annotated[float, Field(gt=0, le=1e6)] = 100.0
+    """Requests that one robot's token may make, and one address without a valid token; an operator's are free."""
+    requests_burst: Count = 200
+    """Requests at once above which that rate holds."""
+    ended_age: Seconds = 86_400.0
     """How long ended instances, their logs and idempotency keys are kept."""
-    ended_count: int = 200
+    ended_count: Count = 200
     """The newest ended instances that are kept at most."""
-    events: int = 20_000
+    events: Count = 20_000
     """Events kept over all instances, the newest."""
-    log_lines: int = 10_000
+    log_lines: Count = 10_000
     """Most lines of a log that one request gets."""
-    reported_topics: int = 64
+    reported_topics: Count = 64
     """Topics of one robot's report that reach /metrics, so that no robot can blow up the number of series."""
 
 
-@dataclass(frozen=True)
-class Settings:
+class Tls(Group):
+    """HTTPS without a proxy in front: both files, or none."""
+
+    certificate: Path | None = None
+    """PEM file of the certificate, with those in between up to the authority's."""
+    key: Path | None = None
+    """PEM file of its private key, which only the orchestrator's user may read."""
+
+    @model_validator(mode="after")
+    def _both(self) -> Tls:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together: give both, or none")
+        return self
+
+
+class Logs(Group):
+    """What is written to standard error, and who did what."""
+
+    format: Literal["text", "json"] = "text"
+    """`json`: one object a line (`time, level, logger, message`, and `exception`)."""
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least important level that is written."""
+    audit_file: Path | None = None
+    """File for one JSON object a line of each request that changes something or was refused; it is moved to
+    `NAME.1` to `NAME.5` at 10 MB. None: these go to the log, from the logger `skytether.audit`."""
+
+
+class Settings(Group):
     """One orchestrator."""
 
-    state_dir: Path
+    state_dir: Path = Field(default_factory=default_state_dir)
     """Database, tokens, secret key, instances' folders. Mode 0700."""
-    host: str = DEFAULT_HOST
-    """Address to listen on. Loopback, because there is no TLS unless a proxy in front brings it."""
-    port: int = DEFAULT_PORT
-    """0: any free one; the real address is written to ``address`` in the state folder."""
-    database_url: str | None = None
-    """SQLAlchemy URL; None: SQLite in the state folder."""
+    host: Annotated[str, Field(min_length=1)] = DEFAULT_HOST
+    """Address to listen on; loopback unless told otherwise."""
+    port: Annotated[int, Field(ge=0, le=65_535)] = DEFAULT_PORT
+    """0: any free one; the real address is written to `address` in the state folder."""
+    database_url: str | None = Field(default=None, repr=False)
+    """SQLAlchemy URL, `postgresql://user:password@host/name`; none: SQLite in the state folder."""
     secrets_dir: Path | None = None
-    """Folder of ``secret.key`` and ``operator.token``, the same for all orchestrators over one database; None: the
-    state folder."""
+    """Folder of `secret.key` and `operator.token`, the same for all orchestrators over one database; none: the state
+    folder."""
     catalogue_dir: Path | None = None
-    """Folder of manifests (``*.yaml``, ``*.yml``) beside the built-in ones; None: none."""
+    """Folder of manifests (`*.yaml`, `*.yml`) beside the built-in ones."""
     stop_instances: bool = False
-    """At shutdown: True ends all instances; False leaves them running, to be adopted at the next start."""
+    """At shutdown: true ends all instances; false leaves them running, to be adopted at the next start."""
     open_metrics: bool = False
-    """True: ``/metrics`` needs no token."""
-    timing: Timing = field(default_factory=Timing)
-    limits: Limits = field(default_factory=Limits)
-    weights: Weights = field(default_factory=Weights)
+    """True: `/metrics` needs no token."""
+    proxies: tuple[str, ...] = ()
+    """Addresses or networks of proxies in front, whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed."""
+    tls: Tls = Tls()
+    """HTTPS without a proxy in front."""
+    logs: Logs = Logs()
+    """What is written down."""
+    timing: Timing = Timing()
+    """How patient the reconciler is."""
+    limits: Limits = Limits()
+    """Bounds of what is kept and taken."""
+    weights: Weights = Weights()
+    """What placement weighs."""
+
+    @field_validator("state_dir", "secrets_dir", "catalogue_dir")
+    @classmethod
+    def _anywhere(cls, path: Path | None) -> Path | None:
+        return path.expanduser().absolute() if path else None

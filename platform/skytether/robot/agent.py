@@ -73,6 +73,7 @@ class AgentConfig:
         request_timeout_s: Of each request to the orchestrator.
         bind: Local address of the robot's end of the bridge; port 0: any.
         paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
+        ca_file: PEM file of the authority of the orchestrator's certificate; none: the system's.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
     """
 
@@ -93,6 +94,7 @@ class AgentConfig:
     request_timeout_s: float = 5.0
     bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
     paths: Wanted = ()
+    ca_file: str | None = None
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
 
 
@@ -166,7 +168,11 @@ class Agent:
         )
         local = fallback.load(config.fallback, config.fallback_options)
         self._driver = Driver(base, local, config.limits, config.needs, clock(), observer)
-        self._own_client = None if client else Client(config.url, config.token, timeout=config.request_timeout_s)
+        self._own_client = (
+            None
+            if client
+            else Client(config.url, config.token, timeout=config.request_timeout_s, ca_file=config.ca_file)
+        )
         request = rest.InstanceCreate(
             robot=config.robot,
             service=config.service,

@@ -25,11 +25,23 @@ def _core(request: Request) -> Orchestrator:
 Core = Annotated[Orchestrator, Depends(_core)]
 
 
-def _caller(core: Core, bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]) -> Principal:
-    return core.access.authenticate(bearer.credentials if bearer else None)
+Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 
 
-Caller = Annotated[Principal, Depends(_caller)]
+def authenticated(core: Core, request: Request, token: Bearer) -> Principal:
+    """Whoever sends this token.
+
+    Raises:
+        UnauthenticatedError: Nobody we know.
+        TooManyError: They asked too often.
+    """
+    address = request.client.host if request.client else ""
+    principal = core.access.authenticate(token.credentials if token else None, address)
+    request.state.who = principal.owner  # for the audit
+    return principal
+
+
+Caller = Annotated[Principal, Depends(authenticated)]
 """Anybody with a token."""
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
-from fastapi.security import HTTPAuthorizationCredentials
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from ..problems import answer
-from .deps import Core, bearer, says
+from .deps import Bearer, Core, authenticated, says
 
 router = APIRouter(tags=["health"])
 
@@ -29,8 +26,8 @@ def readyz(core: Core, request: Request) -> Response:
 
 
 @router.get("/metrics", response_class=PlainTextResponse, responses=says(401, 403))
-def metrics(core: Core, token: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]) -> Response:
+def metrics(core: Core, request: Request, token: Bearer) -> Response:
     """Prometheus metrics; for the operator, or for all if the orchestrator was started with ``--open-metrics``."""
     if not core.settings.open_metrics:
-        core.access.authenticate(token.credentials if token else None).require_operator()
+        authenticated(core, request, token).require_operator()
     return Response(core.metrics.text(), media_type=CONTENT_TYPE_LATEST)

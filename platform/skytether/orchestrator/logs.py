@@ -1,0 +1,92 @@
+"""What an orchestrator writes down: its log as text or JSON, and who changed what or was refused."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from datetime import UTC, datetime
+from logging.handlers import RotatingFileHandler
+from typing import Any
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from .settings import Logs
+
+AUDIT = "skytether.audit"
+audit = logging.getLogger(AUDIT)
+
+_TEXT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+_CHATTY = ("alembic", "uvicorn", "httpx")
+_AUDIT_BYTES, _AUDIT_FILES = 10_000_000, 5
+_READS = ("GET", "HEAD", "OPTIONS")
+_REFUSED = (401, 403, 429)
+
+
+class JsonFormatter(logging.Formatter):
+    """One object a line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """As RFC 3339 in UTC, with the fields of an audit record beside the message."""
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **getattr(record, "fields", {}),
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+def set_up(logs: Logs) -> None:
+    """Send this process's log where the settings say.
+
+    Raises:
+        OSError: The audit file cannot be written.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter() if logs.format == "json" else logging.Formatter(_TEXT))
+    logging.basicConfig(level=logs.level.upper(), handlers=[handler], force=True)
+    for chatty in _CHATTY:
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    if logs.audit_file is not None:
+        file = RotatingFileHandler(logs.audit_file, maxBytes=_AUDIT_BYTES, backupCount=_AUDIT_FILES)
+        file.setFormatter(JsonFormatter())
+        audit.addHandler(file)
+        audit.propagate = False
+    audit.setLevel(logging.INFO)
+
+
+class Audit:
+    """ASGI middleware: a line for each request that changes something or was refused. No bodies, no queries."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+        status = 0
+
+        async def noting(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, noting)
+        finally:
+            if scope["method"] not in _READS or status in _REFUSED:
+                self._note(scope, status)
+
+    def _note(self, scope: Scope, status: int) -> None:
+        who = scope.get("state", {}).get("who", "nobody")
+        address = scope["client"][0] if scope.get("client") else ""
+        fields = {"who": who, "address": address, "method": scope["method"], "path": scope["path"], "status": status}
+        if scope["path"].endswith("/renew") and status == 200:
+            return  # every robot, every two seconds: the lease in the database says it
+        audit.info("%(who)s %(address)s %(method)s %(path)s %(status)s", fields, extra={"fields": fields})

@@ -1,0 +1,131 @@
+"""HTTPS of the orchestrator's own, its log as JSON, and who did what: the real program."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from orchestrator_program import Program, until, with_toy
+
+from skytether.api.client import ApiError, Client, Unreachable
+from skytether.api.rest import InstanceCreate, RobotCreate
+
+pytestmark = pytest.mark.slow
+
+
+def certificate(folder: Path, address: str = "127.0.0.1") -> tuple[Path, Path]:
+    """A certificate for an address that is its own authority, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "test")])
+    now = datetime.datetime.now(datetime.UTC)
+    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+    builder = builder.not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(
+        now + datetime.timedelta(days=1)
+    )
+    names = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))])
+    signed = builder.add_extension(names, critical=False).sign(key, hashes.SHA256())
+    paths = folder / "cert.pem", folder / "key.pem"
+    paths[0].write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+    encoding = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    paths[1].write_bytes(key.private_bytes(*encoding))
+    return paths
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Iterator[Callable[..., Program]]:
+    made: list[Program] = []
+
+    def make(**settings: Any) -> Program:
+        (tmp_path / "one").mkdir(exist_ok=True)
+        (tmp_path / "orchestrator.yaml").write_text(json.dumps(settings))
+        made.append(Program(tmp_path / "one" / "state", "--config", str(tmp_path / "orchestrator.yaml")))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.clean_up()
+
+
+def test_https_with_a_certificate_of_ones_own(program: Callable[..., Program], tmp_path: Path) -> None:
+    cert, key = certificate(tmp_path)
+    running = program(tls={"certificate": str(cert), "key": str(key)})
+    with running.start() as client:
+        url = (running.folder / "address").read_text().strip()
+        assert url.startswith("https://127.0.0.1:")
+        with pytest.raises(Unreachable, match=r"is not trusted .*self-signed.*SKYTETHER_CA_FILE"):
+            client.sites()
+    token = (running.folder / "operator.token").read_text().strip()
+    with Client(url, token, ca_file=cert) as client:
+        assert [site.name for site in client.sites()] == ["local"]
+    with Client(url.replace("https:", "http:"), token) as client, pytest.raises((Unreachable, ApiError)):
+        client.sites()
+    elsewhere = Client(url.replace("127.0.0.1", "localhost"), token, ca_file=cert)
+    with elsewhere as client, pytest.raises(Unreachable, match=r"is not trusted .*localhost"):
+        client.sites()
+
+
+def test_a_certificate_that_cannot_be_used_is_one_sentence(program: Callable[..., Program], tmp_path: Path) -> None:
+    cert, key = certificate(tmp_path)
+    key.write_text("rubbish")
+    status, text = program(tls={"certificate": str(cert), "key": str(key)}).fails()
+    assert status == 2
+    assert "cannot be used" in text
+    with pytest.raises(ApiError, match="no file of certificates"):
+        Client("https://127.0.0.1:1", "t", ca_file=key)
+
+
+def test_the_log_is_json_and_the_audit_names_who_did_what(
+    program: Callable[..., Program], manifest: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.log"
+    running = program(logs={"format": "json", "audit_file": str(file)})
+    with running.start() as operator:
+        with_toy(operator, manifest)
+        token = operator.create_robot(RobotCreate(name="walker")).token
+        url = (running.folder / "address").read_text().strip()
+        with Client(url, token) as robot:
+            made = robot.create_instance(InstanceCreate(robot="walker", service="toy"))
+            with pytest.raises(ApiError):
+                robot.delete_robot("walker")
+            robot.renew_instance(made.id)
+            robot.instances()
+            robot.delete_instance(made.id)
+        with Client(url, "sky-wrong") as stranger, pytest.raises(ApiError):
+            stranger.sites()
+    until(lambda: len(file.read_text().splitlines()) == 6)
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(line["who"], line["method"], line["path"], line["status"]) for line in lines] == [
+        ("operator", "PUT", "/api/v1/catalog/toy", 201),
+        ("operator", "POST", "/api/v1/robots", 201),
+        ("robot:walker", "POST", "/api/v1/instances", 201),
+        ("robot:walker", "DELETE", "/api/v1/robots/walker", 403),
+        ("robot:walker", "DELETE", f"/api/v1/instances/{made.id}", 204),
+        ("nobody", "GET", "/api/v1/sites", 401),
+    ]
+    assert all(line["address"] == "127.0.0.1" for line in lines)
+    log = [json.loads(line) for line in running.log.splitlines()]
+    assert {"time", "level", "logger", "message"} <= log[0].keys()
+    assert token not in running.log + file.read_text()
+
+
+def test_a_robot_that_asks_too_often_is_told_to_wait(program: Callable[..., Program]) -> None:
+    running = program(limits={"requests_per_s": 1, "requests_burst": 5})
+    with running.start() as operator:
+        token = operator.create_robot(RobotCreate(name="walker")).token
+        url = (running.folder / "address").read_text().strip()
+        with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}, trust_env=False) as robot:
+            answers = [robot.get("/api/v1/sites") for _ in range(20)]
+        refused = [answer for answer in answers if answer.status_code == 429]
+        assert refused
+        assert int(refused[0].headers["retry-after"]) >= 1
+        assert "too many requests" in refused[0].json()["detail"]
+        assert len([operator.sites() for _ in range(20)]) == 20  # an operator is not limited
