@@ -158,3 +158,10 @@ def test_images_and_architectures_rule_out() -> None:
     decision = place(needs, {}, [arm])
     assert [(r.reason, r.detail) for r in decision.refused] == [("architecture", "is arm64, needed is amd64")]
     assert place(needs, {}, [GOOD]).site == "good"  # not known: the engine will tell
+
+
+def test_a_site_that_the_robot_prefers_goes_before_others_that_fit_and_only_if_it_fits():
+    near, far = site(name="near"), site(name="far")
+    measured = {"near": Measurement(rtt_ms=5), "far": Measurement(rtt_ms=50, preferred=True)}
+    assert place(NEEDS, measured, [near, far]).site == "far"
+    assert place(NEEDS, measured, [near, dataclasses.replace(far, tier="robot")]).site == "near"

@@ -118,22 +118,22 @@ class ObedientOrchestrator:
         return self._answer("create", idempotency_key)
 
     def get_instance(self, instance_id: str) -> Instance:
-        return self._answer("get", instance_id)
+        return self._answer("get", instance_id, instance_id)
 
     def renew_instance(self, instance_id: str, renew: Renew) -> Instance:
-        return self._answer("renew", renew)
+        return self._answer("renew", renew, instance_id)
 
     def delete_instance(self, instance_id: str) -> Instance:
         return self._answer("delete", instance_id)
 
-    def _answer(self, name: str, what: object) -> Instance:
+    def _answer(self, name: str, what: object, instance_id: str = "") -> Instance:
         self.calls.append((name, what))
         if self.fail is not None:
             raise self.fail
         state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
         epoch = datetime(2026, 1, 1, tzinfo=UTC)
         return Instance(
-            id=f"i{self._number}",
+            id=instance_id or f"i{self._number}",
             robot="walker",
             service="virtual-trail",
             state=state,

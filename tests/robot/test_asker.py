@@ -157,5 +157,73 @@ def test_run_goes_on_after_what_nobody_expected_and_ends_when_told(orchestrator,
     assert asker.trouble == ""
 
 
+def test_a_service_that_is_not_wanted_any_more_is_let_go_and_asked_for_later(orchestrator):
+    wanted = [REQUEST]
+    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, wanted=lambda: wanted[0])
+    asker.step()
+    wanted[0] = None
+    assert asker.step() == 0.5
+    assert asker.step() == 0.5
+    assert [name for name, _ in orchestrator.calls] == ["create", "delete"]
+    wanted[0] = REQUEST
+    asker.step()
+    keys = [key for name, key in orchestrator.calls if name == "create"]
+    assert len(set(keys)) == 2
+
+
+class Mover:
+    """An asker that wants to be elsewhere once, and what it was told."""
+
+    def __init__(self, orchestrator):
+        self.now, self.elsewhere, self.told, self.stayed = 0.0, False, [], []
+        self.asker = Asker(
+            orchestrator,
+            REQUEST,
+            on_instance=lambda instance: self.told.append(instance.id),
+            elsewhere=lambda _: self.elsewhere,
+            on_stayed=lambda instance, why: self.stayed.append((instance.id, why)),
+            clock=lambda: self.now,
+        )
+        self.asker.step()
+        self.elsewhere = True
+
+
+def test_it_moves_to_an_instance_elsewhere_once_that_runs_and_lets_the_first_go(orchestrator):
+    mover = Mover(orchestrator)
+    orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.STARTING, State.RUNNING]
+    mover.asker.step()  # renews, asks elsewhere
+    mover.elsewhere = False
+    mover.asker.step()  # renews, looks: starting
+    assert "delete" not in [name for name, _ in orchestrator.calls]
+    mover.asker.step()
+    assert [call for call in orchestrator.calls if call[0] == "delete"] == [("delete", "i1")]
+    assert mover.told[-1] == "i2"
+    assert mover.stayed == []
+    assert mover.asker.release() == "i2"
+
+
+def test_an_instance_elsewhere_that_fails_or_dawdles_is_given_up_and_the_first_kept(orchestrator):
+    mover = Mover(orchestrator)
+    orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.FAILED, State.RUNNING]
+    orchestrator.reason = "no such image"
+    mover.asker.step()
+    mover.asker.step()
+    assert mover.stayed == [("i1", "no such image")]
+    orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.STARTING, State.RUNNING]
+    mover.asker.step()
+    mover.now = 21.0
+    mover.asker.step()
+    assert len(mover.stayed) == 2
+    assert mover.asker.trouble == ""
+
+
+def test_a_refused_token_is_looked_for_again_and_a_new_one_tried_soon(orchestrator):
+    fresh = [True, False]
+    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, on_refused=lambda: fresh.pop(0))
+    orchestrator.fail = problem(401, "the token has expired")
+    assert asker.step() <= 0.2
+    assert asker.step() == 10.0
+
+
 def problem(status: int, detail: str) -> ApiError:
     return ApiError(Problem(title="no", status=status, detail=detail))

@@ -85,6 +85,10 @@ class Client:
             trust_env=False,
         )
 
+    def set_token(self, token: str) -> None:
+        """Use another token from the next request on."""
+        self._http.headers["Authorization"] = f"Bearer {token}"
+
     def close(self) -> None:
         """Let go of the connections."""
         self._http.close()

@@ -36,6 +36,8 @@ class Measurement(Strict):
     jitter_ms: Annotated[float, Field(ge=0)] | None = None
     """How much longer a slow one takes than the median."""
     loss: Annotated[float, Field(ge=0, le=1)] | None = None
+    preferred: bool = False
+    """The robot has weighed all that it knows and wants this site: it goes before others that fit."""
 
 
 class InstanceCreate(Strict):

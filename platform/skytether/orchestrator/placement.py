@@ -68,14 +68,16 @@ def place(
 ) -> Decision:
     """Choose a site.
 
-    Of those that fit, the one with the lowest score; at equal scores the nearest tier, then the first by name. A robot
-    that measured nothing towards a site does not rule it out: the site counts with the worst that the service bears.
+    Of those that fit, one that the robot prefers, then the one with the lowest score; at equal scores the nearest tier,
+    then the first by name. A robot that measured nothing towards a site does not rule it out: the site counts with the
+    worst that the service bears.
     """
     verdicts = [(site, _refuse(needs, measured.get(site.name, Measurement()), site, image)) for site in candidates]
     fitting = [site for site, verdict in verdicts if verdict is None]
     tiers = {site.name: _TIER_ORDER[site.tier] for site in fitting}
     scores = [score(needs, measured.get(site.name, Measurement()), site, weights) for site in fitting]
-    scores.sort(key=lambda s: (s.total_ms, tiers[s.site], s.site))
+    wanted = {name for name, measurement in measured.items() if measurement.preferred}
+    scores.sort(key=lambda s: (s.site not in wanted, s.total_ms, tiers[s.site], s.site))
     refused = tuple(verdict[0] for _, verdict in verdicts if verdict)
     hopeless = all(verdict is not None and verdict[1] for _, verdict in verdicts)
     return Decision(scores[0].site if scores else None, refused, hopeless, tuple(scores))

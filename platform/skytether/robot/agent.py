@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from math import isfinite
+from math import isfinite, nan
 from random import Random
 from types import TracebackType
 from typing import Any
@@ -39,6 +39,8 @@ from .service_manager import ServiceManager, terms
 from .session import Endpoint, LiveSession
 from .supervisor import Limits
 from .table import Offer, robot_table
+from .task_manager import Decision, PathQuality
+from .tasks import TaskConfig, Tasks
 
 _log = logging.getLogger(__name__)
 
@@ -74,6 +76,10 @@ class AgentConfig:
         bind: Local address of the robot's end of the bridge; port 0: any.
         paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
         ca_file: PEM file of the authority of the orchestrator's certificate; none: the system's.
+        task: How it is decided whether to ask, and for which site; None: the service is asked for always, at whatever
+            site the orchestrator chooses by ``measurements``.
+        fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
+        status_port: Port on loopback of ``/status`` and ``/metrics``; 0: any free one; None: there are none.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
     """
 
@@ -95,6 +101,9 @@ class AgentConfig:
     bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
     paths: Wanted = ()
     ca_file: str | None = None
+    task: TaskConfig | None = None
+    fresh_token: Callable[[], str] | None = None
+    status_port: int | None = None
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
 
 
@@ -112,6 +121,7 @@ class AgentStatus:
         rtt: Round trip [s].
         loss: Share of messages lost over the last seconds.
         overruns: Ticks that started more than one period late.
+        decision: The task manager's; None: there is none.
     """
 
     driver: DriverStatus
@@ -123,6 +133,7 @@ class AgentStatus:
     rtt: float
     loss: float
     overruns: int
+    decision: Decision | None = None
 
 
 MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
@@ -173,22 +184,27 @@ class Agent:
             if client
             else Client(config.url, config.token, timeout=config.request_timeout_s, ca_file=config.ca_file)
         )
-        request = rest.InstanceCreate(
-            robot=config.robot,
-            service=config.service,
-            params=dict(config.params),
-            measurements=dict(config.measurements),
-            lease_s=config.lease_s,
+        speaks: Any = client or self._own_client
+        self._tasks = (
+            None
+            if config.task is None
+            else Tasks(config.task, speaks, config.service, drives=local.drives, clock=clock)
         )
         self._asker = Asker(
-            client or self._own_client,  # type: ignore[arg-type]
-            request,
+            speaks,
+            self._request({}),
+            wanted=self._wanted,
+            elsewhere=self._elsewhere,
+            on_stayed=self._tasks.stayed if self._tasks else lambda *_: None,
+            on_refused=self._another_token,
+            clock=clock,
             on_instance=self._follow,
             report=self.report,
             healthy=lambda: self._driver.source is Source.CLOUD,
             renew_s=config.renew_s,
             random=random,
         )
+        self._token = config.token
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
         self._manager: ServiceManager | None = None
@@ -204,7 +220,8 @@ class Agent:
         """Start driving and asking; returns at once."""
         warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
-        for target in (self._control, self._ask, self._watch):
+        targets = [self._control, self._ask, self._watch, *([self._decide] if self._tasks else [])]
+        for target in targets:
             thread = threading.Thread(target=target, name=f"agent{target.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
@@ -247,6 +264,7 @@ class Agent:
             rtt=self._driver.quality.rtt,
             loss=self._driver.quality.loss,
             overruns=self._overruns,
+            decision=self._tasks.decision if self._tasks else None,
         )
 
     def report(self) -> rest.Report:
@@ -272,6 +290,50 @@ class Agent:
     def _ask(self) -> None:
         self._asker.run(self._stop)
 
+    def _decide(self) -> None:
+        if self._tasks is not None:
+            self._tasks.run(self._stop)
+
+    def _request(self, measured: Mapping[str, rest.Measurement]) -> rest.InstanceCreate:
+        config = self._config
+        return rest.InstanceCreate(
+            robot=config.robot,
+            service=config.service,
+            params=dict(config.params),
+            measurements={**config.measurements, **measured},
+            lease_s=config.lease_s,
+        )
+
+    def _wanted(self) -> rest.InstanceCreate | None:
+        """What is asked for now; None: nothing, the robot's own controller drives."""
+        if self._tasks is None:
+            return self._request({})
+        if self._tasks.decision.offload:
+            return self._request(self._tasks.measurements())
+        session, self._driver.session = self._driver.session, None
+        if session is not None:
+            session.close()
+        self._instance = None
+        return None
+
+    def _elsewhere(self, instance: rest.Instance) -> bool:
+        wanted = self._tasks.decision.site if self._tasks else None
+        return wanted is not None and instance.placement is not None and instance.placement.site != wanted
+
+    def _another_token(self) -> bool:
+        """Look for a newer token where this one came from; True if there is one."""
+        if self._config.fresh_token is None or self._own_client is None:
+            return False
+        try:
+            token = self._config.fresh_token()
+        except Exception as error:  # a file that is being written, or gone
+            self._notices.say("token", f"no newer token: {error}", self._clock())
+            return False
+        known, self._token = self._token, token
+        if token != known:
+            self._own_client.set_token(token)
+        return token != known
+
     def _watch(self) -> None:
         while not self._stop.wait(_WATCH_S):
             self.watch(self._clock())
@@ -284,12 +346,18 @@ class Agent:
         self._stats = session.bridge.stats()
         if self._manager is not None:
             self._driver.quality = self._manager.watch(self._stats, now)
+            if self._tasks is not None:
+                found = self._driver.quality
+                known = session.connected
+                self._tasks.live(PathQuality(found.rtt, nan, found.loss) if known else PathQuality())
             for kind, sentence in self._manager.troubles():
                 self._notices.say(kind, sentence, now)
 
     def _follow(self, instance: rest.Instance) -> None:
         """The orchestrator said something about the instance: open a new session, or follow the service's address."""
         self._instance = instance
+        if self._tasks is not None:
+            self._tasks.placed(instance)
         granted = instance.session
         if granted is None or granted.host is None or granted.port is None:
             return

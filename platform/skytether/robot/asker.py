@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 import uuid
 from collections.abc import Callable
 from random import Random
@@ -27,6 +28,10 @@ _LOOK_S = 0.2
 """Until the first look when the link went bad: the service may have come back at another address."""
 _REFUSED_S = 10.0
 """Before a refused token is tried again: an operator has to act."""
+_IDLE_S = 0.5
+"""Between looks whether the service is wanted again."""
+_MOVE_S = 20.0
+"""An instance elsewhere that is not running by then is given up; the one that runs is kept."""
 
 
 class Orchestrator(Protocol):
@@ -55,10 +60,17 @@ class Asker:
     Args:
         client: The orchestrator.
         request: What is wanted.
+        wanted: Looked at before each request: the request as it would be now, or None while the service is not wanted;
+            an instance that is held is then let go. Without it: ``request``, always.
+        elsewhere: Whether an instance at another site is wanted instead of this one. It is asked for, and this one let
+            go once that runs.
+        on_stayed: Told the instance that is kept, and why there is none elsewhere.
+        on_refused: Called when the token was refused; True if there is another one to try.
         on_instance: Told every answer about an instance that is coming up or running.
         report: What to say with each renewal.
         healthy: Whether the link is good; while it is not, the address is looked at more often.
         renew_s: Time between renewals [s].
+        clock: Monotonic seconds.
         random: For the jitter of the back-off.
     """
 
@@ -68,13 +80,25 @@ class Asker:
         request: InstanceCreate,
         *,
         on_instance: Callable[[Instance], None],
+        wanted: Callable[[], InstanceCreate | None] | None = None,
+        elsewhere: Callable[[Instance], bool] = lambda _: False,
+        on_stayed: Callable[[Instance, str], None] = lambda *_: None,
+        on_refused: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic,
         report: Callable[[], Report | None] = lambda: None,
         healthy: Callable[[], bool] = lambda: True,
         renew_s: float = 2.0,
         random: Random | None = None,
     ) -> None:
         self._client = client
-        self._request = request
+        self._service = request.service
+        self._wanted = wanted or (lambda: request)
+        self._elsewhere = elsewhere
+        self._on_stayed = on_stayed
+        self._on_refused = on_refused
+        self._clock = clock
+        self._next: tuple[Instance, float] | None = None
+        """An instance elsewhere that is coming up, and when it was asked for."""
         self._on_instance = on_instance
         self._report = report
         self._healthy = healthy
@@ -97,15 +121,20 @@ class Asker:
         Returns:
             Seconds until the next is due.
         """
+        request = self._wanted()
+        if request is None:
+            self.release()
+            return self._say("", _IDLE_S)
         try:
-            instance = self._exchange()
+            instance = self._exchange(request)
         except Unreachable as error:
             return self._say(str(error), self._backoff.next())
         except ApiError as error:
             if error.problem.status == 404 and self._instance is not None:
-                return self._lost(f"instance {self._instance.id} is gone; asking for {self._request.service} again")
+                return self._lost(f"instance {self._instance.id} is gone; asking for {self._service} again")
             if error.problem.status in (401, 403):
-                return self._say(str(error), _REFUSED_S)
+                fresh = error.problem.status == 401 and self._on_refused()
+                return self._say(str(error), self._backoff.next() if fresh else _REFUSED_S)
             return self._say(str(error), self._backoff.next())
         if instance.state.final or instance.state is State.STOPPING:
             reason = f": {instance.reason}" if instance.reason else ""
@@ -116,6 +145,8 @@ class Asker:
             return _POLL_S
         self._backoff.reset()
         self._trouble = ""
+        if self._next is not None or self._elsewhere(instance):
+            return self._move(instance, request)
         if not self._healthy():
             return self._looks.next()
         self._looks.reset()
@@ -141,19 +172,55 @@ class Asker:
         Returns:
             The instance's id, if there was one and the orchestrator took it back.
         """
-        if self._instance is None:
-            return None
-        released, self._instance = self._instance.id, None
-        try:
-            self._client.delete_instance(released)
-        except (ApiError, Unreachable) as error:
-            _log.warning("instance %s was not released, its lease will end it: %s", released, error)
-            return None
-        return released
+        released, self._instance = self._instance, None
+        coming, self._next = self._next, None
+        if coming is not None:
+            self._let_go(coming[0])
+        return self._let_go(released)
 
-    def _exchange(self) -> Instance:
+    def _let_go(self, instance: Instance | None) -> str | None:
+        if instance is None:
+            return None
+        self._key = str(uuid.uuid4())
+        try:
+            self._client.delete_instance(instance.id)
+        except (ApiError, Unreachable) as error:
+            _log.warning("instance %s was not released, its lease will end it: %s", instance.id, error)
+            return None
+        return instance.id
+
+    def _move(self, held: Instance, request: InstanceCreate) -> float:
+        """Bring an instance up elsewhere, and change to it; whatever goes wrong with it, this one is kept."""
+        try:
+            if self._next is None:
+                made = self._client.create_instance(request, idempotency_key=str(uuid.uuid4()))
+                self._next = (made, self._clock())
+                return _POLL_S
+            (coming, began) = self._next
+            found = self._client.get_instance(coming.id)
+        except (ApiError, Unreachable) as error:
+            return self._stay(held, str(error))
+        if found.state is State.RUNNING:
+            self._next = None
+            self._instance = found
+            self._on_instance(found)
+            self._let_go(held)
+            return _POLL_S
+        if found.state.final or found.state is State.STOPPING or self._clock() - began > _MOVE_S:
+            return self._stay(held, found.reason or f"it is {found.state}")
+        return _LOOK_S
+
+    def _stay(self, held: Instance, reason: str) -> float:
+        if self._next is not None:
+            self._let_go(self._next[0])
+            self._next = None
+        _log.warning("instance %s is kept, there is none elsewhere: %s", held.id, reason)
+        self._on_stayed(held, reason)
+        return self._renew_s
+
+    def _exchange(self, request: InstanceCreate) -> Instance:
         if self._instance is None:
-            return self._client.create_instance(self._request, idempotency_key=self._key)
+            return self._client.create_instance(request, idempotency_key=self._key)
         if self._instance.state is State.RUNNING:
             return self._client.renew_instance(self._instance.id, Renew(report=self._report()))
         return self._client.get_instance(self._instance.id)

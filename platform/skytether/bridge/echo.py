@@ -1,0 +1,188 @@
+"""A UDP echo: where a robot measures round trip, loss and packet size towards a machine, and learns how it is seen.
+
+Datagrams only, no session: ``SKYECHO?``, 8 bytes that the asker chose, padding; the answer is ``SKYECHO!``, the same
+8 bytes, the address and port that the question came from (16 bytes of IPv6, IPv4 mapped into it; 2 bytes), and padding
+to the size of the question. An answer is never longer than its question, so the echo amplifies nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+from .datagrams import IP_MTU_DISCOVER, IPV6_MTU_DISCOVER, PMTUDISC_DO
+
+SMALLEST = 64
+"""Bytes of a question; shorter ones are not answered."""
+LARGEST = 9000
+_ASK, _ANSWER = b"SKYECHO?", b"SKYECHO!"
+_BODY = struct.Struct(">8s8s16sH")
+_NONCE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Echo:
+    """One answer.
+
+    Attributes:
+        rtt: Round trip [s].
+        seen_as: Address and port that the other side saw.
+    """
+
+    rtt: float
+    seen_as: tuple[str, int]
+
+
+def answer(question: bytes, source: tuple[str, int]) -> bytes | None:
+    """What the echo says to a datagram; None: nothing."""
+    if not SMALLEST <= len(question) <= LARGEST or not question.startswith(_ASK):
+        return None
+    try:
+        address = ipaddress.ip_address(source[0].split("%")[0])
+    except ValueError:
+        return None
+    packed = address.packed if address.version == 6 else b"\0" * 10 + b"\xff\xff" + address.packed
+    nonce = question[len(_ASK) : len(_ASK) + _NONCE]
+    return _BODY.pack(_ANSWER, nonce, packed, source[1]).ljust(len(question), b"\0")
+
+
+def read_answer(data: bytes, nonce: bytes) -> tuple[str, int] | None:
+    """The address that an answer tells; None if it is no answer to this question."""
+    if len(data) < _BODY.size:
+        return None
+    kind, echoed, packed, port = _BODY.unpack_from(data)
+    if kind != _ANSWER or echoed != nonce:
+        return None
+    address = ipaddress.IPv6Address(packed)
+    return str(address.ipv4_mapped or address), port
+
+
+class EchoServer:
+    """Answers in a thread of its own until `close`.
+
+    Attributes:
+        address: Host and port where it listens.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        """Bind and begin.
+
+        Raises:
+            OSError: The port is taken, or the address is not this machine's.
+        """
+        self._socket = _open(host, port)
+        name = self._socket.getsockname()
+        self.address: tuple[str, int] = (name[0], name[1])
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"echo-{name[1]}", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._socket.settimeout(0.2)
+        while not self._closing:
+            try:
+                question, source = self._socket.recvfrom(LARGEST + 1)
+            except TimeoutError:
+                continue
+            except OSError:  # an ICMP answer to something sent before
+                continue
+            said = answer(question, source[:2])
+            if said is not None:
+                with contextlib.suppress(OSError):  # larger than the way back takes: silence says so
+                    self._socket.sendto(said, source)
+
+    def close(self) -> None:
+        """End. May be called again."""
+        self._closing = True
+        self._thread.join()
+        self._socket.close()
+
+    def __enter__(self) -> EchoServer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class EchoClient:
+    """Asks one echo, from one port. Not for several threads at once."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Open a socket that never sends fragments.
+
+        Raises:
+            OSError: The name has no address.
+        """
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._peer: Any = address
+        self._socket = socket.socket(family, kind, protocol)
+        _never_fragment(self._socket)
+
+    def ask(self, timeout: float, size: int = SMALLEST) -> Echo | None:
+        """One question.
+
+        Args:
+            timeout: To wait for the answer [s].
+            size: Of question and answer, bytes of UDP payload.
+
+        Returns:
+            The answer; None if none came in time, or the question is larger than this machine's network takes.
+        """
+        nonce = os.urandom(_NONCE)
+        began = time.monotonic()
+        try:
+            self._socket.sendto((_ASK + nonce).ljust(size, b"\0"), self._peer)
+            while (left := began + timeout - time.monotonic()) > 0:
+                self._socket.settimeout(left)
+                seen = read_answer(self._socket.recv(LARGEST), nonce)
+                if seen is not None:
+                    return Echo(time.monotonic() - began, seen)
+        except OSError:  # a time-out, no route, nobody there, or "message too long"
+            return None
+        return None
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def __enter__(self) -> EchoClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _open(host: str, port: int) -> socket.socket:
+    family, kind, protocol, _, address = socket.getaddrinfo(
+        host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
+    )[0]
+    sock = socket.socket(family, kind, protocol)
+    try:
+        _never_fragment(sock)
+        sock.bind(address)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def _never_fragment(sock: socket.socket) -> None:
+    level, option = (
+        (socket.IPPROTO_IPV6, IPV6_MTU_DISCOVER)
+        if sock.family == socket.AF_INET6
+        else (socket.IPPROTO_IP, IP_MTU_DISCOVER)
+    )
+    with contextlib.suppress(OSError):  # systems other than Linux
+        sock.setsockopt(level, option, PMTUDISC_DO)
