@@ -27,6 +27,28 @@ def test_an_action_of_the_service_goes_the_other_way():
     assert [row.direction for row in rows] == ["out", "out", "in", "in", "in"]
 
 
+def test_an_action_of_ros2_is_three_calls_and_two_topics():
+    row = TopicSpec(name="go", kind="ros2_action", type="nav2_msgs/action/NavigateToPose", direction="in", priority=90)
+    rows = {t.name.removeprefix("go/_action/"): t for t in topics_from_api([row])}
+    assert {name: t.type.removeprefix("nav2_msgs/action/NavigateToPose_") for name, t in rows.items()} == {
+        "send_goal/request": "SendGoal_Request",
+        "send_goal/response": "SendGoal_Response",
+        "cancel_goal/request": "action_msgs/srv/CancelGoal_Request",
+        "cancel_goal/response": "action_msgs/srv/CancelGoal_Response",
+        "get_result/request": "GetResult_Request",
+        "get_result/response": "GetResult_Response",
+        "feedback": "FeedbackMessage",
+        "status": "action_msgs/msg/GoalStatusArray",
+    }
+    assert [n for n, t in rows.items() if t.direction.sender is Role.ROBOT] == [
+        f"{call}/request" for call in ("send_goal", "cancel_goal", "get_result")
+    ]
+    assert [n for n, t in rows.items() if not t.reliable] == ["feedback"]
+    assert [n for n, t in rows.items() if t.latched] == ["status"]
+    assert rows["get_result/response"].lifespan == 3600
+    assert {t.priority for t in rows.values()} == {90}
+
+
 def test_an_action_is_neither_latched_nor_unreliable():
     for more in ({"latched": True}, {"reliable": False}):
         with pytest.raises(ValidationError, match="kind: action is reliable and not latched"):

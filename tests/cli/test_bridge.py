@@ -6,13 +6,21 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 
 import pytest
 import typer
 import yaml
+from ros2_graph import shared_router, stage
 from typer.testing import CliRunner
 
+from skytether.api.manifest import TopicSpec
+from skytether.bridge import Bridge, GraphPort, LocalGraph, SessionSpec, topics_from_api
 from skytether.cli.bridge import bridge
+from skytether.messages import LaserScan, encode, hash_of
+from skytether.wire.topic import Role
+
+__all__ = ["shared_router", "stage"]
 
 app = typer.Typer()
 app.command()(bridge)
@@ -217,3 +225,66 @@ def test_a_new_key_is_readable_by_its_owner_only_and_never_overwritten(tmp_path)
     assert result.exit_code == 2
     assert "exists already" in result.stderr
     assert path.read_text() == key
+
+
+def ros2_end(**ros2):
+    return {k: v for k, v in BOTH.items() if k != "sources"} | {"role": "service", "ros2": ros2}
+
+
+@pytest.mark.parametrize(
+    ("document", "text"),
+    [
+        (BOTH | {"ros2": {}}, "ros2: is for role 'robot' or 'service', and without sources"),
+        (ros2_end(router="127.0.0.1"), "ros2.router"),
+        (ros2_end(domain=300), "ros2.domain"),
+        (ros2_end(dialekt="x"), "ros2.dialekt: unknown key, did you mean 'dialect'?"),
+        (ros2_end(namespace="/3po"), "ros2: namespace: '/3po' is no name of a ROS 2 graph"),
+        (ros2_end(remap={"skan": "/scan"}), "ros2.remap.skan: there is no such topic or call"),
+        (ros2_end(zenoh_config="none.json5"), "ros2: Zenoh does not take the configuration"),
+        (ros2_end() | {"topics": [{"name": "a", "type": "Twist", "direction": "in"}]}, "topic 'a': 'Twist' is no type"),
+    ],
+)
+def test_a_ros2_end_that_cannot_be_is_named(run, document, text):
+    result = run(document, "--seconds", "0.1")
+    assert result.exit_code == 2, result.output
+    assert text in result.output
+
+
+def test_the_extra_is_named_where_it_is_missing(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    result = run(ros2_end(), "--seconds", "0.1")
+    assert result.exit_code == 2
+    assert "a ROS 2 graph needs the extra 'ros2': pip install 'skytether[ros2]'" in result.output
+
+
+@pytest.mark.slow
+def test_an_end_is_a_ros2_graph(run, stage):
+    """A service's end with a ROS 2 graph, and a robot's end that sends made-up messages to it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    rihs = hash_of("sensor_msgs/msg/LaserScan", "cdr")
+    scans = stage.rmw("listener").subscribe("/bot/scan", "sensor_msgs::msg::dds_::LaserScan_", rihs)
+    scan = LaserScan(ranges=[1.0] * 10)
+    topics = topics_from_api(TopicSpec(**row) for row in TOPICS)
+    graph = LocalGraph()
+    spec = SessionSpec(0xFF, bytes(32), Role.ROBOT, topics)
+    robot = Bridge(spec, GraphPort(graph, topics, Role.ROBOT), peer=("127.0.0.1", port))
+    done = threading.Event()
+
+    def publish():
+        while not done.wait(0.05):
+            robot.publish("scan", encode(scan, "cdr"))
+            if scans.samples:
+                os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C
+                return
+
+    publishing = threading.Thread(target=publish)
+    with robot:
+        publishing.start()
+        ros2 = {"router": stage.router.address, "domain": stage.domain, "namespace": "/bot"}
+        result = run(ros2_end(**ros2) | {"bind": {"host": "127.0.0.1", "port": port}}, "--seconds", "60", "--json")
+        done.set()
+        publishing.join()
+    assert result.exit_code == 0, result.output
+    assert scans.payloads[0] == encode(scan, "cdr")

@@ -64,7 +64,12 @@ ros1:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "ros1: is missing"),
+        ("", "ros1: is missing; it, or ros2, says which graph the robot is"),
+        ("ros1: {}\nros2: {}", "ros1: stands beside ros2"),
+        ("ros2: {rooter: tcp/x:1}", "ros2.rooter: unknown key, did you mean 'router'"),
+        ("ros2: {router: localhost}", "ros2.router"),
+        ("ros2: {cmd_vel_type: geometry_msgs/msg/Pose}", "ros2.cmd_vel_type"),
+        ("ros2: {cmd_vel: base/3d}", "cmd_vel: 'base/3d' is no name of a ROS 2 graph"),
         ("ros1: {mastr: http://x}", "ros1.mastr: unknown key, did you mean 'master'"),
         ("ros1: {master: localhost}", "ros1.master: must be an address such as http://"),
         ("ros1: {}\nservise: x", "servise: unknown key, did you mean 'service'"),

@@ -20,6 +20,8 @@ CALL_DEPTH = 64
 """Requests, and answers, that may be under way by default."""
 ACTION_NEWEST_LIFESPAN_MS = 1000
 """Of an action's feedback and status, which come again and again."""
+RESULT_LIFESPAN_MS = 3_600_000
+"""How long an action of ROS 2 may take: its result is asked for at the start, and answered at the end."""
 
 
 class Strict(BaseModel):
@@ -33,12 +35,13 @@ class TopicSpec(Strict):
 
     name: Annotated[str, Field(min_length=1, max_length=255)]
     """``*`` takes any topic that the robot offers (direction ``in`` only), with this row's quality of service."""
-    kind: Literal["topic", "call", "action"] = "topic"
+    kind: Literal["topic", "call", "action", "ros2_action"] = "topic"
     """A call is asked in the row's direction and answered in the other; its type is that of a ROS service,
     ``nav_msgs/srv/GetPlan``. It is reliable, and ``lifespan_ms`` and ``depth`` have defaults that suit it.
     An action's goals go in the row's direction; its type is that of a ROS action, ``move_base_msgs/action/MoveBase``.
     It is carried on its five topics, the last three in the other direction: goal, cancel, result (these reliable),
-    feedback and status."""
+    feedback and status. A ``ros2_action`` (``nav2_msgs/action/NavigateToPose``) is carried on the three calls and two
+    topics that it is made of in ROS 2."""
     type: Annotated[str, Field(min_length=1, max_length=255)]
     """ROS 2 style name, ``geometry_msgs/msg/Twist``; ``*`` with name ``*``."""
     direction: Literal["in", "out"]
@@ -64,7 +67,7 @@ class TopicSpec(Strict):
     def _reliable_lives_long(cls, row: Any) -> Any:
         if not isinstance(row, dict):
             return row
-        if row.get("kind") in ("call", "action"):
+        if row.get("kind") in ("call", "action", "ros2_action"):
             row = {"reliable": True, "depth": CALL_DEPTH, **row}
         return {"lifespan_ms": RELIABLE_LIFESPAN_MS, **row} if row.get("reliable") else row
 
@@ -76,8 +79,29 @@ class TopicSpec(Strict):
             raise ValueError(f"kind: {self.kind} is reliable and not latched, and has a name of its own")
         return self
 
+    def parts(self) -> tuple[TopicSpec, ...]:
+        """Itself, or the calls and topics of an action of ROS 2."""
+        if self.kind != "ros2_action":
+            return (self,)
+        call = self.model_copy(update={"kind": "call"})
+        topic = self.model_copy(update={"kind": "topic", "direction": "out" if self.direction == "in" else "in"})
+        newest = {"reliable": False, "depth": 1, "lifespan_ms": ACTION_NEWEST_LIFESPAN_MS}
+        whole: tuple[tuple[TopicSpec, str, str, dict[str, Any]], ...] = (
+            (call, "send_goal", f"{self.type}_SendGoal", {}),
+            (call, "cancel_goal", "action_msgs/srv/CancelGoal", {}),
+            (call, "get_result", f"{self.type}_GetResult", {"lifespan_ms": RESULT_LIFESPAN_MS}),
+            (topic, "feedback", f"{self.type}_FeedbackMessage", newest),
+            (topic, "status", "action_msgs/msg/GoalStatusArray", {"latched": True, "depth": 1}),
+        )
+        return tuple(
+            spec.model_copy(update={"name": f"{self.name}/_action/{part}", "type": typ, **quality})
+            for spec, part, typ, quality in whole
+        )
+
     def rows(self) -> tuple[TopicSpec, ...]:
-        """The topics that carry it: itself, the request and the response of a call, or the five topics of an action."""
+        """The topics that carry it: itself, the request and the response of a call, or all those of an action."""
+        if self.kind == "ros2_action":
+            return tuple(row for part in self.parts() for row in part.rows())
         if self.kind == "topic":
             return (self,)
         row = self.model_copy(update={"kind": "topic"})

@@ -27,8 +27,8 @@ MAX_PENDING = 1000
 """Calls of this end that may wait for an answer."""
 MAX_WORKING = 64
 """Calls of the peer that may be worked on or wait for it."""
-WORKERS = 4
-"""Handlers that run at the same time."""
+WORKERS = 16
+"""Handlers that run at the same time; the result of an action of ROS 2 is a call that waits as long as the action."""
 
 Handler = Callable[[bytes], bytes]
 Publish = Callable[[str, bytes], bool]

@@ -35,8 +35,8 @@ def bridge(
 ) -> None:
     """Join two graphs over UDP without an orchestrator: run it at each end with the same id, key and topics.
 
-    Sources in the configuration publish made-up messages, so that a network can be measured before a robot
-    depends on it.
+    With ros2: in the configuration this end is a ROS 2 graph. Sources publish made-up messages instead, so that a
+    network can be measured before a robot depends on it.
     """
     from .bridge_config import load_config, load_key, write_new_key
     from .config_file import ConfigError
@@ -52,23 +52,26 @@ def bridge(
         key = load_key(config.parent / settings.key_file)
     except ConfigError as error:
         fail(str(error), 2)
-    _run(settings, key, seconds, as_json=json)
+    _run(settings, key, config.parent, seconds, as_json=json)
 
 
-def _run(settings: BridgeConfig, key: bytes, seconds: float | None, *, as_json: bool) -> None:
+def _run(settings: BridgeConfig, key: bytes, folder: Path, seconds: float | None, *, as_json: bool) -> None:
     from rich.console import Group
     from rich.live import Live
 
     from skytether.bridge.endpoint import BridgeError
 
     from .bridge_ends import start_ends
+    from .config_file import ConfigError
 
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     with ExitStack() as stack:
         try:
-            ends = start_ends(settings, key, stack)
+            ends = start_ends(settings, key, stack, folder)
+        except ConfigError as error:
+            fail(str(error), 2)
         except BridgeError as error:
             fail(f"{error}; change bind or peer in the configuration")
         except ValueError as error:

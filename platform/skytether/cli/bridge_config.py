@@ -11,9 +11,11 @@ from pydantic import Field, model_validator
 
 from skytether.api.manifest import ANY_TOPIC, Strict, TopicSpec
 from skytether.bridge.spec import KEY_BYTES, parse_key
+from skytether.ros.names import check_name
 from skytether.wire.topic import Direction, Role
 
 from .config_file import ConfigError, Endpoint, read_config
+from .ros2_config import Ros2Graph
 
 
 class LocalNetwork(Strict):
@@ -56,6 +58,24 @@ class Link(Strict):
     down: LinkConfig = LinkConfig()
 
 
+class Ros2End(Ros2Graph):
+    """A ROS 2 graph at this end."""
+
+    namespace: str = "/"
+    """Of the topics and calls, which are found in the graph under their names."""
+    remap: dict[str, str] = {}
+    """Other names in the graph, by topic or call."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros2End:
+        for key, name in {"namespace": self.namespace, **{f"remap.{k}": v for k, v in self.remap.items()}}.items():
+            try:
+                check_name(name, 2)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from None
+        return self
+
+
 class BridgeConfig(Strict):
     """One end of a bridge, or both in one process."""
 
@@ -71,6 +91,8 @@ class BridgeConfig(Strict):
     topics: Annotated[tuple[TopicSpec, ...], Field(min_length=1)]
     sources: tuple[Source, ...] = ()
     """Publishers of made-up messages, on topics that this end sends."""
+    ros2: Ros2End | None = None
+    """The graph at this end; null: none, only ``sources``."""
     rate_mbps: Annotated[float, Field(gt=0)] | None = None
     """What this end may send; null: the protocol's default."""
     link: Link | None = None
@@ -93,6 +115,8 @@ class BridgeConfig(Strict):
             raise ValueError("peer: only role 'robot' has one; the service's end learns where its robot is")
         if self.role == "service" and self.paths:
             raise ValueError("paths: only the robot's end has them; the service's end learns them")
+        if self.ros2 is not None and (self.role == "both" or self.sources):
+            raise ValueError("ros2: is for role 'robot' or 'service', and without sources: the graph has its own")
         if self.role != "both" and self.link is not None:
             raise ValueError("link: only role 'both' can have one; across machines the network is what it is")
         sent = [

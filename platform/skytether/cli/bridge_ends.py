@@ -5,20 +5,28 @@ from __future__ import annotations
 import heapq
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from skytether.bridge.endpoint import Bridge
 from skytether.bridge.interfaces import LocalPath, Wanted
 from skytether.bridge.local import GraphPort, LocalGraph
+from skytether.bridge.port import Port
 from skytether.bridge.spec import SessionSpec, parse_id, topics_from_api
 from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.ros.names import Names
 from skytether.wire import Config
 from skytether.wire.events import Connected, Event, Refused
-from skytether.wire.topic import Role
+from skytether.wire.topic import Role, Topic
 
 from .bridge_config import BridgeConfig, LinkConfig, Source
+from .ros2_config import make_node
+
+if TYPE_CHECKING:
+    from skytether.ros.ros2.node import Ros2Node
 
 
 class End:
@@ -29,8 +37,10 @@ class End:
         refusal: Why the peer's topic table cannot be joined; empty if it can.
     """
 
-    def __init__(self, settings: BridgeConfig, key: bytes, role: Role, peer: tuple[str, int] | None) -> None:
-        """Prepare.
+    def __init__(
+        self, settings: BridgeConfig, key: bytes, role: Role, peer: tuple[str, int] | None, node: Ros2Node | None = None
+    ) -> None:
+        """Prepare; a node is the ROS 2 graph at this end.
 
         Raises:
             ValueError: A topic cannot be.
@@ -44,7 +54,11 @@ class End:
         bind = (settings.bind.host, settings.bind.port if role.value in (settings.role, "service") else 0)
         config = Config() if settings.rate_mbps is None else Config(rate_bps=settings.rate_mbps * 1e6)
         spec = SessionSpec(parse_id(settings.id), key, role, topics)
-        port = GraphPort(self.graph, topics, role, on_event=self._on_event)
+        port: Port
+        if node is None or settings.ros2 is None:
+            port = GraphPort(self.graph, topics, role, on_event=self._on_event)
+        else:
+            port = _ros2_port(node, settings, topics, role, self._on_event)
         paths = local_paths(settings) if role is Role.ROBOT else ()
         self.bridge = Bridge(spec, port, bind=bind, peer=peer, paths=paths, config=config)
         sent = {t.name for t in topics if t.direction.sender is role}
@@ -88,13 +102,45 @@ class Sources:
             heapq.heapreplace(due, (at + 1 / self._sources[i].rate_hz, i))
 
 
-def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack) -> list[End]:
+def _ros2_port(
+    node: Ros2Node,
+    settings: BridgeConfig,
+    topics: Sequence[Topic],
+    role: Role,
+    on_event: Callable[[Event], object],
+) -> Port:
+    """The ROS 2 graph of this end.
+
+    Raises:
+        ValueError: A topic cannot be in it.
+    """
+    from skytether.ros.ros2.port import Ros2Port
+
+    assert settings.ros2 is not None  # noqa: S101 - the caller has a node of it
+    home = settings.ros2.namespace
+    names = Names(settings.topics, home, home, settings.ros2.remap, ros=2)
+    for unused in names.unused():
+        raise ValueError(f"ros2.remap.{unused}: there is no such topic or call")
+    return Ros2Port(node, topics, role, name_of=names.of, on_event=on_event)
+
+
+def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack, folder: Path) -> list[End]:
     """Start what the configuration names; the stack ends it again.
+
+    Args:
+        settings: What to start.
+        key: The session's.
+        stack: Ends what is started.
+        folder: That the configuration's paths are relative to.
 
     Raises:
         BridgeError: A port is taken, or an address cannot be used.
+        ConfigError: A graph cannot be joined as it is configured.
         ValueError: A topic cannot be.
     """
+    node = None
+    if settings.ros2 is not None:
+        node = stack.enter_context(make_node(settings.ros2, folder, settings.ros2.namespace))
     peer = (settings.peer.host, settings.peer.port) if settings.peer else None
     ends: list[End] = []
     for role in settings.roles:
@@ -103,7 +149,7 @@ def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack) -> list[End
             if settings.link is not None:
                 up, down = conditions(settings.link.up), conditions(settings.link.down)
                 peer = stack.enter_context(LinkEmulator(peer, up=up, down=down)).address
-        end = End(settings, key, role, peer)
+        end = End(settings, key, role, peer, node)
         stack.enter_context(end.bridge)
         stack.enter_context(Sources(end.graph, end.sources))
         ends.append(end)

@@ -17,6 +17,7 @@ from skytether.ros.names import Generation, check_name
 
 from .bridge_config import LocalNetwork
 from .config_file import ConfigError, Endpoint, read_config
+from .ros2_config import Ros2Graph
 
 DEFAULT_MASTER = "http://localhost:11311"
 
@@ -104,6 +105,20 @@ class Ros1Config(GraphConfig):
         return self
 
 
+class Ros2Config(GraphConfig, Ros2Graph):
+    """A ROS 2 graph."""
+
+    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
+    """What the wheels take; nav2 and ros2_control have stamped velocities from Jazzy on."""
+    frame: str = "base_link"
+    """Coordinate frame of stamped velocities."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros2Config:
+        self.check_names(2)
+        return self
+
+
 class RobotConfig(Strict):
     """The whole file."""
 
@@ -126,6 +141,8 @@ class RobotConfig(Strict):
     paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
     """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
     ros1: Ros1Config | None = None
+    ros2: Ros2Config | None = None
+    """The robot's graph: one of the two."""
 
     @field_validator("fallback", mode="before")
     @classmethod
@@ -149,8 +166,11 @@ class RobotConfig(Strict):
 
     @model_validator(mode="after")
     def _has_a_graph(self) -> RobotConfig:
-        if self.ros1 is None:
-            raise ValueError("ros1: is missing; it says which graph the robot is (an empty one is written: ros1: {})")
+        if (self.ros1 is None) == (self.ros2 is None):
+            found = "is missing" if self.ros1 is None else "stands beside ros2"
+            raise ValueError(
+                f"ros1: {found}; it, or ros2, says which graph the robot is (an empty one is written: ros1: {{}})"
+            )
         return self
 
 

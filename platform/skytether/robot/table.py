@@ -37,7 +37,8 @@ def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, enco
         offers: The robot's, by name.
         encoding: In which the robot wants the service's topics.
     """
-    everything = [row for spec in specs for row in (spec.rows() if spec.kind == "action" else (spec,))]
+    parts = [part for spec in specs for part in spec.parts()]
+    everything = [row for part in parts for row in (part.rows() if part.kind == "action" else (part,))]
     rows = [spec for spec in everything if spec.kind == "topic"]
     named = {spec.name: spec for spec in rows}
     anything = named.pop(ANY_TOPIC, None)

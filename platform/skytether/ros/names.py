@@ -109,7 +109,7 @@ class Names:
             if spec.name == ANY_TOPIC:
                 self._anything = True
                 continue
-            asks = spec.kind in ("call", "action")
+            asks = spec.kind != "topic"
             home = robot if (spec.direction == "in") is not asks else service
             name = check_name(resolve(self._remap.get(spec.name, spec.name), home), ros)
             self._names[spec.name] = name

@@ -74,10 +74,15 @@ class NodeName:
 class Dialect(Protocol):
     """One way of writing a ROS 2 graph in Zenoh. Key expressions of peers may be anything and raise nothing."""
 
-    attaches: bool
-    """Whether messages carry an attachment."""
-    watched: str
-    """Key expression of every endpoint's liveliness token."""
+    @property
+    def attaches(self) -> bool:
+        """Whether messages carry an attachment."""
+        ...
+
+    @property
+    def watched(self) -> str:
+        """Key expression of every endpoint's liveliness token."""
+        ...
 
     def key(self, endpoint: Endpoint) -> str:
         """Key expression of an endpoint's messages, requests or responses."""

@@ -68,7 +68,8 @@ class Ros2Port:
         node: Started or not.
         topics: This end's table.
         role: Which end this is.
-        name_of: Name in the graph of a topic or a call of the table; by default its own, in the root namespace.
+        name_of: Name in the graph of a topic of the table (of a call its request); by default its own, in the root
+            namespace.
         skip: Topics of the table that the port has nothing to do with.
         on_event: Called in the bridge's thread with connected, disconnected, moved and refused; must return at once.
 
@@ -240,7 +241,8 @@ class Ros2Port:
         request = self._call_rows[name][0]
         kind = Kind.SERVER if self._calls[name] is self._role else Kind.CLIENT
         service = self._typed(name, request.type.removesuffix("_Request"))
-        return Endpoint(kind, self._named(name), service, hash_of(service, "cdr"), SERVICE)
+        graph_name = self._named(name + REQUEST).removesuffix(REQUEST)
+        return Endpoint(kind, graph_name, service, hash_of(service, "cdr"), SERVICE)
 
     def _ask_peer(self, bridge: Caller, name: str, request: bytes) -> bytes:
         """In a worker's thread of the node: a call from our graph is answered by the peer's."""

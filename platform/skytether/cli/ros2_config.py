@@ -1,0 +1,73 @@
+"""How a configuration says where a ROS 2 graph is, and the node that comes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from skytether.api.manifest import Strict
+from skytether.ros.names import check_name
+
+from .config_file import ConfigError
+
+if TYPE_CHECKING:
+    from skytether.ros.ros2.node import Ros2Node
+
+_EXTRA = "a ROS 2 graph needs the extra 'ros2': pip install 'skytether[ros2]'"
+
+
+class Ros2Graph(Strict):
+    """A ROS 2 graph, by its Zenoh router."""
+
+    router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
+    """``tcp/HOST:PORT`` or ``tls/HOST:PORT``; null: as ``zenoh_config`` says, or tcp/127.0.0.1:7447."""
+    zenoh_config: Path | None = None
+    """Configuration file of Zenoh's (JSON5), for certificates and the like; relative to this file's folder."""
+    dialect: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
+    """Nodes that run rmw_zenoh_cpp, or nodes on DDS behind zenoh-bridge-ros2dds."""
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    """ROS_DOMAIN_ID; of ``rmw_zenoh``."""
+    type_hashes: bool = True
+    """False for ROS 2 Humble, whose types have no hash; of ``rmw_zenoh``."""
+    bridge_namespace: str = "/"
+    """The ``namespace`` that zenoh-bridge-ros2dds is configured with; of ``ros2dds``."""
+    node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
+    """Name of our node in the graph."""
+
+    @field_validator("bridge_namespace")
+    @classmethod
+    def _a_namespace(cls, name: str) -> str:
+        return check_name(name, 2)
+
+
+def make_node(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Ros2Node:
+    """The node that a configuration asks for, not started.
+
+    Args:
+        settings: Where and how.
+        folder: That paths are relative to.
+        namespace: Of the node in the graph.
+
+    Raises:
+        ConfigError: The extra is not installed, or Zenoh does not take a setting.
+    """
+    try:
+        import zenoh  # noqa: F401 - told apart from an ImportError of our own
+    except ModuleNotFoundError as error:
+        raise ConfigError(_EXTRA) from error
+    from skytether.ros.ros2.dialect import Dialect, NodeName, RmwZenoh, Ros2Dds
+    from skytether.ros.ros2.node import Ros2Error, Ros2Node
+
+    dialect: Dialect
+    if settings.dialect == "rmw_zenoh":
+        dialect = RmwZenoh(settings.domain, settings.type_hashes)
+    else:
+        dialect = Ros2Dds(settings.bridge_namespace)
+    file = None if settings.zenoh_config is None else folder / settings.zenoh_config
+    name = NodeName(namespace, settings.node)
+    try:
+        return Ros2Node(dialect, router=settings.router, config_file=file, name=name)
+    except Ros2Error as error:
+        raise ConfigError(f"ros2: {error}") from error
