@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from skytether.cli import main as entry
 from skytether.cli.app import app
 from skytether.cli.demo import _told
-from skytether.cli.output import log_to_console
-from skytether.cli.resources import _table
+from skytether.cli.output import log_to_console, print_table
 from skytether.robot.arbiter import Reason
 from skytether.robot.command import Source
 from skytether.robot.driver import Transition
@@ -52,7 +51,7 @@ def test_warnings_are_one_line_on_standard_error_however_often_it_is_set_up(caps
 def test_in_a_narrow_terminal_names_and_ids_stay_whole(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "40")
     rows = [("0123456789abcdef", "walker", "virtual-trail", "failed", "a reason of many words " * 3)]
-    _table(("instance", "robot", "service", "state", "reason"), rows)
+    print_table(("instance", "robot", "service", "state", "reason"), rows)
     shown = capsys.readouterr().out
     assert "0123456789abcdef" in shown
     assert "\N{HORIZONTAL ELLIPSIS}" not in shown, "what does not fit is folded"

@@ -38,6 +38,10 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("GET", f"{API}/robots", None, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/robots", {"name": "tmp"}, (401, 401, 403, 403, 201)),
     ("DELETE", f"{API}/robots/tmp", None, (401, 401, 403, 403, 204)),
+    ("GET", f"{API}/tokens", None, (401, 401, 403, 403, 200)),
+    ("POST", f"{API}/tokens", {"name": "tmp", "scopes": ["read"]}, (401, 401, 403, 403, 201)),
+    ("POST", f"{API}/tokens/none/rotate", {}, (401, 401, 403, 403, 404)),
+    ("DELETE", f"{API}/tokens/none", None, (401, 401, 403, 403, 204)),
     ("GET", f"{API}/instances", None, (401, 401, 200, 200, 200)),
     ("POST", f"{API}/instances", {"robot": "walker", "service": "toy"}, (401, 401, 201, 403, 201)),
     ("GET", f"{API}/instances/ID", None, (401, 401, 200, 404, 200)),
@@ -98,6 +102,7 @@ def test_every_route_is_in_the_list(people: People) -> None:
         for method in methods
     }
     parameters = {"lab": "{site}", "tmp": "{}", "toy": "{service}", "new": "{service}", "ID": "{instance}"}
+    parameters["none"] = "{token}"
     parameters["ENDED"] = "{instance}"
     listed = set()
     for method, path, *_ in ROUTES:

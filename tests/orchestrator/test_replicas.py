@@ -85,8 +85,18 @@ def running(client: Client, instance: str) -> Any:
 
 def test_the_schema_in_postgresql_is_that_of_the_models(postgres: str) -> None:
     engine = make_engine(postgres)
+    migrate(engine, "0001")
+    with engine.begin() as connection:
+        connection.exec_driver_sql(
+            "INSERT INTO robots (name, services, token_prefix, token_sha256, created_at)"
+            " VALUES ('walker', '[]', 'sky-12345678', 'x', 1)"
+        )
     migrate(engine)
     migrate(engine)
+    with engine.connect() as connection:
+        assert connection.exec_driver_sql("SELECT id, robot, prefix FROM tokens").all() == [
+            ("12345678", "walker", "sky-12345678")
+        ]
     with engine.connect() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []

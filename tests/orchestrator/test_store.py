@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from skytether.orchestrator.db import make_engine, migrate
 from skytether.orchestrator.models import metadata
 from skytether.orchestrator.records import IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
-from skytether.orchestrator.store import KeyReusedError, RobotRow, Store
+from skytether.orchestrator.store import KeyReusedError, RobotRow, Store, TokenRow
 
 NewRecord = Callable[..., Record]
 NOW = 1_700_000_000.0
@@ -27,6 +28,26 @@ def test_the_migrations_make_the_tables_of_the_models_and_may_run_again(tmp_path
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []
     engine.dispose()
+
+
+def test_tokens_of_the_first_schema_are_good_still(tmp_path: Path) -> None:
+    engine = make_engine(f"sqlite:///{tmp_path}/db")
+    migrate(engine, "0001")
+    token = "sky-" + "ab" * 32
+    kept = TokenHash.of(token)
+    with engine.begin() as connection:
+        connection.exec_driver_sql(
+            "INSERT INTO robots (name, services, token_prefix, token_sha256, created_at) VALUES (?, ?, ?, ?, ?)",
+            ("walker", '["*"]', kept.prefix, kept.digest, NOW),
+        )
+    engine.dispose()
+    store = Store(f"sqlite:///{tmp_path}/db")
+    store.migrate()
+    assert [row.name for row in store.robots()] == ["walker"]
+    (row,) = store.tokens_by_prefix(kept.prefix)
+    assert row.robot == "walker"
+    assert row.hash.matches(token)
+    store.close()
 
 
 def test_an_instance_comes_back_as_it_was(store: Store, new_record: NewRecord) -> None:
@@ -176,16 +197,26 @@ def test_event_ids_never_come_again(store: Store, new_record: NewRecord) -> None
 
 
 def test_robots_sites_and_services(store: Store) -> None:
-    token = TokenHash("sky-12345678", "0" * 64)
-    robot = RobotRow("r", ("a", "b"), token, NOW)
-    assert store.add_robot(robot)
-    assert not store.add_robot(robot)
+    token = TokenRow("t", "r", "r", (), TokenHash("sky-12345678", "0" * 64), NOW)
+    robot = RobotRow("r", ("a", "b"), NOW)
+    assert store.add_robot(robot, token)
+    assert not store.add_robot(robot, dataclasses.replace(token, id="u"))
     store.seen("r", NOW + 1)
-    found = store.robots_by_prefix("sky-12345678")[0]
-    assert (found.services, found.token, found.last_seen_at) == (("a", "b"), token, NOW + 1)
+    found = store.robot("r")
+    assert found is not None
+    assert (found.services, found.last_seen_at) == (("a", "b"), NOW + 1)
+    assert store.tokens_by_prefix("sky-12345678") == [token]
+    other = TokenRow("o", "metrics", None, ("metrics",), TokenHash("sky-87654321", "1" * 64), NOW, NOW + 9)
+    assert store.add_token(other)
+    assert not store.add_token(dataclasses.replace(token, id="v", robot="nobody"))
+    store.change_token("o", expires_at=NOW + 5, last_used_at=NOW + 4)
+    assert store.tokens() == [token, dataclasses.replace(other, expires_at=NOW + 5, last_used_at=NOW + 4)]
     store.delete_robot("r")
     store.delete_robot("r")
     assert store.robots() == []
+    assert [row.id for row in store.tokens()] == ["o"]
+    store.delete_token("o")
+    assert store.tokens() == []
 
     site = SiteCreate(name="lab", tier="cloud", runtime="process", options={"cpu": 1})
     assert store.add_site(site)

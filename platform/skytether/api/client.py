@@ -27,6 +27,10 @@ from .rest import (
     Site,
     SiteCreate,
     State,
+    Token,
+    TokenCreate,
+    TokenCreated,
+    TokenRotate,
 )
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -232,6 +236,24 @@ class Client:
         self._request("DELETE", f"/robots/{name}")
 
     # Everything
+
+    # Tokens
+
+    def tokens(self) -> list[Token]:
+        """All but the one in the state folder."""
+        return self._many(Token, "/tokens")
+
+    def create_token(self, token: TokenCreate) -> TokenCreated:
+        """Another token of a robot, or an operator's."""
+        return self._one(TokenCreated, "POST", "/tokens", token)
+
+    def rotate_token(self, token_id: str | None = None, rotate: TokenRotate | None = None) -> TokenCreated:
+        """Another one with the same rights; None: instead of this client's own."""
+        return self._one(TokenCreated, "POST", f"/tokens/{token_id or 'self'}/rotate", rotate or TokenRotate())
+
+    def delete_token(self, token_id: str) -> None:
+        """Revoke a token; may be called again."""
+        self._request("DELETE", f"/tokens/{token_id}")
 
     def metrics(self) -> str:
         """In Prometheus' text format."""

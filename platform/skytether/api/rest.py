@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -204,15 +204,26 @@ class Site(SiteCreate):
     instances: int = 0
 
 
-class RobotCreate(Strict):
-    """Register a robot."""
+TokenLife = Annotated[float, Field(ge=1, le=10 * 365 * 86_400)]
+"""Seconds that a token is good for."""
+
+
+class RobotBase(Strict):
+    """What is known of a robot and may be changed by nobody but an operator."""
 
     name: Name
     services: tuple[str, ...] = ("*",)
     """What it may ask for; ``*``: anything."""
 
 
-class Robot(RobotCreate):
+class RobotCreate(RobotBase):
+    """Register a robot."""
+
+    token_ttl_s: TokenLife | None = None
+    """How long its first token is good for; None: until it is deleted."""
+
+
+class Robot(RobotBase):
     """A registered robot."""
 
     created_at: datetime
@@ -221,6 +232,47 @@ class Robot(RobotCreate):
 
 class RobotCreated(Robot):
     """Answer to a registration: the only time that the token is shown."""
+
+    token: Annotated[str, Field(repr=False)]
+
+
+Scope = Literal["read", "instances", "catalog", "sites", "robots", "tokens", "metrics"]
+"""What an operator's token may: see everything; change instances, catalogue, sites, robots, tokens; read /metrics."""
+SCOPES: tuple[Scope, ...] = get_args(Scope)
+
+
+class TokenCreate(Strict):
+    """Another token: a robot's, or an operator's with some scopes."""
+
+    name: Name
+    """For people, to tell it from others."""
+    robot: Name | None = None
+    scopes: tuple[Scope, ...] = ()
+    ttl_s: TokenLife | None = None
+    """How long it is good for; None: until it is deleted."""
+
+
+class TokenRotate(Strict):
+    """Another token instead of one."""
+
+    grace_s: Annotated[float, Field(ge=0, le=30 * 86_400)] = 300
+    """How long the old one is good for still."""
+
+
+class Token(Strict):
+    """What is known of a token; never the token itself."""
+
+    id: str
+    name: str
+    robot: str | None = None
+    scopes: tuple[Scope, ...] = ()
+    created_at: datetime
+    expires_at: datetime | None = None
+    last_used_at: datetime | None = None
+
+
+class TokenCreated(Token):
+    """The only time that the token is shown."""
 
     token: Annotated[str, Field(repr=False)]
 

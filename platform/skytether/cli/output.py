@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+_PRIVATE = {"session": {"key"}}
 console = Console(stderr=True, highlight=False)
 """For people: progress, tables, notes. Standard output is kept for what programs read."""
 
@@ -32,6 +37,29 @@ def print_json(document: Any) -> None:
     json.dump(document, sys.stdout, allow_nan=False, separators=(",", ":"))
     sys.stdout.write("\n")
     sys.stdout.flush()
+
+
+def plain(model: BaseModel) -> Any:
+    """A model as JSON, without session keys: the output of a command ends up in logs and bug reports."""
+    return model.model_dump(mode="json", exclude=_PRIVATE if "session" in type(model).model_fields else None)
+
+
+def or_dash(value: Any) -> Any:
+    """For a cell of a table."""
+    return "-" if value is None else value
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """A table for people, on standard output."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for i, name in enumerate(head):
+        table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    Console(highlight=False).print(table)
 
 
 def log_to_console() -> None:

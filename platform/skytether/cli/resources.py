@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .connection import Json, TokenFile, Url, connected
-from .output import console, fail, print_json
+from .output import console, fail, or_dash, plain, print_json, print_table
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -19,9 +18,6 @@ service_app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
 site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
 instance_app = typer.Typer(help="What runs, for whom.", no_args_is_help=True)
 robot_app = typer.Typer(help="Who may ask.", no_args_is_help=True)
-
-_PRIVATE = {"session": {"key"}}
-"""Never printed: the output of a command ends up in logs and bug reports."""
 
 
 def apply(
@@ -72,7 +68,7 @@ def list_services(url: Url = None, token_file: TokenFile = None, json: Json = Fa
         (m.metadata.name, m.metadata.version, ", ".join(m.spec.needs.tiers), " ".join(t.name for t in m.spec.topics))
         for m in found
     ]
-    _table(("service", "version", "tiers", "topics"), rows)
+    print_table(("service", "version", "tiers", "topics"), rows)
 
 
 @service_app.command("delete")
@@ -88,10 +84,74 @@ def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False
     with connected(url, token_file) as client:
         found = client.sites()
     if json:
-        print_json([_plain(site) for site in found])
+        print_json([plain(site) for site in found])
         return
-    rows = [(s.name, s.tier, s.runtime, s.state, _or_dash(s.cpu), _or_dash(s.memory_mb), s.instances) for s in found]
-    _table(("site", "tier", "runtime", "state", "cores", "MiB", "instances"), rows)
+    rows = [(s.name, s.tier, s.runtime, s.state, or_dash(s.cpu), or_dash(s.memory_mb), s.instances) for s in found]
+    print_table(("site", "tier", "runtime", "state", "cores", "MiB", "instances"), rows)
+
+
+@site_app.command("show")
+def show_site(name: str, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """Show one site."""
+    with connected(url, token_file) as client:
+        found = client.get_site(name)
+    _show(found, json)
+
+
+@site_app.command("add")
+def add_site(
+    name: str,
+    runtime: Annotated[str, typer.Option(help="What starts instances there: process, docker.")],
+    tier: Annotated[str, typer.Option(help="robot, edge or cloud.")] = "edge",
+    option: Annotated[
+        list[str] | None, typer.Option(help="KEY=VALUE of the runtime's options; may be given again.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")] = 1.0,
+    cost: Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")] = 0.0,
+    image: Annotated[
+        list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
+    ] = None,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Add a place where instances run."""
+    from pydantic import ValidationError
+
+    from skytether.api.rest import SiteCreate
+
+    options = {}
+    for entry in option or ():
+        key, is_, value = entry.partition("=")
+        if not is_:
+            fail(f"--option {entry}: write KEY=VALUE", 2)
+        options[key] = _value(value)
+    asked = {"name": name, "runtime": runtime, "tier": tier, "options": options, "speed": speed, "cost": cost}
+    try:
+        request = SiteCreate.model_validate({**asked, "images": tuple(image or ("*",))})
+    except ValidationError as error:
+        first = error.errors()[0]
+        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
+    with connected(url, token_file) as client:
+        made = client.create_site(request)
+    _show(made, json)
+
+
+def _value(text: str) -> Any:
+    """As YAML reads it; what is none is text."""
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+@site_app.command("delete")
+def delete_site(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+    """Forget a site that has no instances."""
+    with connected(url, token_file) as client:
+        client.delete_site(name)
 
 
 @instance_app.command("list")
@@ -100,13 +160,13 @@ def list_instances(url: Url = None, token_file: TokenFile = None, json: Json = F
     with connected(url, token_file) as client:
         found = client.instances()
     if json:
-        print_json([_plain(instance) for instance in found])
+        print_json([plain(instance) for instance in found])
         return
     rows = [
-        (i.id, i.robot, i.service, i.state, _or_dash(i.placement and i.placement.site), i.restarts, i.reason)
+        (i.id, i.robot, i.service, i.state, or_dash(i.placement and i.placement.site), i.restarts, i.reason)
         for i in found
     ]
-    _table(("instance", "robot", "service", "state", "site", "restarts", "reason"), rows)
+    print_table(("instance", "robot", "service", "state", "site", "restarts", "reason"), rows)
 
 
 @instance_app.command("create")
@@ -166,6 +226,23 @@ def show_logs(
         typer.echo(text, nl=False)
 
 
+@instance_app.command("events")
+def watch_events(
+    instance: str,
+    follow: Annotated[bool, typer.Option("--follow", help="Go on until the instance has ended.")] = False,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Print what happened to an instance, a line each; with --json a document a line."""
+    with connected(url, token_file) as client:
+        for event in client.watch(instance, timeout=None if follow else 1.0):
+            if json:
+                print_json(plain(event))
+            else:
+                typer.echo(f"{event.at.isoformat(timespec='milliseconds')}  {event.state}  {event.reason}".rstrip())
+
+
 @instance_app.command("delete")
 def delete_instance(instance: str, url: Url = None, token_file: TokenFile = None) -> None:
     """End an instance."""
@@ -179,10 +256,10 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
     with connected(url, token_file) as client:
         found = client.robots()
     if json:
-        print_json([_plain(robot) for robot in found])
+        print_json([plain(robot) for robot in found])
         return
-    rows = [(r.name, ", ".join(r.services), r.created_at, _or_dash(r.last_seen_at)) for r in found]
-    _table(("robot", "may ask for", "registered", "last seen"), rows)
+    rows = [(r.name, ", ".join(r.services), r.created_at, or_dash(r.last_seen_at)) for r in found]
+    print_table(("robot", "may ask for", "registered", "last seen"), rows)
 
 
 @robot_app.command("add")
@@ -207,7 +284,7 @@ def add_robot(
     with connected(url, token_file) as client:
         made = client.create_robot(request)
     if json:
-        print_json(_plain(made))
+        print_json(plain(made))
         return
     console.print(f"robot {made.name} is registered; its token, which cannot be shown again:")
     typer.echo(made.token)
@@ -220,32 +297,10 @@ def delete_robot(name: str, url: Url = None, token_file: TokenFile = None) -> No
         client.delete_robot(name)
 
 
-def _plain(model: BaseModel) -> Any:
-    return model.model_dump(mode="json", exclude=_PRIVATE if "session" in type(model).model_fields else None)
-
-
 def _show(instance: BaseModel, json: bool) -> None:
     import yaml
 
     if json:
-        print_json(_plain(instance))
+        print_json(plain(instance))
     else:
-        typer.echo(yaml.safe_dump(_plain(instance), sort_keys=False), nl=False)
-
-
-def _or_dash(value: Any) -> Any:
-    return "-" if value is None else value
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """A table for people, on standard output."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False)
-    for i, name in enumerate(head):
-        table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
-    for row in rows:
-        table.add_row(*(Text(str(cell)) for cell in row))
-    Console(highlight=False).print(table)
+        typer.echo(yaml.safe_dump(plain(instance), sort_keys=False), nl=False)

@@ -1,20 +1,35 @@
 """Who asks, and what they may.
 
-An operator may everything; a robot may ask for itself, for what it is allowed, and see its own.
+A robot may ask for itself, for what it is allowed, and see its own. An operator's token may what its scopes say; the
+one in the state folder may everything.
 """
 
 from __future__ import annotations
 
+import secrets as random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
-from .errors import ConflictError, ForbiddenError, TooManyError, UnauthenticatedError
+from skytether.api.rest import SCOPES, Scope
+
+from .errors import (
+    ConflictError,
+    Fault,
+    ForbiddenError,
+    InvalidError,
+    NotFoundError,
+    TooManyError,
+    UnauthenticatedError,
+)
 from .security import PREFIX_LENGTH, Secrets, TokenHash, new_token
-from .store import RobotRow, Store
+from .store import RobotRow, Store, TokenRow
 from .throttle import Throttle
 
 ANY_SERVICE = "*"
+OWN = "self"
+"""In the place of a token's id: the one that the request came with."""
 _SEEN_EVERY = 10.0
 """Seconds between two notes that a robot was seen: one write per request would be too much."""
 
@@ -24,25 +39,35 @@ class Principal:
     """Who a token belongs to."""
 
     robot: str | None
-    """None: the operator."""
+    """None: an operator."""
     services: tuple[str, ...] = (ANY_SERVICE,)
+    scopes: frozenset[str] = frozenset()
+    """Of an operator's token."""
+    token: TokenRow | None = None
+    """None: the operator's token in the state folder."""
 
     @property
     def owner(self) -> str:
-        """Whose idempotency keys these are."""
-        return "operator" if self.robot is None else f"robot:{self.robot}"
+        """Whose idempotency keys these are, and who it was in the audit."""
+        if self.robot is not None:
+            return f"robot:{self.robot}"
+        return f"operator:{self.token.name}" if self.token else "operator"
 
     def may_use(self, service: str) -> bool:
         return ANY_SERVICE in self.services or service in self.services
 
-    def require_operator(self) -> None:
-        """Refuse a robot.
+    def require_scope(self, scope: Scope, *, robots: bool = False) -> None:
+        """Refuse a token without a scope, and robots unless they may.
 
         Raises:
-            ForbiddenError: It is one.
+            ForbiddenError: It has not.
         """
         if self.robot is not None:
-            raise ForbiddenError(f"robot '{self.robot}' may not do this: it needs the operator's token")
+            if not robots:
+                raise ForbiddenError(f"robot '{self.robot}' may not do this: it needs an operator's token")
+        elif scope not in self.scopes:
+            has = ", ".join(sorted(self.scopes)) or "none"
+            raise ForbiddenError(f"this token may not do this: it needs the scope '{scope}'; its scopes are: {has}")
 
     def require(self, robot: str, service: str) -> None:
         """May it ask for this service for that robot?
@@ -97,32 +122,121 @@ class Access:
         if not token:
             raise UnauthenticatedError("a token is needed: send `Authorization: Bearer TOKEN`")
         if self._secrets.is_operator(token):
-            return Principal(None)
-        for row in self._store.robots_by_prefix(token[:PREFIX_LENGTH]):
-            if row.token.matches(token):
-                self._note_seen(row.name)
-                return Principal(row.name, row.services)
+            return Principal(None, scopes=frozenset(SCOPES))
+        for row in self._store.tokens_by_prefix(token[:PREFIX_LENGTH]):
+            if row.hash.matches(token):
+                return self._principal(row)
         raise UnauthenticatedError("this token is not known here: it was revoked, or is another orchestrator's")
 
-    def _note_seen(self, robot: str) -> None:
-        now = time.monotonic()
-        if now - self._noted.get(robot, -_SEEN_EVERY) >= _SEEN_EVERY:
-            self._noted[robot] = now
-            self._store.seen(robot, self._clock())
+    def _principal(self, row: TokenRow) -> Principal:
+        now = self._clock()
+        if row.expires_at is not None and now >= row.expires_at:
+            when = datetime.fromtimestamp(row.expires_at, UTC).isoformat(timespec="seconds")
+            raise UnauthenticatedError(f"this token expired at {when}: ask the operator for another")
+        self._note_used(row, now)
+        if row.robot is None:
+            return Principal(None, scopes=frozenset(row.scopes), token=row)
+        robot = self._store.robot(row.robot)
+        if robot is None:
+            raise UnauthenticatedError("this token's robot is registered no more")
+        return Principal(robot.name, robot.services, token=row)
 
-    def register(self, name: str, services: tuple[str, ...]) -> tuple[RobotRow, str]:
+    def _note_used(self, row: TokenRow, now: float) -> None:
+        at = time.monotonic()
+        if at - self._noted.get(row.id, -_SEEN_EVERY) >= _SEEN_EVERY:
+            self._noted[row.id] = at
+            self._store.change_token(row.id, last_used_at=now)
+            if row.robot is not None:
+                self._store.seen(row.robot, now)
+
+    def register(self, name: str, services: tuple[str, ...], ttl_s: float | None) -> tuple[RobotRow, str]:
         """A new robot and its token, which cannot be shown again.
 
         Raises:
             ConflictError: There is one of that name.
         """
-        token = new_token()
-        row = RobotRow(name, services, TokenHash.of(token), self._clock())
-        if not self._store.add_robot(row):
-            raise ConflictError(f"there is a robot '{name}' already: delete it first if its token is lost")
-        return row, token
+        row, token = self._new(name, name, (), ttl_s)
+        robot = RobotRow(name, services, row.created_at)
+        if not self._store.add_robot(robot, row):
+            raise ConflictError(f"there is a robot '{name}' already: give it another token, or delete it first")
+        return robot, token
 
     def revoke(self, name: str) -> None:
-        """Forget a robot: its token is worth nothing from now on. One that is gone already is no error."""
+        """Forget a robot: its tokens are worth nothing from now on. One that is gone already is no error."""
         self._store.delete_robot(name)
-        self._noted.pop(name, None)
+
+    def create(
+        self, by: Principal, name: str, robot: str | None, scopes: Iterable[Scope], ttl_s: float | None
+    ) -> tuple[TokenRow, str]:
+        """Another token of a robot, or an operator's with some scopes; it cannot be shown again.
+
+        Raises:
+            ForbiddenError: It would have a scope that the one who asks has not.
+            InvalidError: Scopes for a robot, or none for an operator.
+            NotFoundError: There is no such robot.
+        """
+        scopes = tuple(sorted(set(scopes)))
+        if (robot is None) != bool(scopes):
+            text = (
+                "an operator's token needs at least one"
+                if robot is None
+                else "a robot's token has none: leave them out"
+            )
+            raise InvalidError([Fault("scopes", f"{text}; there are: {', '.join(SCOPES)}")])
+        _require_all(by, robot, scopes)
+        row, token = self._new(name, robot, scopes, ttl_s)
+        if not self._store.add_token(row):
+            raise NotFoundError(f"there is no robot '{robot}': register it first")
+        return row, token
+
+    def rotate(self, by: Principal, id_: str, grace_s: float) -> tuple[TokenRow, str]:
+        """Another token with the same rights and the same time to live; the old one is good for a while longer.
+
+        Raises:
+            ForbiddenError: Not for this token.
+            NotFoundError: There is none of that id.
+        """
+        if id_ == OWN or (by.token and id_ == by.token.id):
+            old = by.token
+            if old is None:
+                raise NotFoundError(
+                    "the operator's token of the state folder is renewed by deleting its file and a restart"
+                )
+        else:
+            by.require_scope("tokens")
+            old = self._store.token(id_)
+            if old is None:
+                raise NotFoundError(f"there is no token '{id_}'")
+            _require_all(by, old.robot, old.scopes)
+        now = self._clock()
+        ttl_s = None if old.expires_at is None else old.expires_at - old.created_at
+        row, token = self._new(old.name, old.robot, old.scopes, ttl_s)
+        self._store.add_token(row)
+        ends = now + grace_s
+        if old.expires_at is None or ends < old.expires_at:
+            self._store.change_token(old.id, expires_at=ends)
+        return row, token
+
+    def forget(self, by: Principal, id_: str) -> None:
+        """A token is worth nothing from now on. One that is gone already is no error.
+
+        Raises:
+            ForbiddenError: It may more than the one who asks.
+        """
+        row = self._store.token(id_)
+        if row is not None:
+            _require_all(by, row.robot, row.scopes)
+            self._store.delete_token(id_)
+
+    def _new(
+        self, name: str, robot: str | None, scopes: tuple[Scope, ...], ttl_s: float | None
+    ) -> tuple[TokenRow, str]:
+        token, now = new_token(), self._clock()
+        expires = None if ttl_s is None else now + ttl_s
+        return TokenRow(random.token_hex(8), name, robot, scopes, TokenHash.of(token), now, expires), token
+
+
+def _require_all(by: Principal, robot: str | None, scopes: Iterable[Scope]) -> None:
+    """Nobody makes, renews or revokes a token that may more than his own."""
+    for scope in ("robots",) if robot is not None else scopes:
+        by.require_scope(scope)

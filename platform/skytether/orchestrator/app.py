@@ -9,7 +9,7 @@ import skytether
 from . import problems
 from .core import Orchestrator
 from .logs import Audit
-from .routers import catalog, health, instances, robots, sites
+from .routers import catalog, health, instances, robots, sites, tokens
 
 
 def create_app(core: Orchestrator) -> FastAPI:
@@ -21,7 +21,7 @@ def create_app(core: Orchestrator) -> FastAPI:
     )
     app.state.core = core
     problems.install(app, core.settings.limits.body_bytes)
-    for router in (catalog.router, sites.router, instances.router, robots.router, health.router):
+    for router in (catalog.router, sites.router, instances.router, robots.router, tokens.router, health.router):
         app.include_router(router)
     app.add_middleware(Audit)
     return app

@@ -40,10 +40,22 @@ robots = Table(
     metadata,
     Column("name", String(63), primary_key=True),
     Column("services", JSON, nullable=False),
-    Column("token_prefix", String(16), nullable=False, index=True),
-    Column("token_sha256", String(64), nullable=False),
     Column("created_at", Float, nullable=False),
     Column("last_seen_at", Float),
+)
+
+tokens = Table(
+    "tokens",
+    metadata,
+    Column("id", String(16), primary_key=True),
+    Column("name", String(63), nullable=False),
+    Column("robot", String(63), ForeignKey("robots.name", ondelete="CASCADE"), comment="NULL: an operator's"),
+    Column("scopes", JSON, nullable=False),
+    Column("prefix", String(16), nullable=False, index=True),
+    Column("sha256", String(64), nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("expires_at", Float),
+    Column("last_used_at", Float),
 )
 
 instances = Table(

@@ -14,11 +14,11 @@ from typing import Any
 from sqlalchemy import Connection, Row, RowMapping, delete, func, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
-from skytether.api.rest import SiteCreate, State
+from skytether.api.rest import Scope, SiteCreate, State
 
 from .db import make_engine, migrate
 from .leader import Lock, lock_of
-from .models import events, facts, idempotency, instances, reports, robots, services, sites
+from .models import events, facts, idempotency, instances, reports, robots, services, sites, tokens
 from .records import Record, check_move
 from .security import TokenHash
 
@@ -43,9 +43,25 @@ class RobotRow:
 
     name: str
     services: tuple[str, ...]
-    token: TokenHash
     created_at: float
     last_seen_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TokenRow:
+    """What is kept of a token, of a robot or of an operator."""
+
+    id: str
+    name: str
+    """For people; of a robot's first token: the robot's."""
+    robot: str | None
+    """None: an operator's."""
+    scopes: tuple[Scope, ...]
+    """What an operator's may do; a robot's has none, for what it may is the robot's."""
+    hash: TokenHash
+    created_at: float
+    expires_at: float | None = None
+    last_used_at: float | None = None
 
 
 class KeyReusedError(Exception):
@@ -269,15 +285,21 @@ class Store:
         with self._engine.connect() as connection:
             return [_robot(row) for row in connection.execute(select(robots).order_by(robots.c.name))]
 
-    def robots_by_prefix(self, prefix: str) -> Sequence[RobotRow]:
-        """Those whose token begins so; at most one but for a freak of chance."""
+    def robot(self, name: str) -> RobotRow | None:
         with self._engine.connect() as connection:
-            return [_robot(r) for r in connection.execute(select(robots).where(robots.c.token_prefix == prefix))]
+            row = connection.execute(select(robots).where(robots.c.name == name)).one_or_none()
+        return _robot(row) if row else None
 
-    def add_robot(self, robot: RobotRow) -> bool:
-        """False if there is one of that name."""
+    def add_robot(self, robot: RobotRow, token: TokenRow) -> bool:
+        """With its first token; False if there is one of that name."""
         row = {"name": robot.name, "services": list(robot.services), "created_at": robot.created_at}
-        return self._insert(robots, {**row, "token_prefix": robot.token.prefix, "token_sha256": robot.token.digest})
+        try:
+            with self._writer.begin() as connection:
+                connection.execute(insert(robots).values(**row))
+                connection.execute(insert(tokens).values(**_token_values(token)))
+        except IntegrityError:
+            return False
+        return True
 
     def delete_robot(self, name: str) -> None:
         with self._writer.begin() as connection:
@@ -286,6 +308,35 @@ class Store:
     def seen(self, robot: str, now: float) -> None:
         with self._writer.begin() as connection:
             connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
+
+    # Tokens
+
+    def tokens(self) -> list[TokenRow]:
+        with self._engine.connect() as connection:
+            return [_token(row) for row in connection.execute(select(tokens).order_by(tokens.c.created_at))]
+
+    def token(self, id_: str) -> TokenRow | None:
+        with self._engine.connect() as connection:
+            row = connection.execute(select(tokens).where(tokens.c.id == id_)).one_or_none()
+        return _token(row) if row else None
+
+    def tokens_by_prefix(self, prefix: str) -> Sequence[TokenRow]:
+        """Those that begin so; at most one but for a freak of chance."""
+        with self._engine.connect() as connection:
+            return [_token(row) for row in connection.execute(select(tokens).where(tokens.c.prefix == prefix))]
+
+    def add_token(self, token: TokenRow) -> bool:
+        """False if its robot is gone."""
+        return self._insert(tokens, _token_values(token))
+
+    def change_token(self, id_: str, **values: float | None) -> None:
+        """Set when it expires, or when it was last used."""
+        with self._writer.begin() as connection:
+            connection.execute(update(tokens).where(tokens.c.id == id_).values(**values))
+
+    def delete_token(self, id_: str) -> None:
+        with self._writer.begin() as connection:
+            connection.execute(delete(tokens).where(tokens.c.id == id_))
 
     def _insert(self, table: Any, values: dict[str, Any]) -> bool:
         try:
@@ -308,8 +359,19 @@ def _record(row: RowMapping) -> Record:
 
 
 def _robot(row: Row[Any]) -> RobotRow:
-    token = TokenHash(row.token_prefix, row.token_sha256)
-    return RobotRow(row.name, tuple(row.services), token, row.created_at, row.last_seen_at)
+    return RobotRow(row.name, tuple(row.services), row.created_at, row.last_seen_at)
+
+
+def _token(row: Row[Any]) -> TokenRow:
+    kept = TokenHash(row.prefix, row.sha256)
+    times = row.created_at, row.expires_at, row.last_used_at
+    return TokenRow(row.id, row.name, row.robot, tuple(row.scopes), kept, *times)
+
+
+def _token_values(token: TokenRow) -> dict[str, Any]:
+    plain = {"id": token.id, "name": token.name, "robot": token.robot, "scopes": list(token.scopes)}
+    times = {"created_at": token.created_at, "expires_at": token.expires_at}
+    return {**plain, **times, "prefix": token.hash.prefix, "sha256": token.hash.digest}
 
 
 def _add_event(connection: Connection, record: Record) -> None:

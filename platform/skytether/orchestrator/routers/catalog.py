@@ -6,7 +6,7 @@ from fastapi import APIRouter, Response
 
 from skytether.api.manifest import Manifest
 
-from .deps import PREFIX, Caller, Core, Operator, says
+from .deps import PREFIX, Caller, CatalogOperator, Core, says
 
 router = APIRouter(prefix=f"{PREFIX}/catalog", tags=["catalogue"], responses=says(401))
 
@@ -25,7 +25,7 @@ def get_service(core: Core, caller: Caller, service: str) -> Manifest:
 
 
 @router.put("/{service}", responses={201: {"model": Manifest, "description": "It is new"}, **says(403, 422)})
-def put_service(core: Core, _: Operator, service: str, manifest: Manifest, response: Response) -> Manifest:
+def put_service(core: Core, _: CatalogOperator, service: str, manifest: Manifest, response: Response) -> Manifest:
     """Add a service, or change it for instances to come."""
     if core.catalogue.put(service, manifest):
         response.status_code = 201
@@ -33,7 +33,7 @@ def put_service(core: Core, _: Operator, service: str, manifest: Manifest, respo
 
 
 @router.delete("/{service}", status_code=204, responses=says(403, 409))
-def delete_service(core: Core, _: Operator, service: str) -> None:
+def delete_service(core: Core, _: CatalogOperator, service: str) -> None:
     """Remove a service that was put; its instances run on."""
     core.catalogue.delete(service)
     core.metrics.forget_service(service)

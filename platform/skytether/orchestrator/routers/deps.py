@@ -7,14 +7,14 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from skytether.api.rest import Problem
+from skytether.api.rest import Problem, Scope
 
 from ..access import Principal
 from ..core import Orchestrator
 
 PREFIX = "/api/v1"
 
-bearer = HTTPBearer(auto_error=False, description="The operator's token, or a robot's")
+bearer = HTTPBearer(auto_error=False, description="An operator's token, or a robot's")
 
 
 def _core(request: Request) -> Orchestrator:
@@ -41,17 +41,27 @@ def authenticated(core: Core, request: Request, token: Bearer) -> Principal:
     return principal
 
 
-Caller = Annotated[Principal, Depends(authenticated)]
-"""Anybody with a token."""
+Authenticated = Annotated[Principal, Depends(authenticated)]
+"""Anybody with a token, whatever it may."""
 
 
-def _operator(caller: Caller) -> Principal:
-    caller.require_operator()
-    return caller
+def _holder(scope: Scope, *, robots: bool = False) -> Any:
+    def check(caller: Authenticated) -> Principal:
+        caller.require_scope(scope, robots=robots)
+        return caller
+
+    return Depends(check)
 
 
-Operator = Annotated[Principal, Depends(_operator)]
-"""The operator, and nobody else."""
+Caller = Annotated[Principal, _holder("read", robots=True)]
+"""A robot, or an operator who may read: for looking."""
+Actor = Annotated[Principal, _holder("instances", robots=True)]
+"""A robot, or an operator who may change instances."""
+Reader = Annotated[Principal, _holder("read")]
+CatalogOperator = Annotated[Principal, _holder("catalog")]
+SitesOperator = Annotated[Principal, _holder("sites")]
+RobotsOperator = Annotated[Principal, _holder("robots")]
+TokensOperator = Annotated[Principal, _holder("tokens")]
 
 
 def says(*statuses: int) -> dict[int | str, dict[str, Any]]:

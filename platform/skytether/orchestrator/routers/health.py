@@ -29,5 +29,5 @@ def readyz(core: Core, request: Request) -> Response:
 def metrics(core: Core, request: Request, token: Bearer) -> Response:
     """Prometheus metrics; for the operator, or for all if the orchestrator was started with ``--open-metrics``."""
     if not core.settings.open_metrics:
-        authenticated(core, request, token).require_operator()
+        authenticated(core, request, token).require_scope("metrics")
     return Response(core.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -17,7 +17,7 @@ from ..core import Orchestrator
 from ..instances import utc
 from ..records import Record
 from ..store import EventRow
-from .deps import PREFIX, Caller, Core, says
+from .deps import PREFIX, Actor, Caller, Core, says
 
 router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
 
@@ -28,7 +28,7 @@ _LOOK = 1.0
 @router.post("", status_code=201, responses=says(403, 404, 409, 422))
 def create(
     core: Core,
-    caller: Caller,
+    caller: Actor,
     asked: InstanceCreate,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=255)] = None,
 ) -> Instance:
@@ -57,13 +57,13 @@ def get(core: Core, record: Own) -> Instance:
 
 
 @router.delete("/{instance}", status_code=204, responses=says(404))
-def delete(core: Core, caller: Caller, instance: str) -> None:
+def delete(core: Core, caller: Actor, instance: str) -> None:
     """End an instance; may be called again."""
     core.instances.delete(caller, instance)
 
 
 @router.post("/{instance}/renew", responses=says(404, 422))
-def renew(core: Core, caller: Caller, instance: str, asked: Renew) -> Instance:
+def renew(core: Core, caller: Actor, instance: str, asked: Renew) -> Instance:
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
     return core.instances.show(core.instances.renew(caller, instance, asked))
 

@@ -1,4 +1,4 @@
-"""``/robots``: who may ask. For the operator only."""
+"""``/robots``: who may ask. For operators only."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skytether.api.rest import Robot, RobotCreate, RobotCreated
 
 from ..instances import utc
 from ..store import RobotRow
-from .deps import PREFIX, Core, Operator, says
+from .deps import PREFIX, Core, Reader, RobotsOperator, says
 
 router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))
 
@@ -19,20 +19,20 @@ def _show(row: RobotRow) -> Robot:
 
 
 @router.get("")
-def list_robots(core: Core, _: Operator) -> list[Robot]:
+def list_robots(core: Core, _: Reader) -> list[Robot]:
     """All registered robots."""
     return [_show(row) for row in core.store.robots()]
 
 
 @router.post("", status_code=201, responses=says(409, 422))
-def add_robot(core: Core, _: Operator, asked: RobotCreate) -> RobotCreated:
+def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate) -> RobotCreated:
     """Register a robot. Its token is in the answer and cannot be shown again."""
-    row, token = core.access.register(asked.name, asked.services)
+    row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s)
     return RobotCreated(**_show(row).model_dump(), token=token)
 
 
 @router.delete("/{robot}", status_code=204)
-def delete_robot(core: Core, _: Operator, robot: str) -> None:
-    """Revoke a robot's token and end what it holds."""
+def delete_robot(core: Core, _: RobotsOperator, robot: str) -> None:
+    """Revoke a robot's tokens and end what it holds."""
     core.access.revoke(robot)
     core.instances.end_all(robot)

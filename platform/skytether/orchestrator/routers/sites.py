@@ -9,7 +9,7 @@ from skytether.api.rest import Site, SiteCreate
 from ..access import Principal
 from ..core import Orchestrator
 from ..sites import Site as LiveSite
-from .deps import PREFIX, Caller, Core, Operator, says
+from .deps import PREFIX, Caller, Core, SitesOperator, says
 
 router = APIRouter(prefix=f"{PREFIX}/sites", tags=["sites"])
 
@@ -42,7 +42,7 @@ def list_sites(core: Core, caller: Caller) -> list[Site]:
 
 
 @router.post("", status_code=201, responses=says(401, 403, 409, 422))
-def create_site(core: Core, caller: Operator, asked: SiteCreate) -> Site:
+def create_site(core: Core, caller: SitesOperator, asked: SiteCreate) -> Site:
     """Add a site."""
     return _show(core, core.sites.add(asked), caller)
 
@@ -54,7 +54,7 @@ def get_site(core: Core, caller: Caller, site: str) -> Site:
 
 
 @router.delete("/{site}", status_code=204, responses=says(401, 403, 404, 409))
-def delete_site(core: Core, _: Operator, site: str) -> None:
+def delete_site(core: Core, _: SitesOperator, site: str) -> None:
     """Forget a site that has no instances."""
     core.sites.delete(site)
     core.metrics.forget_site(site)

@@ -1,0 +1,135 @@
+"""Tokens over REST: scopes, expiry, rotation, and that nobody makes one that may more than his own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from skytether.api.client import ApiError, Client
+from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, SiteCreate, TokenCreate, TokenRotate
+from skytether.orchestrator.access import Access
+from skytether.orchestrator.errors import UnauthenticatedError
+from skytether.orchestrator.security import Secrets
+from skytether.orchestrator.store import Store
+from skytether.orchestrator.throttle import Throttle
+
+ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
+DOES: dict[str, Callable[[Client, Any], Any]] = {
+    "read": lambda c, _: (c.sites(), c.instances(), c.services(), c.robots(), c.tokens()),
+    "instances": lambda c, _: c.create_instance(ASK),
+    "catalog": lambda c, m: c.put_service("other", m),
+    "sites": lambda c, _: c.create_site(SiteCreate(name="more", tier="edge", runtime="fake")),
+    "robots": lambda c, _: c.create_robot(RobotCreate(name="another")),
+    "tokens": lambda c, _: c.delete_token("none"),
+    "metrics": lambda c, _: c.metrics(),
+}
+"""One thing that each scope is for."""
+
+
+@pytest.mark.parametrize("scope", SCOPES)
+def test_a_scope_is_good_for_what_it_names_and_nothing_else(served: Any, manifest: Any, scope: Any) -> None:
+    served.site("lab")
+    token = served.operator.create_token(TokenCreate(name="one", scopes=(scope,))).token
+    client = served.client(token)
+    for name, does in DOES.items():
+        body = manifest()
+        body["metadata"]["name"] = "other"
+        if name == scope:
+            does(client, body)
+        else:
+            with pytest.raises(ApiError, match=f"it needs the scope '{name}'; its scopes are: {scope}") as caught:
+                does(client, body)
+            assert caught.value.problem.status == 403
+
+
+def test_what_is_told_of_tokens_is_never_the_token(served: Any) -> None:
+    served.robot("walker")
+    made = served.operator.create_token(TokenCreate(name="prometheus", scopes=("metrics", "read"), ttl_s=60))
+    listed = served.operator.tokens()
+    assert [(t.name, t.robot, t.scopes) for t in listed] == [
+        ("walker", "walker", ()),
+        ("prometheus", None, ("metrics", "read")),
+    ]
+    assert (made.expires_at - made.created_at).total_seconds() == 60
+    assert listed[1].last_used_at is None
+    assert made.token not in repr(made) + str(listed)
+
+
+def test_a_robot_gets_another_token_before_its_own_ends(served: Any) -> None:
+    robot = served.robot("walker")
+    fresh = robot.rotate_token(rotate=TokenRotate(grace_s=0))
+    with pytest.raises(ApiError, match="expired at"):
+        robot.sites()
+    other = served.client(fresh.token)
+    other.sites()
+    again = served.operator.rotate_token(fresh.id)
+    assert again.robot == "walker"
+    other.sites()  # still good, for the grace
+    served.client(again.token).sites()
+    served.operator.delete_token(again.id)
+    with pytest.raises(ApiError, match="not known here"):
+        served.client(again.token).sites()
+
+
+def test_a_robot_may_have_several_and_all_end_with_it(served: Any) -> None:
+    first = served.robot("walker")
+    second = served.client(served.operator.create_token(TokenCreate(name="spare", robot="walker")).token)
+    assert [client.instances() for client in (first, second)] == [[], []]
+    served.operator.delete_robot("walker")
+    for client in (first, second):
+        with pytest.raises(ApiError):
+            client.instances()
+    assert served.operator.tokens() == []
+
+
+def test_nobody_makes_renews_or_revokes_a_token_that_may_more_than_his_own(served: Any) -> None:
+    served.robot("walker")
+    strong = served.operator.create_token(TokenCreate(name="strong", scopes=("sites",)))
+    walkers = served.operator.tokens()[0]
+    weak = served.client(served.operator.create_token(TokenCreate(name="weak", scopes=("tokens",))).token)
+    for attempt in (
+        lambda: weak.create_token(TokenCreate(name="a", scopes=("sites",))),
+        lambda: weak.create_token(TokenCreate(name="a", robot="walker")),
+        lambda: weak.rotate_token(strong.id),
+        lambda: weak.rotate_token(walkers.id),
+        lambda: weak.delete_token(strong.id),
+        lambda: weak.delete_token(walkers.id),
+    ):
+        with pytest.raises(ApiError, match=r"it needs the scope '(sites|robots)'"):
+            attempt()
+    assert weak.create_token(TokenCreate(name="a", scopes=("tokens",))).scopes == ("tokens",)
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "says"),
+    [
+        (TokenCreate(name="a"), 422, "an operator's token needs at least one; there are: read,"),
+        (TokenCreate(name="a", robot="walker", scopes=("read",)), 422, "a robot's token has none"),
+        (TokenCreate(name="a", robot="nobody"), 404, "there is no robot 'nobody'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(served: Any, asked: TokenCreate, status: int, says: str) -> None:
+    served.robot("walker")
+    with pytest.raises(ApiError, match=says) as caught:
+        served.operator.create_token(asked)
+    assert caught.value.problem.status == status
+
+
+def test_the_operators_own_token_is_renewed_at_the_machine(served: Any) -> None:
+    with pytest.raises(ApiError, match="deleting its file"):
+        served.operator.rotate_token()
+
+
+def test_a_token_ends_at_its_time_and_use_is_noted(store: Store, tmp_path: Any) -> None:
+    now = [1000.0]
+    access = Access(store, Secrets(tmp_path), lambda: now[0], Throttle(100, 100, lambda: 0.0))
+    _, token = access.register("walker", ("*",), ttl_s=60)
+    assert access.authenticate(token).robot == "walker"
+    now[0] += 59.9
+    access.authenticate(token)
+    now[0] += 0.1
+    with pytest.raises(UnauthenticatedError, match="expired at 1970-01-01T00:17:40"):
+        access.authenticate(token)
+    assert store.tokens()[0].last_used_at == 1000.0
