@@ -37,17 +37,51 @@ def test_one_round_trip(world, topics):
     assert len(hellos(link)) == len(welcomes(link)) == 1
 
 
-def test_a_lost_handshake_is_repeated_with_back_off(world):
+def test_a_lost_handshake_is_repeated_quickly_at_first_and_with_back_off_later(world):
     link = world.link(connect=False, up=LinkConditions(cut=True), record=True)
     link.run(4.9)
     times = [t for t, p in link.sent[ROBOT]]
     waits = [b - a for a, b in itertools.pairwise(times)]
-    assert waits == pytest.approx([0.05, 0.1, 0.2, 0.4, 0.8, 1.0, 1.0, 1.0])
+    assert waits[:20] == pytest.approx([0.05] * 20)
+    assert waits[20:] == pytest.approx([0.05 * t for t in times[20:-1]])
     assert len(set(hellos(link))) == 1
+    link.run(30.0)
+    assert link.sent[ROBOT][-1][0] - link.sent[ROBOT][-2][0] == pytest.approx(1.0)
+    before = len(set(hellos(link)))
     link.models[ROBOT].conditions = LinkConditions()
     link.run(2.0)
-    assert len(set(hellos(link))) == 2  # a new one before the service forgets the old one
+    assert 6 <= before <= len(set(hellos(link))) <= 9  # a new one before the service forgets the old one
     assert events(link, SERVICE, Connected)
+
+
+@pytest.mark.parametrize(("burst", "most", "all_within"), [(None, 0.4, 1.0), (4, 1.0, 3.0)], ids=["single", "bursts"])
+def test_thirty_percent_of_loss_costs_a_handshake_tenths_of_a_second(make_world, burst, most, all_within):
+    """Bursts are of 4 packets here however far apart those are, so repeating costs more than on a real link."""
+    took = []
+    for seed in range(100):
+        bad = {"delay": 0.05, "loss": 0.3, "burst": burst}
+        up, down = LinkConditions(seed=2 * seed, **bad), LinkConditions(seed=2 * seed + 1, **bad)
+        link = make_world(seed).link(connect=False, up=up, down=down)
+        while not all(events(link, role, Connected) for role in Role):
+            link.run(0.05)
+            assert link.now < 10
+        took.append(max(events(link, role, Connected)[0][0] for role in Role))
+    took.sort()
+    assert took[94] <= most
+    assert took[-1] <= all_within
+
+
+def test_a_robot_goes_on_confirming_until_the_service_is_heard(world):
+    link = world.link(connect=False, up=LinkConditions(delay=0.01), down=LinkConditions(delay=0.01))
+    link.run(0.015)
+    link.models[ROBOT].conditions = LinkConditions(cut=True)
+    link.run(0.4)
+    assert events(link, ROBOT, Connected)
+    assert not events(link, SERVICE, Connected)
+    back = link.now
+    link.models[ROBOT].conditions = LinkConditions(delay=0.01)
+    link.run(0.1)
+    assert events(link, SERVICE, Connected)[0][0] - back < 0.065
 
 
 def test_a_lost_answer_is_repeated_the_same(world):

@@ -45,7 +45,7 @@ class Config:
     silence: float = 1.0
     """A peer not heard for this long is reported as disconnected; its keys stay valid."""
     hello_retry: float = 0.05
-    """First wait for an answer to a handshake; doubles up to ``hello_retry_max``."""
+    """Time between handshakes at first; 5 % of that since the first one later, at most ``hello_retry_max``."""
     hello_retry_max: float = 1.0
     old_keys: float = 2.0
     """How long the keys before a new handshake still open packets that were on their way."""

@@ -270,6 +270,8 @@ class Paths:
 
     def _interval(self, path: Path, now: float, silence: float, connected: bool) -> float:
         config = self._config
+        if path.newest < 0 and silence < config.silence:  # the peer may not know of these keys yet, for all we know
+            return min(config.keepalive, config.hello_retry)
         if len(self._paths) == 1:
             return config.keepalive if connected else patience(config, silence)
         health = path.liveness.health(now)

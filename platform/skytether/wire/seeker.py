@@ -12,6 +12,9 @@ from .topic import Topic
 
 HELLO_LIFE = 5.0
 """Seconds before an unanswered HELLO is replaced by a new one: less than the service remembers it."""
+HELLO_SHARE = 0.05
+"""Time between HELLOs as a share of that since the first: no back-off in the first second, in which a lost packet is
+more likely than an absent service."""
 PROBE_SHARE = 0.02
 """Time between probes as a share of the silence: who was away for 5 s is found within 0.1 s."""
 
@@ -31,7 +34,8 @@ class Seeker:
         self._config = config
         self._entropy = entropy
         self._life = entropy(LIFE_SIZE)
-        self._wait = config.hello_retry
+        self._began = math.inf
+        """When the first HELLO was sent since the service was last heard or looked for elsewhere."""
         self._proposal = entropy(1)[0]
         self.peers: set[Hashable] = set()
         """Where the service should be, seen from all paths."""
@@ -47,7 +51,7 @@ class Seeker:
         self.peers = peers
         self.hello = None
         self.due = 0.0
-        self._wait = self._config.hello_retry
+        self._began = math.inf
         self._elsewhere = connected
 
     def counts(self, address: Hashable) -> bool:
@@ -58,7 +62,7 @@ class Seeker:
         """The service is heard; ``epoch`` is the one in use, so that the next HELLO proposes another."""
         self.hello = None
         self._elsewhere = False
-        self._wait = self._config.hello_retry
+        self._began = math.inf
         self._proposal = epoch
         self.due = now + self._config.probe_after if self.peers else math.inf
 
@@ -94,8 +98,9 @@ class Seeker:
             )
         self.hello.sent += 1
         if held is None:
-            self.due = now + self._wait
-            self._wait = min(2 * self._wait, config.hello_retry_max)
+            self._began = min(self._began, now)
+            wait = max(config.hello_retry, HELLO_SHARE * (now - self._began))
+            self.due = now + min(wait, config.hello_retry_max)
         else:
             self.due = now + patience(config, now - last_heard)
         return self.hello
