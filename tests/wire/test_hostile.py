@@ -26,7 +26,7 @@ def state(link, role):
     """What a stranger's packets must not change."""
     stats = link.sessions[role].stats(link.time_of(role))
     topics = [(t.topic, t.delivered, t.lost, t.late, t.superseded, t.sent, t.bytes_delivered) for t in stats.topics]
-    paths = [(p.address, p.rtt, p.packets_sent) for p in stats.paths]
+    paths = [(p.address, p.rtt) for p in stats.paths]
     return topics, paths, stats.connected, stats.handshakes, stats.clock_offset, len(link.events[role])
 
 
@@ -61,6 +61,8 @@ def live(make_world):
             link.publish(ROBOT, topic, bytes(5000))
         link.publish(SERVICE, "cmd_vel", bytes(80))
         link.run(0.1)
+    link.run(0.02)
+    link.arrived = {role: [p for _, p in link.sent[role]] for role in Role}  # nothing is on its way
     return link
 
 
@@ -82,7 +84,7 @@ def test_plausible_forgeries_alone_and_in_batches(live, seed):
     for role in Role:
         other = SERVICE if role is ROBOT else ROBOT
         epoch = packet.pull_header(live.sent[other][-1][1])[2]
-        before = state(live, role)
+        before, sent = state(live, role), live.sessions[role].stats(live.now).paths[0].packets_sent
         for _ in range(60):
             one = forged(random, epoch)
             live.inject(role, one)
@@ -94,6 +96,8 @@ def test_plausible_forgeries_alone_and_in_batches(live, seed):
                     batch[i * len(one) + random.randrange(packet.HEADER_SIZE)] ^= 1
             live.inject(role, bytes(batch[: len(batch) - random.choice((0, 1, len(one) // 2))]), segment=len(one))
         assert state(live, role) == before
+        # One ping at most, to the peer: much came, so what came of it should be told.
+        assert live.sessions[role].stats(live.now).paths[0].packets_sent <= sent + 1
         assert set(live.sessions[role].stats(live.now).rejected) <= REASONS
 
 
@@ -102,7 +106,7 @@ def test_plausible_forgeries_alone_and_in_batches(live, seed):
 def test_what_was_sent_before_repeated_cut_and_changed(live, seed):
     random = Random(seed)
     for role in Role:
-        recorded = [p for _, p in live.sent[SERVICE if role is ROBOT else ROBOT]]
+        recorded = live.arrived[SERVICE if role is ROBOT else ROBOT]
         before = state(live, role)
         for _ in range(150):
             data = bytearray(random.choice(recorded))
@@ -184,21 +188,6 @@ def test_a_stranger_cannot_bring_an_end_up(make_world, seed):
         assert service.transmit(0.0) == []
     assert service.next_event() is None
     assert service.next_timer() is None
-
-
-def test_who_is_faster_than_the_ends_takes_an_address_for_a_moment_only(world):
-    """A packet that is repeated from elsewhere before it arrives moves its peer; both ends then speak to nobody."""
-    link = world.link(record=True, up=LinkConditions(delay=0.05), down=LinkConditions(delay=0.05))
-    for role in Role:
-        link.publish(role, "log" if role is ROBOT else "map", b"x")
-    for role in Role:
-        link.inject(SERVICE if role is ROBOT else ROBOT, link.sent[role][-1][1], "faster")
-    assert {end.stats(link.now).paths[0].address for end in link.sessions.values()} == {"faster"}
-    link.run(0.5)
-    assert link.sessions[ROBOT].stats(link.now).paths[0].address == "service"
-    assert link.sessions[SERVICE].stats(link.now).paths[0].address == "robot"
-    for role, end in link.sessions.items():
-        assert (end.stats(link.now).connected, end.stats(link.now).handshakes) == (True, 1), role
 
 
 def test_memory_of_a_flooded_end_is_bounded(make_world):

@@ -60,7 +60,7 @@ def test_a_robot_with_many_paths(world):
 def test_a_path_that_was_left_wakes_nobody(world):
     link = world.link()
     for path in (1, 2):
-        say(link, ROBOT, ping(path), path=path, address=f"robot {path}")
+        link.add_path(path)
         link.run(0.05)
     session = link.sessions[SERVICE]
     choice = session._paths.choice

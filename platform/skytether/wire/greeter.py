@@ -10,7 +10,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Hashable
 
 from .config import MIN_MTU
-from .control import Ping, push_ping
 from .epoch import Epoch
 from .events import Event, Refused
 from .handshake import NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
@@ -104,7 +103,7 @@ class Greeter:
         if kind == HELLO and self._door is not None:
             self._on_hello(self._door, common, message, path, address, epoch, previous, now)
         elif kind == WELCOME and self._seeker.hello is not None:
-            self._on_welcome(self._seeker.hello, common, message, path, address, now)
+            self._on_welcome(self._seeker.hello, common, message, path, now)
         else:
             self._rejected["unasked"] += 1
 
@@ -131,17 +130,16 @@ class Greeter:
         elif isinstance(answer, Resume):
             for each in self._paths:
                 self._paths.ping_soon(each, now)
-            self._resume(self._paths.get(path) or self._paths.choice.active, address, now)
+            self._resume(path, address, now)
         else:
             if answer.outcome is not None and answer.epoch is None:
                 answer.epoch = self._make_epoch(answer.outcome)
             if answer.reason:
                 self._refuse(answer.reason)
+            answer.asked(path, address)
             self._send(answer.common, answer.message, self._paths.choice.active, address)
 
-    def _on_welcome(
-        self, hello: Hello, common: bytes, message: bytes, path: int, address: Hashable, now: float
-    ) -> None:
+    def _on_welcome(self, hello: Hello, common: bytes, message: bytes, path: int, now: float) -> None:
         welcome = hello.open(common, message)
         if welcome is None:
             self._rejected["welcome_forged"] += 1
@@ -154,25 +152,18 @@ class Greeter:
         self._welcomed(self._make_epoch(welcome.outcome), welcome.times if sole else None, now)
         came_by = self._paths.get(path)
         if came_by is not None:
-            came_by.address = address
+            if came_by.peer is not None:  # it answers what was sent there, wherever the answer comes from
+                came_by.address = came_by.peer
             if sole:
                 came_by.echo = welcome.times[2], now
         for each in self._paths:
             self._paths.ping(each, now)
 
-    def _resume(self, path: Path, address: Hashable, now: float) -> None:
-        """Tell a robot that holds the keys, where it asks for them.
-
-        Somebody may have been faster than the robot with one of its own packets, and be taken for it since.
-        """
-        if address == path.address or len(self.waiting) >= MAX_RAW:
-            return
-        ping = push_ping(Ping(path.id, path.cost, False, 0, None, 0, path.feedback(now)))
-        packet = self._sender.packet(ping, path, now)
-        if packet is not None:
-            path.packets_sent += 1
-            path.bytes_sent += len(packet)
-            self.waiting.append(Transmit(path.id, address, packet, None))
+    def _resume(self, path: int, address: Hashable, now: float) -> None:
+        """Tell a robot that holds the keys, where it asks for them: that need not be where it was last heard."""
+        known = self._paths.get(path) or self._paths.choice.active
+        if address != known.address:
+            self._paths.ping_to(address, known, now)
 
     def _refuse(self, reason: str) -> None:
         if reason != self._refusal:

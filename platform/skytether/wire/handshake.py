@@ -18,8 +18,8 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from . import crypto
 from .epoch import Epoch
@@ -166,6 +166,13 @@ class Pending:
     """t2 and t3."""
     epoch: Epoch | None = None
     """What the session made of the outcome."""
+    askers: dict[int, Hashable] = field(default_factory=dict)
+    """Where the only HELLO by a path came from; None: there were several."""
+
+    def asked(self, path: int, address: Hashable) -> None:
+        """WELCOME goes to that address."""
+        if self.askers.setdefault(path, address) != address:
+            self.askers[path] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,10 +266,18 @@ class Doorkeeper:
                 return pending.epoch
         return None
 
-    def confirm(self) -> None:
-        """A message sealed with a pending handshake's keys arrived: all HELLOs so far are used up."""
-        for name in list(self._pending):
+    def confirm(self, epoch: Epoch) -> dict[int, Hashable]:
+        """A message sealed with a pending handshake's keys arrived: all HELLOs so far are used up.
+
+        Returns:
+            By path where the only HELLO of that handshake came from: who confirms from there gets what is sent there.
+        """
+        askers: dict[int, Hashable] = {}
+        for name, pending in list(self._pending.items()):
+            if pending.epoch is epoch:
+                askers = pending.askers
             self._retire(name)
+        return askers
 
     def forget(self, now: float) -> None:
         """Drop what was not confirmed in time."""

@@ -184,9 +184,14 @@ class Lane:
         while recent[0][0] < now - RECENT_TIME or (self._recent_bytes > RECENT_BYTES and len(recent) > 1):
             self._recent_bytes -= recent.popleft()[1].size
 
-    def repeat(self, other: Lane, now: float) -> None:
-        """Have another path send what may not have arrived by this one, and is not too old."""
-        since = self.path.liveness.confirmed_at
+    def repeat(self, other: Lane, since: float, now: float) -> None:
+        """Have another path (or this one, which leads elsewhere now) send what may not have arrived by this one.
+
+        Args:
+            other: Of the path.
+            since: What was sent from then on may not have arrived; what is too old is left out.
+            now: Time.
+        """
         for sent_at, message in self._recent:
             if isinstance(message, Flight):
                 sent_at = now if message.shards.remaining else message.sent_at

@@ -10,6 +10,7 @@ from collections.abc import Hashable
 from typing import NamedTuple
 
 from .arrivals import NUMBERS, DelayMeter, LossMeter
+from .claims import Claims
 from .config import Config
 from .congestion import RateControl
 from .control import Feedback
@@ -47,7 +48,7 @@ class Path:
 
     __slots__ = (
         "_arrived_at", "_assumed_loss", "_fed_back_at", "_settle_at", "address", "bytes_received", "bytes_sent",
-        "control", "cost", "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out",
+        "claims", "control", "cost", "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out",
         "losses", "mtu", "newest", "next_number", "pacer", "packets_received", "packets_sent", "peer",
         "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
     )  # fmt: skip
@@ -59,7 +60,8 @@ class Path:
         self.peer: Hashable | None = None
         """Where the robot's end was told that the service is."""
         self.address: Hashable | None = None
-        """Where to send; None while unknown. Follows the peer's authentic messages."""
+        """Where to send; None while unknown. Follows the peer once it has answered there (see `claims`)."""
+        self.claims = Claims()
         self.newest = -1
         """Highest number of an authentic message of this epoch that came by this path."""
         self.heard_at = now
@@ -138,6 +140,16 @@ class Path:
         self.control.take(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
         self.pacer.set_rate(self.control.rate)
 
+    def shared(self, batches: list[Transmit]) -> list[Transmit]:
+        """Copies for addresses where the peer may be, as far as they may have them."""
+        copies = []
+        for batch in batches:
+            for address, size in self.claims.shares(len(batch.data), batch.segment):
+                segment = batch.segment if batch.segment is not None and size > batch.segment else None
+                copies.append(Transmit(self.id, address, batch.data[:size], segment))
+                self.bytes_sent += size
+        return copies
+
     def number(self, count: int = 1) -> int:
         """Claim packet numbers; returns the first."""
         first = self.next_number
@@ -149,6 +161,7 @@ class Path:
         """Forget what belongs to a peer that was there before."""
         self.newest = -1
         self.echo = None
+        self.claims.clear()
         self._measure(now)
         self.liveness = Liveness()
         self.mtu.restart(now)

@@ -60,8 +60,10 @@ class Paths:
 
     Args:
         config: Settings.
-        say: Sends a ping by a path, at once.
+        say: Sends a ping by a path, at once, to some address or (None) to the path's.
         changed: Called with the choice whenever it is another one, and when paths came or went.
+        moved: Called when the peer of a path has another address, with the time since when what was sent to the one
+            before may not have arrived.
         tell: Takes events: the peer moved, another path became the active one.
         now: Time.
     """
@@ -69,14 +71,16 @@ class Paths:
     def __init__(
         self,
         config: Config,
-        say: Callable[[Path, bytes, float], None],
+        say: Callable[[Path, bytes, Hashable | None, float], None],
         changed: Callable[[Choice, float], None],
+        moved: Callable[[Path, float, float], None],
         tell: Callable[[Event], None],
         now: float,
     ) -> None:
         self._config = config
         self._say = say
         self._changed = changed
+        self._moved = moved
         self._tell = tell
         self._paths: dict[int, Path] = {0: Path(0, config, now)}
         self.choice = Choice(self._paths[0], None, False)
@@ -163,12 +167,11 @@ class Paths:
         ask = size > 0 or len(self._paths) > 1
         if ask and not size:
             path.liveness.ask(now)
-        if path.echo is None:
-            echo, hold = None, 0
-        else:
-            echo, hold = round(path.echo[0] * 1e6), int((now - path.echo[1]) * 1e6)
-        ping = Ping(path.id, path.cost, ask, size, echo, hold, path.feedback(now))
-        self._say(path, push_ping(ping, max(0, size - PADDING)), now)
+        self._say(path, push_ping(_ping(path, ask, size, now), max(0, size - PADDING)), None, now)
+
+    def ping_to(self, address: Hashable, path: Path, now: float) -> None:
+        """Tell somebody who seems to be the peer that we are here."""
+        self._say(path, push_ping(_ping(path, False, 0, now)), address, now)
 
     def ping_soon(self, path: Path, now: float) -> None:
         """Ping, unless one was sent just now."""
@@ -181,8 +184,8 @@ class Paths:
             if path.much_arrived:
                 self.ping_soon(path, now)
 
-    def take(self, ping: Ping, path: Path, sent_at: float, now: float) -> Exchange | None:
-        """Take the peer's ping that came by a path, and answer it.
+    def take(self, ping: Ping, path: Path, sent_at: float, address: Hashable, now: float) -> Exchange | None:
+        """Take the peer's ping that came by a path, and answer it where it came from.
 
         Returns:
             Time stamps, if it answers one of ours.
@@ -193,11 +196,13 @@ class Paths:
             path.take_feedback(ping.feedback, now)
         if ping.ask:
             answer = Ping(path.id, path.cost, False, ping.size, round(sent_at * 1e6), 0, path.feedback(now))
-            self._say(path, push_ping(answer), now)
+            self._say(path, push_ping(answer), None if address == path.address else address, now)
         elif first:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
             return None
+        if path.claims and (proven := path.claims.answered(ping.echo)) is not None:
+            self._move(path, *proven, now)
         asked_at, hold = ping.echo / 1e6, ping.hold / 1e6
         rtt = now - asked_at - hold
         if rtt < 0:
@@ -211,20 +216,39 @@ class Paths:
             self.choose(now)
         return Exchange(asked_at, sent_at - hold, sent_at)
 
-    def heard(self, path: Path, number: int, address: Hashable, now: float) -> None:
-        """An authentic message came by that path; the newest of its messages tells where the peer is."""
+    def heard(self, path: Path, number: int, address: Hashable, size: int, now: float, *, proven: bool = False) -> None:
+        """An authentic message came by that path; the newest of its messages tells where the peer seems to be.
+
+        Args:
+            path: The path.
+            number: Of the message.
+            address: Where it came from.
+            size: Bytes that came.
+            now: Time.
+            proven: The peer got what was sent to that address.
+        """
         if number > path.newest:
             path.newest = number
             if address != path.address:
-                moved = path.address is not None
-                path.address = address
-                if moved:
-                    path.mtu.restart(now)
-                    self._tell(PeerMoved(address))
-                self.choose(now)
+                if proven:
+                    self._move(path, address, path.heard_at, now)
+                elif path.claims.heard(address, size, path.heard_at, now):
+                    stamp = path.claims.challenge(address, now)
+                    self._say(path, push_ping(_ping(path, True, 0, now)), address, stamp)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
             self.ping_soon(path, now)
+
+    def _move(self, path: Path, address: Hashable, since: float, now: float) -> None:
+        """The peer is there."""
+        moved = path.address is not None
+        path.address = address
+        path.claims.clear()
+        if moved:
+            path.mtu.restart(now)
+            self._tell(PeerMoved(address))
+            self._moved(path, since - (path.rtt if path.rtt == path.rtt else 0.0), now)
+        self.choose(now)
 
     # --- time
 
@@ -371,6 +395,15 @@ class Paths:
             self._changed(choice, now)
             if reason and self._up:
                 self._tell(PathSwitched(choice.active.id, reason))
+
+
+def _ping(path: Path, ask: bool, size: int, now: float) -> Ping:
+    """A question, or only the answer to the peer's latest."""
+    if path.echo is None:
+        echo, hold = None, 0
+    else:
+        echo, hold = round(path.echo[0] * 1e6), int((now - path.echo[1]) * 1e6)
+    return Ping(path.id, path.cost, ask, size, echo, hold, path.feedback(now))
 
 
 def _badness(path: Path) -> float:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import heapq
 import math
 import struct
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Hashable, Iterable
 from functools import partial
 
 from .compression import FLAG, Compressed, original_size
@@ -30,6 +31,8 @@ INNER = struct.Struct(">IQ")
 """Start of the plaintext: topic sequence, time of publishing in microseconds of the sender's clock with the highest
 bit set if the payload is compressed."""
 OVERHEAD = INNER.size + TAG_SIZE
+MAX_ASTRAY = 16
+"""Packets to unproven addresses that may wait for the socket."""
 MAX_BATCH = 65_507
 """Bytes of such a batch: it is one IP packet to the kernel until it is cut."""
 
@@ -52,6 +55,8 @@ class Sender:
         self._active = self._lanes[path.id]
         self._other: Lane | None = None
         self._doubled = False
+        self.astray: deque[Transmit] = deque()
+        """Packets to other addresses than those of their paths."""
 
     @property
     def queue(self) -> SendQueue[Copy | Outbox]:
@@ -77,14 +82,15 @@ class Sender:
             before.queue, self._active.queue = self._active.queue, before.queue
             before.land_parcels(now)
             if not already:
-                before.repeat(self._active, now)
+                before.repeat(self._active, before.path.liveness.confirmed_at, now)
         elif self._other is not None and doubled and not already:
-            before.repeat(self._other, now)
+            before.repeat(self._other, before.path.liveness.confirmed_at, now)
 
     def start_epoch(self, epoch: Epoch | None) -> None:
         """Use other keys from now on; what was queued or under way for the old ones is dropped."""
         for lane in self._lanes.values():
             lane.clear()
+        self.astray.clear()
         self.epoch = epoch
         self._control = _control()
 
@@ -103,11 +109,25 @@ class Sender:
 
     def say(self, path: Path, message: bytes, now: float) -> None:
         """Send a control message of one packet by that path, once and at once, however large the packet."""
-        packet = self.packet(message, path, now)
+        packet = self._packet(message, path, now)
         if packet is not None:
             self._lane(path).say(packet)
 
-    def packet(self, message: bytes, path: Path, now: float) -> bytes | None:
+    def say_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
+        """The same to some address, which need not be the path's; returns its bytes, 0 if it cannot be sent."""
+        packet = self._packet(message, path, now) if len(self.astray) < MAX_ASTRAY else None
+        if packet is None:
+            return 0
+        path.bytes_sent += len(packet)
+        self.astray.append(Transmit(path.id, address, packet, None))
+        return len(packet)
+
+    def repeat(self, path: Path, since: float, now: float) -> None:
+        """The peer moved: send again what went where it was not any more, of topics that ask for every effort."""
+        lane = self._lane(path)
+        lane.repeat(lane, since, now)
+
+    def _packet(self, message: bytes, path: Path, now: float) -> bytes | None:
         """Seal a control message of one packet; None if there are no keys."""
         epoch, topic = self.epoch, self._control
         if epoch is None:
@@ -218,10 +238,10 @@ class Sender:
         parity = lane.path.redundancy.parity(shape.block_k(0), shape.blocks, topic.delivery)
         flight = Flight(topic, Shards(common, sealed, shape, parity), now + topic.lifespan)
         lane.flights.append(flight)
-        if self._other is not None:
+        if self._other is not None or topic.redundant:
             lane.remember(flight, now)
-            if self._doubled or topic.redundant:
-                self._other.take(flight, now)
+        if self._other is not None and (self._doubled or topic.redundant):
+            self._other.take(flight, now)
         return 0
 
     def _send_letter(self, epoch: Epoch, outbox: Outbox, lane: Lane, batches: Batches, now: float) -> int:
@@ -285,11 +305,11 @@ class Sender:
         sealed, other = epoch.ciphers.seal(number, plaintext, common), self._other
         planned, spacing = lane.path.redundancy.copies(topic.delivery, topic.lifespan)
         extra = planned if extra is None else extra
-        if other is not None:
+        if other is not None or topic.redundant:
             message = Copy(topic, common, sealed, 0, spacing, 0.0, deadline)
             lane.remember(message, now)
             # every second copy goes by the other path, one at once
-            if self._doubled or topic.redundant or (extra and len(sealed) <= other.room):
+            if other is not None and (self._doubled or topic.redundant or (extra and len(sealed) <= other.room)):
                 there = max(1, (extra + 1) // 2)
                 other.take(message, now, there)
                 extra = max(0, extra - there)

@@ -10,7 +10,7 @@ from . import control
 from .compression import Compressed, compress
 from .config import Config
 from .control import Forward, Goodbye, Ping, Report
-from .crypto import KEY_SIZE
+from .crypto import KEY_SIZE, TAG_SIZE
 from .delivery import Delivery
 from .epoch import Epoch
 from .events import Connected, Disconnected, Event
@@ -72,7 +72,7 @@ class Session:
         self._table = index_topics(topics)
         self._config = config or Config()
         self._events: deque[Event] = deque()
-        self._paths = Paths(self._config, self._say, self._on_choice, self._events.append, now)
+        self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, now)
         self._peer: Hashable | None = None
         self._sender = Sender(session_id, self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
@@ -153,6 +153,7 @@ class Session:
         for each in self._paths:
             if path in (None, each.id):
                 each.peer = each.address = address
+                each.claims.clear()
         if self._door is None and not self._closed:
             self._seeker.look_at({p.peer for p in self._paths}, connected=self._epoch is not None)
 
@@ -247,12 +248,15 @@ class Session:
     def transmit(self, now: float, full: Container[int] = ()) -> list[Transmit]:
         """What may be sent now, at most a burst by each path that is not ``full``; call again until it is nothing."""
         sent: list[Transmit] = []
+        for waiting in (self._greeter.waiting, self._sender.astray):
+            sent += waiting
+            waiting.clear()
         for path in self._paths:
             if path.id not in full:
-                sent += self._sender.transmit(path, now)
-        if self._greeter.waiting:
-            sent = [*self._greeter.waiting, *sent]
-            self._greeter.waiting.clear()
+                batches = self._sender.transmit(path, now)
+                sent += batches
+                if path.claims:
+                    sent += path.shared(batches)
         return sent
 
     def next_event(self) -> Event | None:
@@ -378,9 +382,10 @@ class Session:
         self, epoch: Epoch, index: int, plaintext: bytes, number: int, path: int, address: Hashable, now: float
     ) -> None:
         """One authentic message, the first time that it is complete."""
+        asked_from: Hashable | None = None
         if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
             if self._door is not None:
-                self._door.confirm()
+                asked_from = self._door.confirm(epoch).get(path)
             self._start_epoch(epoch, now)
         came_by = self._paths.get(path)
         if came_by is None and self._door is not None:
@@ -389,21 +394,27 @@ class Session:
         if epoch is self._epoch and self._seeker.counts(address):
             self._last_heard = now
             if came_by is not None:
-                self._paths.heard(came_by, number, address, now)
+                size = len(plaintext) + TAG_SIZE
+                self._paths.heard(came_by, number, address, size, now, proven=address == asked_from)
             if not self._connected:
                 self._connect(epoch.topics, now)
             if self._seeker.hello is not None:
                 self._seeker.found(now, epoch.id)
         sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
-            self._on_control(epoch, plaintext[INNER.size :], stamp, came_by, now)
+            self._on_control(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
             return
         self._delivery.take(epoch, epoch.receive[index], plaintext, sequence, stamp, now)
 
     def _on_choice(self, choice: Choice, now: float) -> None:
         self._sender.use(self._paths, *choice, now)
 
-    def _on_control(self, epoch: Epoch, data: bytes, micros: int, path: Path | None, now: float) -> None:
+    def _on_moved(self, path: Path, since: float, now: float) -> None:
+        self._sender.repeat(path, since, now)
+
+    def _on_control(
+        self, epoch: Epoch, data: bytes, micros: int, path: Path | None, address: Hashable, now: float
+    ) -> None:
         message = control.pull_control(data)
         if message is None:
             self._rejected["control"] += 1
@@ -413,7 +424,7 @@ class Session:
             if path is not None and path.id == message.path:
                 if self._door is not None:
                     path.cost = message.cost
-                exchange = self._paths.take(message, path, micros / 1e6, now)
+                exchange = self._paths.take(message, path, micros / 1e6, address, now)
                 if exchange is not None:
                     if path is self._paths.choice.active:
                         self._streams.round_trip.add(path.rtt)
@@ -435,5 +446,8 @@ class Session:
         for message in control.push_reports(*self._ledger.rows(self._epoch, now)):
             self._sender.tell(message, now)
 
-    def _say(self, path: Path, message: bytes, now: float) -> None:
-        self._sender.say(path, message, now)
+    def _say(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:
+        if address is None:
+            self._sender.say(path, message, now)
+        else:
+            path.claims.sent(address, self._sender.say_to(address, path, message, now))

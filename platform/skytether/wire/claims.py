@@ -1,0 +1,116 @@
+"""Where a path's peer seems to be, until it has shown that it is there (RFC 9000, sections 8.2 and 9.3).
+
+An authentic message from another address may come from a peer that moved, or from somebody who repeats what he
+overheard, faster than the network carries it. So it is a claim, no more: the address in use stays in use, and a
+challenge goes to the other one. Only an answer to it moves the session. Until then the claimed address is sent
+copies of what goes to the one in use, so that a peer that did move misses little; with the challenges they are at most
+`ALLOWANCE` times the bytes that came from there, so that nobody is flooded by a session he has no part in.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Hashable, Iterator
+
+ALLOWANCE = 3
+"""Bytes that an address may be sent for each that came from it before it has answered."""
+MAX_CLAIMS = 4
+"""Addresses of one path that are tested at the same time; the oldest claim gives way."""
+SPACING = 0.05
+"""Seconds between challenges to one address."""
+MAX_CHALLENGES = 64
+"""Challenges to one address of which an answer counts."""
+
+
+class Claim:
+    """One address that authentic messages came from."""
+
+    __slots__ = ("asked_at", "challenges", "left", "since")
+
+    def __init__(self, since: float) -> None:
+        self.since = since
+        """When the peer was last heard from the address in use."""
+        self.left = 0
+        """Bytes that may still be sent there."""
+        self.asked_at = float("-inf")
+        self.challenges: deque[int] = deque(maxlen=MAX_CHALLENGES)
+
+
+class Claims:
+    """The claims on one path."""
+
+    __slots__ = ("_latest", "_open")
+
+    def __init__(self) -> None:
+        self._open: OrderedDict[Hashable, Claim] = OrderedDict()
+        self._latest = 0
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def heard(self, address: Hashable, size: int, since: float, now: float) -> bool:
+        """An authentic message, newer than all before, came from an address that is not the one in use.
+
+        Args:
+            address: From where.
+            size: Bytes of it.
+            since: When the peer was last heard from the address in use.
+            now: Time.
+
+        Returns:
+            Whether to challenge it now.
+        """
+        claim = self._open.get(address)
+        if claim is None:
+            if len(self._open) >= MAX_CLAIMS:
+                self._open.popitem(last=False)
+            claim = self._open[address] = Claim(since)
+        claim.left += ALLOWANCE * size
+        return now >= claim.asked_at + SPACING
+
+    def challenge(self, address: Hashable, now: float) -> float:
+        """Make a challenge: the time that it has to bear, ``now`` or little more, for no two may be the same."""
+        claim = self._open[address]
+        claim.asked_at = now
+        self._latest = max(self._latest + 1, int(now * 1e6))
+        claim.challenges.append(self._latest)
+        return (self._latest + 0.5) / 1e6  # so that it is cut to just these microseconds
+
+    def sent(self, address: Hashable, size: int) -> None:
+        """So many bytes went to an address."""
+        claim = self._open.get(address)
+        if claim is not None:
+            claim.left -= size
+
+    def answered(self, echo: int) -> tuple[Hashable, float] | None:
+        """The peer answers what bore that time (microseconds).
+
+        Returns:
+            The address that it was sent to, and ``since`` of the claim; None if it was no challenge. All claims are
+            settled then.
+        """
+        for address, claim in self._open.items():
+            if echo in claim.challenges:
+                self._open.clear()
+                return address, claim.since
+        return None
+
+    def clear(self) -> None:
+        """Forget them."""
+        self._open.clear()
+
+    def shares(self, total: int, segment: int | None) -> Iterator[tuple[Hashable, int]]:
+        """Who is to have a copy of a batch.
+
+        Args:
+            total: Its bytes.
+            segment: Bytes of one datagram, if it is several.
+
+        Yields:
+            Address, and how many bytes of it may go there: whole datagrams.
+        """
+        for address, claim in self._open.items():
+            size = total if total <= claim.left else claim.left // segment * segment if segment else 0
+            if size > 0:
+                claim.left -= size
+                yield address, size
