@@ -1,0 +1,179 @@
+"""One topic that the node publishes: its subscribers, each with a bounded queue, and the latched message."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from skytether.ros.names import ros1_type
+
+from .tcpros import ANY, pack_frame, pack_header, sums_differ
+
+_log = logging.getLogger(__name__)
+
+QUEUE = 100
+"""Messages that may wait for one subscriber that is too slow; the oldest are dropped beyond."""
+QUEUE_BYTES = 32 * 2**20
+"""The same in bytes."""
+_WRITTEN_BYTES = 2**16
+"""What may wait in a connection's own buffer before the queue is used."""
+_HANDOVER = 1000
+"""Messages on the way from other threads to the node's; they wait there for milliseconds."""
+_MAX_SUBSCRIBERS = 256
+
+
+class _Subscriber:
+    """One connection."""
+
+    def __init__(self, caller: str, writer: asyncio.StreamWriter, queue: int) -> None:
+        self.caller = caller
+        self.writer = writer
+        self.dropped = 0
+        self._limit = queue
+        self._queue: deque[bytes] = deque()
+        self._bytes = 0
+        self._draining: asyncio.Task[None] | None = None
+        writer.transport.set_write_buffer_limits(_WRITTEN_BYTES)
+
+    def send(self, frame: bytes) -> None:
+        if self._draining is None and self.writer.transport.get_write_buffer_size() < _WRITTEN_BYTES:
+            self.writer.write(frame)
+            return
+        self._queue.append(frame)
+        self._bytes += len(frame)
+        while len(self._queue) > self._limit or (self._bytes > QUEUE_BYTES and len(self._queue) > 1):
+            self._bytes -= len(self._queue.popleft())
+            self.dropped += 1
+        if self._draining is None:
+            self._draining = asyncio.ensure_future(self._drain())
+
+    async def _drain(self) -> None:
+        try:
+            while self._queue:
+                await self.writer.drain()
+                if self._queue:
+                    frame = self._queue.popleft()
+                    self._bytes -= len(frame)
+                    self.writer.write(frame)
+        except OSError:
+            self._queue.clear()  # the connection's reader notices its end
+        finally:
+            self._draining = None
+
+    def close(self) -> None:
+        if self._draining is not None:
+            self._draining.cancel()
+        self.writer.close()
+
+
+class Publication:
+    """Made by `Node.advertise`; `publish` may be called from any thread.
+
+    Attributes:
+        topic: Absolute name.
+        type: As ROS 1 has it, ``sensor_msgs/LaserScan``.
+        md5: Of the type.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        soon: Callable[[Callable[[], None]], bool],
+        topic: str,
+        kind: str,
+        md5: str,
+        definition: str,
+        *,
+        latched: bool,
+        queue: int,
+    ) -> None:
+        self.topic = topic
+        self.type = ros1_type(kind)
+        self.md5 = md5
+        self._header = pack_header(
+            {
+                "callerid": node,
+                "topic": topic,
+                "type": self.type,
+                "md5sum": md5,
+                "message_definition": definition,
+                "latching": "1" if latched else "0",
+            }
+        )
+        self._node = node
+        self._soon = soon
+        self._latched = latched
+        self._queue = queue
+        self._newest: bytes | None = None
+        self._lock = threading.Lock()
+        self._handover: deque[bytes] = deque(maxlen=_HANDOVER)
+        self._subscribers: list[_Subscriber] = []
+        self._refused: set[tuple[str, str]] = set()
+
+    @property
+    def subscribers(self) -> list[str]:
+        """Names of the nodes that listen now."""
+        return [subscriber.caller for subscriber in list(self._subscribers)]
+
+    def publish(self, payload: bytes | memoryview) -> None:
+        """Send a serialised message to everybody who listens; never blocks."""
+        frame = pack_frame(payload)
+        with self._lock:
+            first = not self._handover
+            self._handover.append(frame)
+        if first:
+            self._soon(self._flush)
+
+    def _flush(self) -> None:
+        with self._lock:
+            frames, self._handover = self._handover, deque(maxlen=_HANDOVER)
+        if not frames:
+            return
+        if self._latched:
+            self._newest = frames[-1]
+        for subscriber in self._subscribers:
+            for frame in frames:
+                subscriber.send(frame)
+
+    async def serve(self, header: dict[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """In the node's thread: a subscriber has connected. Returns when it is gone."""
+        caller = header.get("callerid", "somebody")
+        refusal = self._refusal(caller, header)
+        if refusal:
+            writer.write(pack_header({"error": refusal}))
+            await writer.drain()
+            return
+        writer.write(self._header)
+        subscriber = _Subscriber(caller, writer, self._queue)
+        if self._newest is not None:
+            subscriber.send(self._newest)
+        self._subscribers.append(subscriber)
+        try:
+            while await reader.read(4096):
+                pass
+        finally:
+            self._subscribers.remove(subscriber)
+            subscriber.close()
+
+    def _refusal(self, caller: str, header: dict[str, str]) -> str:
+        kind, md5 = header.get("type", ANY), header.get("md5sum", ANY)
+        if len(self._subscribers) >= _MAX_SUBSCRIBERS:
+            return f"{self._node}: {self.topic} has {_MAX_SUBSCRIBERS} subscribers already"
+        if not sums_differ(self.md5, md5) and (kind in (ANY, self.type) or md5 not in (ANY, "")):
+            return ""
+        refusal = (
+            f"{self.topic}: {caller} wants {kind} with MD5 {md5}, but it is {self.type} with MD5 {self.md5}; "
+            "both sides need the same version of the message"
+        )
+        if (caller, md5) not in self._refused and len(self._refused) < _MAX_SUBSCRIBERS:
+            self._refused.add((caller, md5))
+            _log.error("%s", refusal)
+        return refusal
+
+    def close(self) -> None:
+        """In the node's thread: let everybody go."""
+        for subscriber in list(self._subscribers):
+            subscriber.close()

@@ -1,0 +1,135 @@
+"""XML-RPC of ROS 1: what master and other nodes ask of a node (wiki.ros.org/ROS/Slave_API)."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from socketserver import ThreadingMixIn
+from typing import Any, Protocol
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+MAX_REQUEST = 2**20
+"""Bytes of a request: the longest is a list of publishers."""
+_IDLE_S = 30.0
+"""A connection that says nothing for so long is closed."""
+
+
+class NodeApi(Protocol):
+    """What a node answers with."""
+
+    name: str
+    master_uri: str
+
+    def publishers_changed(self, topic: str, uris: list[str]) -> None:
+        """The master says who publishes a topic now."""
+        ...
+
+    def offered(self, topic: str) -> tuple[str, int] | None:
+        """Where a topic of this node can be had; None if it has no such topic."""
+        ...
+
+    def publications(self) -> list[list[str]]:
+        """Topics and types that it offers."""
+        ...
+
+    def subscriptions(self) -> list[list[str]]:
+        """Topics and types that it takes."""
+        ...
+
+    def connections(self) -> list[list[Any]]:
+        """As getBusInfo tells them."""
+        ...
+
+    def asked_to_end(self, reason: str) -> None:
+        """Somebody wants the node to end."""
+        ...
+
+
+class _Handler(SimpleXMLRPCRequestHandler):
+    rpc_paths = ()  # nodes ask at / or /RPC2
+    timeout = _IDLE_S
+    disable_nagle_algorithm = True
+
+    def do_POST(self) -> None:  # noqa: N802 (named by the library)
+        length = self.headers.get("content-length", "")
+        if not length.isdigit() or int(length) > MAX_REQUEST or "content-encoding" in self.headers:
+            self.send_error(413)
+            self.close_connection = True
+            return
+        super().do_POST()
+
+    def log_request(self, code: int | str = "-", size: int | str = "-") -> None:
+        """Nobody reads it."""
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        """Nobody reads it."""
+
+
+class _Server(ThreadingMixIn, SimpleXMLRPCServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A connection that broke off, or a request that is none: the asker's matter."""
+
+
+class SlaveServer:
+    """Answers for a node until it is closed.
+
+    Attributes:
+        port: Where it listens.
+    """
+
+    def __init__(self, api: NodeApi, bind: str) -> None:
+        """Listen.
+
+        Raises:
+            OSError: The address is not this machine's.
+        """
+        self._server = _Server((bind, 0), _Handler, allow_none=True, logRequests=False)
+        self.port: int = self._server.server_address[1]
+        for name, function in _methods(api).items():
+            self._server.register_function(function, name)
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.2,), name=f"ros1-api-{self.port}", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+def _methods(api: NodeApi) -> dict[str, Callable[..., Any]]:
+    def request_topic(_caller: str, topic: str, protocols: list[list[Any]]) -> Any:
+        where = api.offered(topic)
+        if where is None:
+            return -1, f"{api.name} does not publish {topic}", []
+        if not any(protocol and protocol[0] == "TCPROS" for protocol in protocols):
+            return 0, f"{api.name} speaks TCPROS only", []
+        return 1, "ready", ["TCPROS", *where]
+
+    def publisher_update(_caller: str, topic: str, uris: list[str]) -> Any:
+        api.publishers_changed(topic, [str(uri) for uri in uris])
+        return 1, "", 0
+
+    def shutdown(_caller: str, reason: str = "") -> Any:
+        api.asked_to_end(str(reason))
+        return 1, "shutdown", 0
+
+    return {
+        "requestTopic": request_topic,
+        "publisherUpdate": publisher_update,
+        "shutdown": shutdown,
+        "paramUpdate": lambda *_: (1, "", 0),
+        "getPid": lambda *_: (1, "", os.getpid()),
+        "getMasterUri": lambda *_: (1, "", api.master_uri),
+        "getName": lambda *_: (1, "", api.name),
+        "getPublications": lambda *_: (1, "", api.publications()),
+        "getSubscriptions": lambda *_: (1, "", api.subscriptions()),
+        "getBusInfo": lambda *_: (1, "", api.connections()),
+        "getBusStats": lambda *_: (1, "", [[], [], []]),
+    }
