@@ -470,3 +470,19 @@ def test_ipv6(ends):
     robot.graph.wait_connected()
     robot.publish("force", b"x")
     service.graph.wait_messages(1)
+
+
+def test_a_port_may_publish_reliably_from_the_moment_it_is_attached(ends):
+    from skytether.wire.topic import Direction, Topic
+
+    class Eager(type(ends.make(Role.SERVICE).graph)):
+        def attach(self, publisher):
+            super().attach(publisher)
+            self.taken = publisher.publish("map", b"early")
+
+    table = (Topic("map", "t/msg/M", Direction.IN, reliable=True, latched=True, lifespan=60.0),)
+    service = ends.start(Role.SERVICE, topics=table)
+    robot = ends.start(Role.ROBOT, Eager(), topics=table, peer=service.address)
+    assert robot.graph.taken
+    service.graph.wait_messages(1)
+    assert service.graph.messages == [("map", b"early")]

@@ -127,13 +127,15 @@ class Bridge:
             self._loop = _new_loop(self._socket)
             undo.callback(self._loop.close)
             self._driver = Driver(session, self._socket, self._port, self._calls, self._loop)
-            self._port.attach(self)
             self._paths = LocalPaths(self._driver, self._socket.resolve)
             networks = self._look() if self._wanted else {}
+            # Before the port is told: what it publishes from then on waits for the thread, and is not refused.
+            self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
+            undo.callback(setattr, self, "_thread", None)
+            self._port.attach(self)
             undo.pop_all()
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_INTERVAL))
         self._loop.call_soon(self._paths.use, networks)
-        self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
         self._thread.start()
         if self._wanted:
             self._watcher = Watcher(self._look, lambda found: self._soon(lambda: self._paths.use(found)), networks)

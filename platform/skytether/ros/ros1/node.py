@@ -206,7 +206,15 @@ class Node:
         return end
 
     def advertise(
-        self, topic: str, kind: str, md5: str, definition: str = "", *, latched: bool = False, queue: int = QUEUE
+        self,
+        topic: str,
+        kind: str,
+        md5: str,
+        definition: str = "",
+        *,
+        latched: bool = False,
+        queue: int = QUEUE,
+        hold_s: float = 0.0,
     ) -> Publication:
         """Publish a topic.
 
@@ -217,12 +225,15 @@ class Node:
             definition: Of the type, for recorders; looked up if it is not given.
             latched: Newcomers get the last message.
             queue: Messages that wait for a slow subscriber; the newest win.
+            hold_s: How long messages wait for a first subscriber while there is none; as many as in the queue.
 
         Raises:
             ValueError: This node publishes it already.
         """
         definition = definition or definition_of(bridge_type(kind), "ros1")
-        publication = Publication(self.name, self.soon, topic, kind, md5, definition, latched=latched, queue=queue)
+        publication = Publication(
+            self.name, self.soon, topic, kind, md5, definition, latched=latched, queue=queue, hold_s=hold_s
+        )
         with self._lock:
             if topic in self._publications:
                 raise ValueError(f"{topic} is published by this node already")

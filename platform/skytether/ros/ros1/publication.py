@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -89,6 +90,7 @@ class Publication:
         *,
         latched: bool,
         queue: int,
+        hold_s: float = 0.0,
     ) -> None:
         self.topic = topic
         self.type = ros1_type(kind)
@@ -107,6 +109,8 @@ class Publication:
         self._soon = soon
         self._latched = latched
         self._queue = queue
+        self._hold_s = hold_s
+        self._held: deque[tuple[float, bytes]] = deque(maxlen=queue)
         self._newest: bytes | None = None
         self._lock = threading.Lock()
         self._handover: deque[bytes] = deque(maxlen=_HANDOVER)
@@ -137,6 +141,9 @@ class Publication:
         for subscriber in self._subscribers:
             for frame in frames:
                 subscriber.send(frame)
+        if self._hold_s and not self._subscribers:
+            until = time.monotonic() + self._hold_s
+            self._held.extend((until, frame) for frame in frames)
 
     async def serve(self, header: dict[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """In the node's thread: a subscriber has connected. Returns when it is gone."""
@@ -148,8 +155,12 @@ class Publication:
             return
         writer.write(self._header)
         subscriber = _Subscriber(caller, writer, self._queue)
-        if self._newest is not None:
+        if self._latched and self._newest is not None:
             subscriber.send(self._newest)
+        while self._held:
+            until, frame = self._held.popleft()
+            if time.monotonic() < until:
+                subscriber.send(frame)
         self._subscribers.append(subscriber)
         try:
             while await reader.read(4096):

@@ -147,10 +147,11 @@ def call(address: tuple[str, int], node: str, name: str, md5: str, request: byte
     try:
         with socket.create_connection(address, timeout) as sock:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            sock.sendall(pack_header(fields) + pack_frame(request))
+            sock.sendall(pack_header(fields))
             header = _header_of(sock)
             if "error" in header:
                 raise CallRefusedError(f"service {name} refuses: {header['error']}")
+            sock.sendall(pack_frame(request))  # not before: rospy loses what comes right behind a header
             succeeded = _exactly(sock, 1)
             answer = _exactly(sock, _length(sock, MAX_MESSAGE))
     except (OSError, EOFError, HeaderError) as error:

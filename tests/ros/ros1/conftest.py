@@ -1,0 +1,40 @@
+import pytest
+from ros1_graph import Ros1Graph
+from ros1_pair import Pair
+
+from skytether.api.manifest import TopicSpec
+
+
+@pytest.fixture
+def make_graph(ros1, tmp_path):
+    made = []
+
+    def make(name="graph", **options):
+        graph = Ros1Graph(tmp_path / name, **options)
+        made.append(graph)
+        return graph
+
+    yield make
+    for graph in made:
+        graph.close()
+
+
+@pytest.fixture
+def graph(make_graph):
+    return make_graph().start_master()
+
+
+@pytest.fixture
+def make_pair(make_graph):
+    """Two masters and a bridge between their graphs."""
+    made = []
+
+    def make(*specs, **options):
+        robot, service = make_graph("robot").start_master(), make_graph("service").start_master()
+        pair = Pair(robot, service, [TopicSpec(**spec) for spec in specs], **options)
+        made.append(pair)
+        return pair, robot, service
+
+    yield make
+    for pair in made:
+        pair.close()
