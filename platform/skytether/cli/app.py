@@ -8,7 +8,7 @@ import typer
 
 from skytether import __version__
 
-from . import bridge, demo, lab, orchestrator, relay, replay, resources, tokens
+from . import bridge, demo, lab, orchestrator, relay, replay, resources, robot_run, tokens
 from .output import log_to_console
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.add_typer(orchestrator.app, name="orchestrator")
 app.add_typer(resources.service_app, name="service")
 app.add_typer(resources.site_app, name="site")
 app.add_typer(resources.instance_app, name="instance")
+resources.robot_app.command("run")(robot_run.run)
 app.add_typer(resources.robot_app, name="robot")
 app.add_typer(tokens.app, name="token")
 app.add_typer(lab.app, name="lab")

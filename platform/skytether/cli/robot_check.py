@@ -1,0 +1,140 @@
+"""``skytether robot run --check``: is everything there that a run will need?"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.table import Table
+
+from skytether.api.client import ApiError, Client, Unreachable
+from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
+from skytether.messages import hash_of
+from skytether.robot.ros1 import Ros1RobotConfig
+from skytether.ros.names import Names, resolve
+from skytether.ros.ros1.master import MasterError
+from skytether.ros.ros1.node import Node
+from skytether.ros.ros1.services import CallRefusedError
+from skytether.ros.ros1.subscription import Listener
+
+from .output import console
+from .robot_config import RobotConfig
+
+_LOOK_S = 3.0
+"""For publishers to say what they publish."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One row of the answer.
+
+    Attributes:
+        what: Topic of the bridge, or what else is needed.
+        where: Its name in the graph, or its address.
+        kind: Its type.
+        says: What was found.
+        good: Whether that will do; a topic that nobody publishes yet will.
+    """
+
+    what: str
+    where: str
+    kind: str
+    says: str
+    good: bool = True
+
+
+def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> bool:
+    """Look, and print a table. True if nothing is wrong."""
+    manifest, findings = _orchestrator(settings, token)
+    findings.append(_master(node))
+    if manifest is not None and findings[-1].good:
+        specs = manifest.spec.topics
+        findings += _topics(settings, graph.names(specs), node, specs)
+        findings.append(_wheels(graph, node))
+    table = Table(box=None, pad_edge=False)
+    for head in ("", "what", "in the graph", "type", "found"):
+        table.add_column(head, overflow="fold")
+    for f in findings:
+        table.add_row("ok" if f.good else "!!", f.what, f.where, f.kind, f.says)
+    Console(highlight=False).print(table, markup=False)
+    wrong = sum(not f.good for f in findings)
+    console.print("all is there" if not wrong else f"{wrong} to mend, marked !!", markup=False)
+    return not wrong
+
+
+def _orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
+    try:
+        with Client(settings.orchestrator, token) as client:
+            manifest = client.get_service(settings.service)
+    except (ApiError, Unreachable) as error:
+        return None, [Finding("orchestrator", settings.orchestrator, "", str(error), good=False)]
+    says = f"service {settings.service}, {len(manifest.spec.topics)} topics, calls and actions"
+    return manifest, [Finding("orchestrator", settings.orchestrator, "", says)]
+
+
+def _master(node: Node) -> Finding:
+    try:
+        topics = len(node.master.published())
+    except MasterError as error:
+        return Finding("ROS master", node.master_uri, "", f"{error}; is roscore running?", good=False)
+    return Finding("ROS master", node.master_uri, "", f"answers; {topics} topics are published")
+
+
+def _topics(settings: RobotConfig, names: Names, node: Node, specs: Sequence[TopicSpec]) -> list[Finding]:
+    rows = [row for spec in specs if spec.kind != "call" for row in spec.rows() if row.name != ANY_TOPIC]
+    taken = [row for row in rows if row.direction == "in"]
+    for row in taken:
+        node.subscribe(names.of(row.name), row.type, hash_of(row.type, "ros1"), Listener(lambda *_: None))
+    found = [_unknown(name) for name in names.unused(settings.ros1.readings if settings.ros1 else ())]
+    published = node.master.published()
+    deadline = time.monotonic() + _LOOK_S
+    awaited = {names.of(row.name) for row in taken} & set(published)
+    while time.monotonic() < deadline and any(not any(node.look()[name]) for name in awaited):
+        time.sleep(0.05)
+    for row in rows:
+        name = names.of(row.name)
+        if row.direction == "in":
+            found.append(_incoming(row, name, node, name in published))
+        elif row.name == settings.command_topic:
+            found.append(Finding(row.name, "", row.type, "drives, past the supervisor"))
+        else:
+            found.append(Finding(row.name, name, row.type, "will be published"))
+    found += [_call(spec, names.of(spec.name), node) for spec in specs if spec.kind == "call"]
+    return found
+
+
+def _incoming(row: TopicSpec, name: str, node: Node, published: bool) -> Finding:
+    connected, refused = node.look()[name]
+    if refused:
+        return Finding(row.name, name, row.type, next(iter(refused.values())), good=False)
+    if connected:
+        return Finding(row.name, name, row.type, "from " + ", ".join(info.caller for info in connected.values()))
+    if published:
+        return Finding(row.name, name, row.type, "is published, but its publisher cannot be reached", good=False)
+    return Finding(row.name, name, row.type, "nobody publishes it yet; it is waited for")
+
+
+def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
+    if spec.direction == "in":
+        return Finding(spec.name, name, spec.type, "will be offered")
+    try:
+        found = node.find_service(name)
+    except (CallRefusedError, MasterError) as error:
+        return Finding(spec.name, name, spec.type, str(error), good=False)
+    says = "nobody offers it yet; it is waited for" if found is None else f"is offered, {found[1].type}"
+    return Finding(spec.name, name, spec.type, says)
+
+
+def _wheels(graph: Ros1RobotConfig, node: Node) -> Finding:
+    name = resolve(graph.cmd_vel, graph.home)
+    kind = node.master.topic_types().get(name, "*")
+    if kind not in ("*", "geometry_msgs/Twist"):
+        return Finding("wheels", name, "geometry_msgs/Twist", f"is a {kind}", good=False)
+    says = "is known to the master" if kind != "*" else "nobody listens to it yet; is cmd_vel right?"
+    return Finding("wheels", name, "geometry_msgs/Twist", says)
+
+
+def _unknown(name: str) -> Finding:
+    return Finding(f"remap.{name}", "", "", "the service has no such topic, call or action", good=False)

@@ -1,0 +1,161 @@
+"""``skytether robot run``: the agent on a robot that is a ROS graph."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .output import console, fail
+
+if TYPE_CHECKING:
+    from skytether.robot.agent import AgentConfig, AgentStatus
+    from skytether.robot.ros1 import Ros1RobotConfig
+    from skytether.ros.ros1.node import Node
+
+    from .robot_config import RobotConfig, Ros1Config
+
+_STATUS_S = 0.5
+"""Between looks at the agent, to say what changed."""
+
+
+def run(
+    config: Annotated[
+        Path, typer.Argument(help="YAML of the robot: robot, orchestrator, token_file, service, ros1, ...")
+    ],
+    check: Annotated[
+        bool, typer.Option("--check", help="Only look whether everything is there, topic by topic; status 1 if not.")
+    ] = False,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after this long; without it at Ctrl-C.")] = None,
+) -> None:
+    """Join the robot's ROS graph, ask for its service, and drive with what the service says.
+
+    The robot's own nodes stay as they are: what the service takes in is subscribed, what it gives out is published,
+    and velocities pass the supervisor before they reach the wheels' topic.
+    """
+    from .config_file import ConfigError
+    from .robot_config import load_config, load_token
+
+    try:
+        settings = load_config(config)
+        token = load_token(settings, config.parent)
+    except ConfigError as error:
+        fail(str(error), 2)
+    if settings.ros1 is None:
+        fail(f"{config}: ros1: is missing", 2)
+    if check:
+        from .robot_check import check_robot
+
+        with _node(settings, settings.ros1, threading.Event()) as node:
+            raise typer.Exit(0 if check_robot(settings, ros1_config(settings, settings.ros1), node, token) else 1)
+    _run(settings, settings.ros1, token, seconds)
+
+
+def _run(settings: RobotConfig, ros1: Ros1Config, token: str, seconds: float | None) -> None:
+    from skytether.robot.agent import Agent
+    from skytether.robot.fallback import FallbackError
+    from skytether.robot.ros1 import Ros1Robot
+
+    ended = threading.Event()
+    with _node(settings, ros1, ended) as node:
+        robot = Ros1Robot(ros1_config(settings, ros1), node)
+        try:
+            with Agent(agent_config(settings, token), robot.base, graph=robot) as agent:
+                _watch(agent.status, ended, seconds)
+        except FallbackError as error:
+            fail(str(error), 2)
+        finally:
+            robot.close()
+
+
+@contextmanager
+def _node(settings: RobotConfig, ros1: Ros1Config, ended: threading.Event) -> Iterator[Node]:
+    """The node; what goes wrong with it ends the command."""
+    from skytether.ros.ros1.node import Node, NodeError
+
+    def end(reason: str) -> None:
+        console.print(f"robot {settings.robot}: asked to end: {reason or 'by rosnode kill'}", markup=False)
+        ended.set()
+
+    node = Node(ros1.node, ros1.master, host=ros1.host, on_end=end)
+    try:
+        node.start()
+    except NodeError as error:
+        fail(str(error), 2)
+    try:
+        yield node
+    finally:
+        node.close()
+
+
+def _watch(status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None) -> None:
+    """Say what changes, until the end."""
+    begin = time.monotonic()
+    before = ""
+    while seconds is None or time.monotonic() - begin < seconds:
+        now = _sentence(status())
+        if now != before:
+            console.print(now, markup=False, soft_wrap=True)
+            before = now
+        if ended.wait(_STATUS_S):
+            return
+
+
+def _sentence(status: AgentStatus) -> str:
+    """What changes rarely, for people."""
+    driver = status.driver
+    reason = driver.transitions[-1].reason if driver.transitions else ""
+    instance = f"instance {status.instance.id} {status.instance.state}" if status.instance else "no instance"
+    session = "session up" if status.connected else "no session"
+    trouble = f"; {status.trouble}" if status.trouble else ""
+    return f"driving: {driver.source} ({reason}); {instance}, {session}{trouble}"
+
+
+def agent_config(settings: RobotConfig, token: str) -> AgentConfig:
+    """What the agent needs of the configuration."""
+    from skytether.bridge.interfaces import LocalPath, Wanted
+    from skytether.robot.agent import AgentConfig
+    from skytether.robot.supervisor import Limits
+
+    paths: Wanted = (
+        "auto"
+        if settings.paths == "auto"
+        else [LocalPath(p.local, p.cost, (p.peer.host, p.peer.port) if p.peer else None) for p in settings.paths]
+    )
+    return AgentConfig(
+        robot=settings.robot,
+        url=settings.orchestrator,
+        token=token,
+        service=settings.service,
+        params=settings.params,
+        fallback=settings.fallback.name,
+        fallback_options=settings.fallback.options,
+        limits=Limits(**settings.limits),
+        command_topic=settings.command_topic,
+        rate_hz=settings.rate_hz,
+        bind=(settings.bind.host, settings.bind.port),
+        paths=paths,
+    )
+
+
+def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
+    """What the graph needs of the configuration."""
+    from skytether.robot.ros1 import Ros1RobotConfig
+
+    return Ros1RobotConfig(
+        robot=settings.robot,
+        service=settings.service,
+        namespace=ros1.namespace,
+        remap=ros1.remap,
+        cmd_vel=ros1.cmd_vel,
+        idle_s=ros1.idle_s,
+        readings=ros1.readings,
+        topics=ros1.topics,
+        params=ros1.params,
+        use_sim_time=ros1.use_sim_time,
+    )
