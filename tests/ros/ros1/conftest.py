@@ -1,8 +1,13 @@
+from pathlib import Path
+
 import pytest
 from ros1_graph import Ros1Graph
 from ros1_pair import Pair
 
+from skytether.api.client import Client
 from skytether.api.manifest import TopicSpec
+from skytether.api.rest import SiteCreate
+from skytether.lab.embedded import EmbeddedOrchestrator
 
 
 @pytest.fixture
@@ -38,3 +43,19 @@ def make_pair(make_graph):
     yield make
     for pair in made:
         pair.close()
+
+
+@pytest.fixture
+def orchestrator(tmp_path):
+    """An orchestrator that runs services from this checkout."""
+    folders = [str(Path(__file__).parents[3] / folder) for folder in ("platform", "services", "docs/examples")]
+    (tmp_path / "orchestrator").mkdir()
+    with (
+        EmbeddedOrchestrator(tmp_path / "orchestrator") as orchestrator,
+        Client(orchestrator.url, orchestrator.operator_token) as client,
+    ):
+        options = {"python_path": folders}
+        client.create_site(SiteCreate(name="here", tier="edge", runtime="process", options=options))
+        client.delete_site("local")
+        orchestrator.client = client
+        yield orchestrator

@@ -1,0 +1,152 @@
+"""``skytether robot run`` on a real master, with a real orchestrator and a service."""
+
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from ros1_graph import wait_for
+
+from skytether.api.manifest import Manifest
+from skytether.api.rest import RobotCreate
+from skytether.messages import LaserScan, Twist, decode, encode, type_hash
+from skytether.ros.ros1.node import Node
+from skytether.ros.ros1.subscription import Listener
+
+pytestmark = [pytest.mark.ros1, pytest.mark.slow]
+
+EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
+SCAN_MD5, TWIST_MD5 = type_hash(LaserScan, "ros1"), type_hash(Twist, "ros1")
+
+
+class Walker:
+    """The robot's own nodes: a laser at 20 Hz, and wheels that remember what they were told."""
+
+    def __init__(self, graph):
+        self.told = []
+        self.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 200)
+        self.node = Node("walker", graph.uri, look_s=0.2)
+        self.node.start()
+        self.laser = self.node.advertise("/scan", "sensor_msgs/LaserScan", SCAN_MD5)
+        listener = Listener(lambda data, _: self.told.append(decode(Twist, data, "ros1").linear.x))
+        self.node.subscribe("/cmd_vel", "geometry_msgs/Twist", TWIST_MD5, listener)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        while not self._ended.wait(0.05):
+            self.laser.publish(encode(self.scan, "ros1"))
+
+    @property
+    def speed(self):
+        return self.told[-1] if self.told else None
+
+    def close(self):
+        self._ended.set()
+        self._thread.join()
+        self.node.close()
+
+
+@pytest.fixture
+def walker(graph):
+    walker = Walker(graph)
+    yield walker
+    walker.close()
+
+
+@pytest.fixture
+def config(graph, orchestrator, tmp_path):
+    """A robot.yaml, and the robot registered."""
+    manifest = yaml.safe_load((EXAMPLES / "wall_stop" / "service.yaml").read_text())
+    # How well a busy machine keeps time is not what is asked here.
+    manifest["spec"]["needs"] = {"cpu": 0.1}
+    orchestrator.client.put_service("wall-stop", Manifest.model_validate(manifest))
+    token = tmp_path / "walker.token"
+    token.touch(0o600)
+    token.write_text(orchestrator.client.create_robot(RobotCreate(name="walker")).token)
+    path = tmp_path / "robot.yaml"
+    document = {
+        "robot": "walker",
+        "orchestrator": orchestrator.url,
+        "token_file": "walker.token",
+        "service": "wall-stop",
+        "limits": {"max_gap_s": 2.0},
+        "ros1": {"master": graph.uri, "namespace": "/"},
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def test_a_service_drives_a_robot_of_ros_1_and_stops_it_where_the_laser_knows_nothing(graph, config, walker, tmp_path):
+    process = graph.skytether("robot", "run", str(config), stderr=subprocess.PIPE)
+    wait_for(lambda: walker.speed is not None and abs(walker.speed - 0.2) < 1e-9, "the service to drive")
+    assert "/skytether" in graph.ask("rosnode", "list").split()
+    walker.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0)
+    wait_for(lambda: walker.speed == 0.0, "the standstill before a laser without ranges")
+    walker.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[0.0] * 200)
+    time.sleep(0.5)
+    assert walker.speed == 0.0
+    walker.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 200)
+    wait_for(lambda: walker.speed and walker.speed > 0.1, "the service to drive again")
+    # As a ROS user ends nodes; the wheels' last word is a standstill, and the node is gone from the graph.
+    graph.ask("rosnode", "kill", "/skytether")
+    said = process.stderr.read().decode()
+    assert process.wait(30) == 0, said
+    wait_for(lambda: walker.speed == 0.0, "the last standstill")
+    assert graph.publishers("/cmd_vel") == []
+    assert "driving: cloud" in said
+    assert "Traceback" not in said
+
+
+def test_a_laser_of_another_type_drives_nobody_and_the_check_says_so_before(graph, config, tmp_path):
+    with Node("walker", graph.uri, look_s=0.2) as node:
+        told = []
+        node.subscribe("/cmd_vel", "*", "", Listener(lambda data, _: told.append(decode(Twist, data, "ros1").linear.x)))
+        laser = node.advertise("/scan", "std_msgs/Bool", "8b94c1b53db61fb6aed406028ad6332a", latched=True)
+        laser.publish(b"\x01")
+        checked = graph.skytether(
+            "robot", "run", str(config), "--check", stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        found, said = (text.decode() for text in checked.communicate(timeout=60))
+        assert checked.returncode == 1, found + said
+        assert "!!" in found
+        assert "1 to mend" in said
+        process = graph.skytether("robot", "run", str(config), "--seconds", "5", stderr=subprocess.PIPE)
+        said = process.stderr.read().decode()
+        assert process.wait(30) == 0
+    assert said.count("publishes std_msgs/Bool with MD5 8b94c1b53db61fb6aed406028ad6332a") == 1
+    assert SCAN_MD5 in said
+    assert set(told) <= {0.0}
+
+
+def test_the_check_finds_all_that_is_there(graph, config, walker):
+    said = graph.skytether("robot", "run", str(config), "--check", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    found, told = (text.decode() for text in said.communicate(timeout=60))
+    assert said.returncode == 0, found + told
+    assert "all is there" in told
+    assert "from /walker" in found
+    assert "/cmd_vel" in found
+
+
+def test_without_master_and_orchestrator_it_waits_and_says_so_once_and_the_check_names_both(make_graph, tmp_path):
+    graph = make_graph()  # no master
+    token = tmp_path / "walker.token"
+    token.touch(0o600)
+    token.write_text("secret")
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        f"robot: walker\norchestrator: http://127.0.0.1:9\ntoken_file: walker.token\nservice: wall-stop\n"
+        f"ros1: {{master: '{graph.uri}'}}\n"
+    )
+    process = graph.skytether("robot", "run", str(path), "--seconds", "6", stderr=subprocess.PIPE)
+    said = process.stderr.read().decode()
+    assert process.wait(30) == 0, said
+    assert said.count("no ROS master answers") == 1
+    assert "no orchestrator answers" in said
+    check = graph.skytether("robot", "run", str(path), "--check", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    found, said = (text.decode() for text in check.communicate(timeout=60))
+    assert check.returncode == 1
+    assert found.count("!!") == 2
