@@ -6,7 +6,7 @@ READY := .venv/.ready
 # A busy machine can make a test on real sockets or processes miss its moment: it is run again, and reported as such.
 AGAIN := --reruns 2 --reruns-delay 3
 
-.PHONY: demo test unit fuzz check fmt docs lock clean
+.PHONY: demo test unit images fuzz check fmt docs lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -17,6 +17,9 @@ test: $(READY) ## every test that this machine can run; what is missing is skipp
 
 unit: $(READY) ## the quick part, under a minute
 	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+
+images: $(READY) ## the container images, on the Docker engine of this machine; prints build time and size of each
+	$(BIN)/python images/build.py
 
 fuzz: $(READY) ## every byte that can arrive, with coverage, 30 s for each target (SECONDS=300 for more)
 	$(BIN)/python tests/fuzz/run.py --seconds $(or $(SECONDS),30)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import pytest
+
+if TYPE_CHECKING:
+    from docker_site import DockerSite, Images
 
 
 def pytest_configure() -> None:
@@ -153,3 +158,44 @@ def postgres(postgres_server: PostgresServer) -> Iterator[str]:
     yield f"{postgres_server.url.rpartition('/')[0]}/{name}"
     with psycopg.connect(postgres_server.url, autocommit=True) as connection:
         connection.execute(f"DROP DATABASE {name} WITH (FORCE)")
+
+
+@pytest.fixture(scope="session")
+def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Images]:
+    """The base image, the network's guard, one service and the toy, built from this very code."""
+    from docker_site import TOY, Images
+
+    prefix = f"skytether-test-{secrets.token_hex(4)}/"
+    build = Path(__file__).parent.parent / "images" / "build.py"
+    names = ["base", "guard", "virtual-trail"]
+    try:
+        done = subprocess.run(
+            [sys.executable, str(build), "--prefix", prefix, "--json", *names], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        images = Images(prefix, json.loads(done.stdout))
+        folder = tmp_path_factory.mktemp("toy")
+        (folder / "Dockerfile").write_text(TOY)
+        command = ["docker", "build", "-q", "-t", images.toy, "--build-arg", f"BASE={images.name('base')}", str(folder)]
+        subprocess.run(command, check=True, capture_output=True, env={**os.environ, "DOCKER_BUILDKIT": "0"})
+        yield images
+    finally:
+        made = [f"{prefix}{name}:1" for name in ("toy", *reversed(names))]
+        subprocess.run(["docker", "image", "rm", "-f", *made], capture_output=True)
+        subprocess.run(["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True)
+
+
+@pytest.fixture(scope="session")
+def _docker_network(docker_images: Images) -> Iterator[DockerSite]:
+    from docker_site import DockerSite
+
+    site = DockerSite(docker_images)
+    yield site
+    site.close()
+
+
+@pytest.fixture
+def docker_site(_docker_network: DockerSite) -> Iterator[DockerSite]:
+    """A site on the real engine; its containers and volumes are removed after each test."""
+    yield _docker_network
+    _docker_network.clean()

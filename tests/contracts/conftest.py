@@ -23,10 +23,11 @@ TOY = "skytether.testing.toy_service"
 class Kit(ABC):
     """One kind of runtime, and how to get services of it that behave in a certain way."""
 
-    patience = 10.0
+    patience = 30.0
     """Seconds that a run may take to become what it should."""
+    image = "toy"
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
         self.folder = folder
         self.runtimes: list[Runtime] = []
 
@@ -49,7 +50,7 @@ class Kit(ABC):
             session_key=base64.b64encode(bytes(range(32))).decode(),
             topics=(),
         )
-        return Launch(attempt, ServiceSpec(entrypoint=TOY, image="toy"), grant)
+        return Launch(attempt, ServiceSpec(entrypoint=TOY, image=self.image), grant)
 
     def until(self, runtime: Runtime, phase: Phase | None, instance: str = "i1") -> Observation | None:
         """Look until the instance is in this phase; None: until it is not there."""
@@ -76,11 +77,23 @@ class ProcessKit(Kit):
         return runtime
 
 
+class DockerKit(Kit):
+    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
+        super().__init__(folder, request)
+        self.site: Any = request.getfixturevalue("docker_site")
+        self.image = self.site.images.toy
+
+    def open(self, behaviour: str = "good") -> Runtime:
+        runtime = self.site.open(self.folder)
+        self.runtimes.append(runtime)
+        return runtime
+
+
 class FakeKit(Kit):
     kind: type[FakeRuntime] = FakeRuntime
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
+        super().__init__(folder, request)
         self.world: dict[str, FakeRun] = {}
 
     def open(self, behaviour: str = "good") -> Runtime:
@@ -97,11 +110,12 @@ class SlowKit(FakeKit):
 @pytest.fixture(
     params=[
         pytest.param(ProcessKit, id="process", marks=pytest.mark.slow),
+        pytest.param(DockerKit, id="docker", marks=[pytest.mark.slow, pytest.mark.docker]),
         pytest.param(FakeKit, id="fake"),
         pytest.param(SlowKit, id="slow"),
     ]
 )
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kit]:
-    kit = request.param(tmp_path)
+    kit = request.param(tmp_path, request)
     yield kit
     kit.close()

@@ -15,6 +15,7 @@ from skytether.orchestrator.plan import (
     End,
     Expire,
     Place,
+    Progress,
     Ready,
     Remove,
     Start,
@@ -286,3 +287,27 @@ def test_whatever_happens_there_is_one_run_at_most_and_quiet_brings_what_is_want
         world.look(lose=False)
     assert world.record.state.final
     assert world.run is None or world.run.phase is Phase.EXITED
+
+
+def test_a_start_that_makes_progress_has_time(new_record: NewRecord) -> None:
+    record = at_site(new_record, State.STARTING, started_at=NOW, reason="pulling x: 1 of 9 MB")
+    record = dataclasses.replace(record, lease_expires_at=NOW + 999)
+    late = NOW + T.start_timeout + 1
+    further = seen(Phase.STARTING, detail="pulling x: 2 of 9 MB")
+    assert decide(record, further, late, T) == Progress(record, "pulling x: 2 of 9 MB")
+    same = seen(Phase.STARTING, detail="pulling x: 1 of 9 MB")
+    assert decide(record, same, NOW + 1, T) is None
+    assert isinstance(decide(record, same, late, T), Crash)
+
+
+def test_what_is_not_well_is_started_again(new_record: NewRecord) -> None:
+    record = at_site(new_record, State.RUNNING, host="127.0.0.1", port=4000)
+    ill = dataclasses.replace(RUNNING, detail="its loop has hung for 12 s")
+    crash = decide(record, ill, NOW, T)
+    assert crash == Crash(record, "is not well: its loop has hung for 12 s")
+    assert decide(record, RUNNING, NOW, T) is None
+
+
+def test_a_runtime_may_know_better_how_it_ended() -> None:
+    ended = seen(Phase.EXITED, exit_status=-9, detail="ran out of memory", last_line="x")
+    assert how_it_ended(ended) == 'ran out of memory; its last line: "x"'

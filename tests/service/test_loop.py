@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from skytether.messages import Float64, encode
@@ -21,6 +23,8 @@ class Bench:
         clock = self.clock = FakeClock(0.0)
         steps = self.steps = []
         durations = self.durations = []
+        bench = self
+        self.during: Callable[[], None] = lambda: None
         step_trigger = trigger
 
         class Noting(Service[NoParams]):
@@ -31,6 +35,7 @@ class Bench:
             def step(self, now: float) -> None:
                 steps.append((now, self.value.latest.message.data) if self.value.latest else now)
                 clock.advance(durations.pop(0) if durations else 0.0)
+                bench.during()
 
         self.service = Noting(NoParams())
         self.port = ServicePort(self.service, clock.wake)
@@ -174,3 +179,14 @@ def test_the_real_clock_sleeps_until_its_time_or_a_wake() -> None:
         clock.sleep_until(begin - 1)
     finally:
         clock.close()
+
+
+def test_it_tells_how_long_a_step_takes() -> None:
+    bench = Bench(rate=10.0)
+    assert bench.loop.in_step_for() == 0.0
+    told: list[float] = []
+    bench.during = lambda: told.append(bench.loop.in_step_for())
+    bench.durations.append(0.03)
+    bench.run(0.05)
+    assert told == [0.03]
+    assert bench.loop.in_step_for() == 0.0

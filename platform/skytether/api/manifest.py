@@ -147,11 +147,24 @@ class Needs(Strict):
     """One step of the service on a core of its own; placement reckons delay with it."""
     architectures: tuple[Annotated[str, Field(pattern=r"^[a-z0-9_]+$")], ...] = ()
     """As container images name them (``amd64``, ``arm64``); empty: any."""
+    devices: tuple[Annotated[str, Field(pattern=r"^/dev/[A-Za-z0-9._/-]+$")], ...] = ()
+    """Device files, ``/dev/video0``; a container site must offer each."""
     max_rtt_ms: Annotated[float, Field(gt=0)] | None = None
     """Above this the robot's fallback takes over; None: any."""
     max_loss: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of messages; above this the robot's fallback takes over; None: any."""
     tiers: Annotated[tuple[Tier, ...], Field(min_length=1)] = ("robot", "edge", "cloud")
+
+
+class Limits(Strict):
+    """What a container may take at most; a process site has no limits."""
+
+    cpu: Annotated[float, Field(gt=0)] | None = None
+    """Cores; None: one, or what it needs if that is more. Below that, its share is by need."""
+    memory_mb: Annotated[int, Field(gt=0)] | None = None
+    """Beyond it the service is killed; None: what it needs."""
+    pids: Annotated[int, Field(ge=8, le=32_768)] = 256
+    """Processes and threads."""
 
 
 class Metadata(Strict):
@@ -180,6 +193,15 @@ class ServiceSpec(Strict):
     """JSON schema (2020-12) of the parameters; ``additionalProperties`` is false unless it says otherwise."""
     topics: tuple[TopicSpec, ...] = ()
     needs: Needs = Needs()
+    limits: Limits = Limits()
+
+    @model_validator(mode="after")
+    def _limits_allow_the_needs(self) -> ServiceSpec:
+        for key in ("cpu", "memory_mb"):
+            limit, need = getattr(self.limits, key), getattr(self.needs, key)
+            if limit is not None and limit < need:
+                raise ValueError(f"limits.{key} is {limit:g}, less than needs.{key}, {need:g}")
+        return self
 
     @model_validator(mode="before")
     @classmethod

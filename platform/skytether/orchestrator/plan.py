@@ -36,6 +36,14 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True)
+class Progress:
+    """The present run is not ready, but further than it was: its time to start begins anew."""
+
+    record: Record
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
 class Ready:
     """The service listens (again, or elsewhere)."""
 
@@ -83,7 +91,7 @@ class Remove:
     instance: str
 
 
-Action = Place | Start | Ready | Crash | Expire | End | Stop | Remove
+Action = Place | Start | Progress | Ready | Crash | Expire | End | Stop | Remove
 
 
 def plan(
@@ -144,6 +152,8 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
         return Ready(record, seen.host, seen.port)
     if seen.phase is Phase.EXITED:
         return Crash(record, how_it_ended(seen), for_good=seen.exit_status == BAD_GRANT_STATUS)
+    if seen.detail and seen.detail != record.reason:
+        return Progress(record, seen.detail)
     if record.started_at is not None and now - record.started_at > timing.start_timeout:
         return Crash(record, f"was not ready within {timing.start_timeout:g} s")
     return None
@@ -154,6 +164,8 @@ def _running(record: Record, seen: Observation | None) -> Action | None:
         return Crash(record, "is gone")
     if seen.phase is Phase.EXITED:
         return Crash(record, how_it_ended(seen))
+    if seen.phase is Phase.RUNNING and seen.detail:
+        return Crash(record, f"is not well: {seen.detail}")
     if seen.phase is Phase.RUNNING and (seen.host, seen.port) != (record.host, record.port):
         return Ready(record, seen.host, seen.port)
     return None
@@ -161,7 +173,9 @@ def _running(record: Record, seen: Observation | None) -> Action | None:
 
 def how_it_ended(seen: Observation) -> str:
     """In words that continue "the service ..."."""
-    if seen.exit_status is None:
+    if seen.detail:
+        text = seen.detail
+    elif seen.exit_status is None:
         text = "ended"
     elif seen.exit_status < 0:
         text = f"was killed by signal {-seen.exit_status}"

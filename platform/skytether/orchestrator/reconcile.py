@@ -13,7 +13,7 @@ from skytether.api.rest import Measurement, Refusal, State
 from .db import GONE
 from .metrics import Metrics
 from .placement import NOTHING, Decision, place
-from .plan import Action, Crash, End, Expire, Place, Ready, Remove, Start, Stop, after_crash, plan
+from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
 from .runtimes.base import Capacity, Launch, RuntimeFailure
 from .security import Secrets
@@ -185,6 +185,8 @@ class Reconciler:
             match action:
                 case Start(record):
                     self._start(site, record)
+                case Progress(record, detail):
+                    self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
                 case Ready(record, host, port):
                     self._ready(record, host, port)
                 case Crash():

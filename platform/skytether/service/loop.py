@@ -30,6 +30,12 @@ class Loop:
         self._clock = clock
         self._idle_exit = idle_exit
         self._stopping = False
+        self._step_began: float | None = None
+
+    def in_step_for(self) -> float:
+        """Seconds that the present step has taken; 0 between steps. From any thread."""
+        began = self._step_began
+        return 0.0 if began is None else self._clock.now() - began
 
     def stop(self) -> None:
         """End after the current step; from any thread or signal handler."""
@@ -92,8 +98,10 @@ class Loop:
                 self._clock.sleep_until(idle_since + self._idle_exit)
 
     def _step(self, now: float) -> None:
+        self._step_began = now
         self._port.settle()
         self._service.step(now)
+        self._step_began = None
         self.steps += 1
 
     def _idle(self, now: float, since: float) -> bool:

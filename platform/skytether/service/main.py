@@ -22,6 +22,7 @@ from skytether.wire.topic import Role
 if TYPE_CHECKING:
     from skytether.bridge import Bridge
 
+from .beat import beating
 from .clock import SystemClock
 from .errors import ConfigError, ServiceError
 from .loop import Loop
@@ -121,7 +122,8 @@ def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant) -> in
         started = True
         warm_up(service, grant)
         write_ready_file(grant, bridge.address[1])
-        loop.run()
+        with beating(grant.ready_file, loop.in_step_for):
+            loop.run()
     except ServiceError:
         raise
     except Exception:

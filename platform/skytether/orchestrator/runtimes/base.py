@@ -45,9 +45,16 @@ class Observation:
     """When EXITED; negative: the signal that ended it; None: unknown (it was not our child)."""
     last_line: str = ""
     """When EXITED: the last line of its log."""
+    detail: str = ""
+    """STARTING: what it waits for ("pulling x: 12 of 80 MB"); as long as this changes, the start makes progress.
+    RUNNING: what its own health check finds wrong; empty: it is well. EXITED: how it ended, where the status does not
+    tell; continues "the service ..."."""
     cpu_s: float | None = None
     """Processor time of this run so far."""
     memory_bytes: int | None = None
+    received_bytes: int | None = None
+    """By the network, of this run so far."""
+    sent_bytes: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +148,11 @@ class Runtime(ABC):
 
     @abstractmethod
     def logs(self, instance: str, lines: int) -> str:
-        """The last lines that all runs of the instance wrote; empty if there are none."""
+        """The last lines that all runs of the instance wrote; empty if there are none.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
 
     def load(self) -> float | None:
         """Share of the site's processors that is busy, whoever makes them so, 0 to 1; None: not known.

@@ -1,0 +1,195 @@
+"""The way to an engine, and its errors as ours. Every call has a time-out."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import requests
+import urllib3
+from docker import APIClient
+from docker.errors import APIError, DockerException
+from docker.tls import TLSConfig
+
+from ..base import RuntimeFailure
+from .options import LOCAL_SOCKET, DockerOptions
+
+log = logging.getLogger(__name__)
+
+_POOL = 32
+"""Connections that are kept: as many calls may be under way at once."""
+_SSH_TIMEOUT = 15
+"""Seconds that SSH gets to connect, and after which a silent connection is given up."""
+
+
+class EngineGoneError(RuntimeFailure):
+    """The engine does not answer: nothing is known of what runs there."""
+
+
+class Engine:
+    """One engine; connects at the first call, and anew after :meth:`drop`."""
+
+    def __init__(self, options: DockerOptions) -> None:
+        self._options = options
+        self._lock = threading.Lock()
+        self._tunnel = Tunnel(options) if options.address.scheme == "ssh" else None
+        self._clients: dict[float, APIClient] = {}
+
+    def api(self, timeout_s: float | None = None) -> APIClient:
+        """A client whose calls, and the gaps in whose streams, take at most ``timeout_s`` [s]; the site's by default.
+
+        Raises:
+            EngineGoneError: The engine cannot be reached.
+        """
+        timeout = timeout_s or self._options.timeout_s
+        with self._lock:
+            if timeout not in self._clients:
+                with self.asked():
+                    self._clients[timeout] = self._connect(timeout)
+            return self._clients[timeout]
+
+    def _connect(self, timeout: float) -> APIClient:
+        address, tls = self._options.engine, self._options.tls
+        arguments: dict[str, Any] = {"version": "auto", "timeout": timeout, "max_pool_size": _POOL}
+        if self._tunnel is not None:
+            return APIClient(f"unix://{self._tunnel.open()}", **arguments)
+        if tls is not None:
+            pair = (tls.cert, tls.key)
+            arguments["tls"] = TLSConfig(client_cert=pair, ca_cert=tls.ca, verify=True)
+            address = address.replace("tcp://", "https://", 1)
+        return APIClient(address, **arguments)
+
+    def drop(self) -> None:
+        """Let go of all connections; the next call makes new ones."""
+        with self._lock:
+            clients, self._clients = list(self._clients.values()), {}
+            if self._tunnel is not None:
+                self._tunnel.close()
+        for client in clients:
+            client.close()
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """Around calls: what the SDK raises, as ours.
+
+        Raises:
+            EngineGoneError: The engine does not answer.
+            RuntimeFailure: It refused; in its own words.
+        """
+        try:
+            yield
+        except APIError as error:
+            raise RuntimeFailure(explain(error)) from error
+        except (requests.RequestException, urllib3.exceptions.HTTPError, DockerException, OSError) as error:
+            raise EngineGoneError(
+                f"the Docker engine at {self._options.engine} does not answer: {root_cause(error)}"
+            ) from error
+
+
+def explain(error: APIError) -> str:
+    """What the engine said."""
+    return str(error.explanation or error).strip().rstrip(".")
+
+
+def status_of(error: BaseException) -> int | None:
+    """The HTTP status with which an engine refused; None: it did not."""
+    return error.status_code if isinstance(error, APIError) else None
+
+
+def root_cause(error: BaseException) -> str:
+    """The innermost reason, without the wrapping of four libraries."""
+    seen: set[int] = set()
+    while id(error) not in seen:
+        seen.add(id(error))
+        inner = [a for a in (getattr(error, "reason", None), *error.args, error.__cause__, error.__context__) if a]
+        error = next((a for a in inner if isinstance(a, BaseException)), error)
+    if isinstance(error, TimeoutError):
+        return "timed out"
+    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).strip()
+
+
+class Tunnel:
+    """An SSH client that makes an engine's socket one of ours.
+
+    It runs ``cat`` there, which ends with our end of its input: no tunnel outlives the orchestrator, however that ends.
+    """
+
+    def __init__(self, options: DockerOptions) -> None:
+        self._options = options
+        self._folder: Path | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def command(self, socket: Path) -> list[str]:
+        """What is run."""
+        address, ssh = self._options.address, self._options.ssh
+        settings = {
+            "BatchMode": "yes",  # nobody is there to answer a question
+            "ConnectTimeout": str(_SSH_TIMEOUT),
+            "ExitOnForwardFailure": "yes",
+            "ServerAliveInterval": "5",
+            "ServerAliveCountMax": "3",
+        }
+        if ssh.known_hosts is not None:
+            settings["UserKnownHostsFile"] = shlex.quote(ssh.known_hosts)
+        command = ["ssh", "-T"]
+        for key, value in settings.items():
+            command += ["-o", f"{key}={value}"]
+        if ssh.identity is not None:
+            command += ["-i", ssh.identity, "-o", "IdentitiesOnly=yes"]
+        if address.port is not None:
+            command += ["-p", str(address.port)]
+        host = f"{address.username}@{address.hostname}" if address.username else str(address.hostname)
+        remote = address.path if address.path not in ("", "/") else LOCAL_SOCKET
+        return [*command, "-L", f"{socket}:{remote}", host, "cat"]
+
+    def open(self) -> Path:
+        """Where the engine is now; the client is started unless it runs.
+
+        Raises:
+            OSError: No connection; with what the client said.
+        """
+        if self._process is not None and self._process.poll() is None and self._folder is not None:
+            return self._folder / "engine.sock"
+        self.close()
+        if shutil.which("ssh") is None:
+            raise OSError("the program 'ssh' is missing: install openssh-client")
+        # A short path: a socket's has 107 bytes at most, and a state folder's may be longer.
+        self._folder = Path(tempfile.mkdtemp(prefix="skytether-"))
+        socket, said = self._folder / "engine.sock", self._folder / "said"
+        with said.open("wb") as file:
+            self._process = subprocess.Popen(
+                self.command(socket), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=file
+            )
+        deadline = time.monotonic() + _SSH_TIMEOUT
+        while not socket.exists():
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                lines = [line for line in said.read_text(errors="replace").splitlines() if line.strip()]
+                self.close()
+                raise OSError(f"ssh: {lines[-1].strip() if lines else 'no connection'}")
+            time.sleep(0.01)
+        return socket
+
+    def close(self) -> None:
+        """End the client."""
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(2)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+            self._process = None
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None

@@ -1,0 +1,239 @@
+"""What is known of an engine's containers of ours: listed once, then followed by its events.
+
+The stream of events is read until it has been silent for a while; then everything is listed anew, which costs one call,
+and finds what a stream that was cut in silence has not told.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+import urllib3
+from docker.errors import APIError, NotFound
+
+from ..base import RuntimeFailure
+from .engine import Engine
+from .objects import OWNER, READY, Seen, carried_over, last_line, parse, ready_port
+
+log = logging.getLogger(__name__)
+
+_QUIET_S = 10.0
+"""A stream without events for so long is opened anew: in between, an engine that went away in silence is noticed."""
+_AGAIN_S = 1.0
+"""Between two attempts to reach an engine that does not answer."""
+_READY_S = 0.05
+"""Between two looks for the ready file of a container that starts; each costs the engine some 40 ms."""
+_TAIL = 20
+"""Lines of a log among which the last one that can be read is looked for."""
+_TOLD = frozenset({"create", "start", "die", "oom", "pause", "unpause", "stop", "restart", "rename", "update"})
+"""Events after which a container is looked at; ``health_status`` comes with a colon and more. Each check of its health
+brings three others, and each file that is handed over one."""
+
+
+class Follower:
+    """Keeps up with one engine, in a thread of its own."""
+
+    def __init__(self, engine: Engine, owner: str, on_connect: Callable[[], None]) -> None:
+        """``on_connect`` is called with each new connection; it must not wait."""
+        self._engine = engine
+        self._owner = owner
+        self._on_connect = on_connect
+        self._lock = threading.Lock()
+        self._seen: dict[str, Seen] = {}
+        self._awaited: set[str] = set()
+        self._failure: RuntimeFailure | None = None
+        self._connected = False
+        self._looked = threading.Event()
+        self._closing = threading.Event()
+        self._stream: Any = None
+        self._info: Mapping[str, Any] = {}
+        self._thread = threading.Thread(target=self._run, name="docker-events", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following; returns when nothing is read any more."""
+        self._closing.set()
+        self._end_stream()
+        if self._thread.is_alive():
+            self._thread.join(_QUIET_S)
+
+    def seen(self, timeout_s: float) -> list[Seen]:
+        """All containers of ours; waits for the first look only, ``timeout_s`` [s] at most.
+
+        Raises:
+            RuntimeFailure: The engine does not answer.
+        """
+        self._must_answer(timeout_s)
+        with self._lock:
+            return list(self._seen.values())
+
+    def info(self, timeout_s: float) -> Mapping[str, Any]:
+        """What the engine says of itself; raises as ``seen``."""
+        self._must_answer(timeout_s)
+        return self._info
+
+    def _must_answer(self, timeout_s: float) -> None:
+        if not self._looked.wait(timeout_s):
+            raise RuntimeFailure("the Docker engine has not answered yet")
+        if self._failure is not None:
+            raise RuntimeFailure(str(self._failure))
+
+    def of(self, instance: str) -> list[Seen]:
+        """The containers of one instance as last seen, the earliest run first."""
+        with self._lock:
+            return sorted((s for s in self._seen.values() if s.instance == instance), key=lambda seen: seen.attempt)
+
+    def forget(self, container: str) -> None:
+        """It is gone."""
+        with self._lock:
+            self._seen.pop(container, None)
+
+    def look(self, container: str) -> Seen | None:
+        """Look at one container now; None: it is not there, or not ours.
+
+        Raises:
+            RuntimeFailure: The engine does not answer.
+        """
+        with self._engine.asked():
+            try:
+                seen = parse(self._engine.api().inspect_container(container))
+            except NotFound:
+                seen = None
+        with self._lock:
+            old = self._seen.get(container)
+        if seen is not None:
+            seen = carried_over(seen, old)
+            if seen.ended and (old is None or not old.ended):
+                seen = replace(seen, last_line=self._last_line(container))
+        with self._lock:
+            if seen is None:
+                self._seen.pop(container, None)
+            else:
+                self._seen[container] = seen
+        if seen is not None and seen.runs and not seen.ready:
+            self._await_ready(container)
+        return seen
+
+    def _last_line(self, container: str) -> str:
+        with suppress(RuntimeFailure), self._engine.asked():  # it may be gone by now
+            return last_line(self._engine.api().logs(container, tail=_TAIL).decode(errors="replace"))
+        return ""
+
+    # The thread
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._follow()
+            except RuntimeFailure as error:
+                self._lost(error)
+            except Exception as error:
+                # Whatever it is, the next look sees everything anew; a dead thread would see nothing ever.
+                log.exception("following the engine failed")
+                self._lost(RuntimeFailure(f"the Docker engine's answer is not understood: {error}"))
+
+    def _lost(self, error: RuntimeFailure) -> None:
+        self._failure, self._connected = error, False
+        self._looked.set()
+        self._engine.drop()
+        self._closing.wait(_AGAIN_S)
+
+    def _follow(self) -> None:
+        mine = {"label": [f"{OWNER}={self._owner}"]}
+        with self._engine.asked():
+            api = self._engine.api()
+            self._info = api.info()
+            # By the engine's clock: events from before the list are looked at again, and none is missed.
+            since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
+            quiet = self._engine.api(_QUIET_S)
+            self._stream = quiet.events(since=since, filters={**mine, "type": ["container"]}, decode=True)
+            try:
+                there = {row["Id"] for row in api.containers(all=True, filters=mine)}
+            except BaseException:
+                self._end_stream()
+                raise
+        try:
+            self._look_at_all(there)
+            self._failure = None
+            self._looked.set()
+            if not self._connected:
+                self._connected = True
+                self._on_connect()
+            self._read_events()
+        finally:
+            self._end_stream()
+
+    def _look_at_all(self, there: set[str]) -> None:
+        with self._lock:
+            gone = self._seen.keys() - there
+            for container in gone:
+                del self._seen[container]
+        for container in there:
+            seen = self.look(container)
+            if not self._connected and seen is not None and seen.runs and not seen.ready:
+                self._look_ready(container)  # or an adopted one would seem to start
+
+    def _read_events(self) -> None:
+        with suppress(urllib3.exceptions.HTTPError, OSError, ValueError, AttributeError):  # ended, or silent too long
+            for event in self._stream or ():
+                if self._closing.is_set():
+                    return
+                action, container = str(event.get("Action", "")), event.get("Actor", {}).get("ID", "")
+                if action == "destroy":
+                    self.forget(container)
+                elif action in _TOLD or action.startswith("health_status"):
+                    self.look(container)
+
+    def _end_stream(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            with suppress(Exception):  # of a connection that is half gone, anything
+                stream.close()
+
+    # Readiness
+
+    def _await_ready(self, container: str) -> None:
+        with self._lock:
+            if container in self._awaited or not self._connected:
+                return
+            self._awaited.add(container)
+        threading.Thread(target=self._watch_ready, args=(container,), name="docker-ready", daemon=True).start()
+
+    def _watch_ready(self, container: str) -> None:
+        try:
+            while not self._closing.is_set():
+                with self._lock:
+                    seen = self._seen.get(container)
+                if seen is None or not seen.runs or seen.ready:
+                    return
+                with suppress(RuntimeFailure):
+                    self._look_ready(container)
+                self._closing.wait(_READY_S)
+        finally:
+            with self._lock:
+                self._awaited.discard(container)
+
+    def _look_ready(self, container: str) -> None:
+        with self._engine.asked():
+            try:
+                chunks, _ = self._engine.api().get_archive(container, READY)
+                archive = b"".join(chunks)
+            except APIError:
+                return  # not yet, or not any more
+        if ready_port(archive) is not None:
+            with self._lock:
+                if container in self._seen:
+                    self._seen[container] = replace(self._seen[container], ready=True)
+
+
+def _seconds(moment: str) -> str:
+    """An engine's time without its nanoseconds, which are more digits than Python reads."""
+    return moment[:19] + "+00:00" if moment.endswith("Z") else moment[:19] + moment[-6:]

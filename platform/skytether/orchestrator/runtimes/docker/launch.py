@@ -1,0 +1,210 @@
+"""One start: earlier runs ended, network and image there, the container made, its grant put in, begun."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from docker.errors import APIError, NotFound
+
+from ..base import Launch, RuntimeFailure
+from .engine import Engine, explain
+from .follow import Follower
+from .images import ensure_image
+from .objects import Seen, container, free_gpus, free_port, grant_archive, name_of
+from .options import DockerOptions
+
+log = logging.getLogger(__name__)
+
+_KEPT = 2
+"""Earlier runs whose containers stay, for their logs."""
+_END_S = 10.0
+"""Seconds that a killed container gets to be gone."""
+_TAKEN = ("port is already allocated", "address already in use")
+"""What an engine says when a port is."""
+_ONE_AT_A_TIME = threading.Lock()
+"""From the choice of a port or a GPU until its container is seen: two starts must not choose the same."""
+
+
+class StoppedError(RuntimeFailure):
+    """It was asked to end before it ran."""
+
+
+class Job:
+    """A start under way, in a thread of its own."""
+
+    def __init__(
+        self,
+        launch: Launch,
+        engine: Engine,
+        options: DockerOptions,
+        owner: str,
+        follower: Follower,
+        prepare: Callable[[], None],
+        before: Job | None,
+    ) -> None:
+        """``prepare`` has the network ready, or raises; ``before`` is an earlier start of the instance."""
+        self.launch = launch
+        self.failure = ""
+        """Why nothing runs, when it has ended that way."""
+        self.detail = ""
+        self._engine = engine
+        self._options = options
+        self._owner = owner
+        self._follower = follower
+        self._prepare = prepare
+        self._before = before
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="docker-start", daemon=True)
+
+    @property
+    def attempt(self) -> int:
+        return self.launch.attempt
+
+    @property
+    def ended(self) -> bool:
+        return not self._thread.is_alive()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def cancel(self) -> None:
+        """Let it come to nothing, wherever it is."""
+        self._cancelled.set()
+
+    def join(self, timeout_s: float) -> None:
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            if self._before is not None:
+                self._before.cancel()
+                self._before.join(_END_S + 2 * self._options.timeout_s)
+                self._before = None
+            self._launch()
+        except StoppedError:
+            self.failure = "was stopped before it ran"
+        except RuntimeFailure as error:
+            self.failure = f"could not be started: {error}"
+        except Exception as error:
+            log.exception("start of %s failed", self.launch.instance)
+            self.failure = f"could not be started: {error}"
+
+    def _go_on(self) -> None:
+        if self._cancelled.is_set():
+            raise StoppedError
+
+    def _tell(self, detail: str) -> None:
+        self._go_on()
+        self.detail = detail
+
+    def _launch(self) -> None:
+        self._clear()
+        self._go_on()
+        image = ensure_image(self._engine, self._options, str(self.launch.spec.image), self._tell)
+        self.detail = ""
+        self._go_on()
+        self._prepare()
+        with _ONE_AT_A_TIME:
+            self._go_on()
+            made = self._create(image)
+        if self._cancelled.is_set():
+            with suppress(RuntimeFailure):
+                kill(self._engine, made.id, "KILL")
+            self._follower.look(made.id)
+
+    def _clear(self) -> None:
+        """End what is left of earlier runs; of most, forget it too."""
+        for seen in self._follower.of(self.launch.instance):
+            if seen.runs:
+                kill(self._engine, seen.id, "KILL")
+                self._wait_for_end(seen)
+            if seen.attempt < self.attempt - _KEPT or seen.attempt >= self.attempt or not (seen.runs or seen.ended):
+                remove(self._engine, self._follower, seen.id)
+
+    def _wait_for_end(self, seen: Seen) -> None:
+        deadline = time.monotonic() + _END_S
+        while (now := self._follower.look(seen.id)) is not None and now.runs:
+            if time.monotonic() > deadline:
+                raise RuntimeFailure("what is left of the run before cannot be ended: see the engine's log")
+            time.sleep(0.02)
+
+    def _create(self, image: str) -> Seen:
+        instance = self.launch.instance
+        before = self._follower.of(instance)
+        others = [s for s in self._follower.seen(self._options.timeout_s) if s.runs]
+        gpus = free_gpus(self.launch.spec.needs.gpu, self._options.gpu, {gpu for s in others for gpu in s.gpus})
+        if gpus is None:
+            raise RuntimeFailure("every GPU of the site is taken")
+        taken = {s.host_port for s in others if s.host_port is not None}
+        preferred = before[-1].host_port if before else None
+        while True:
+            try:
+                port = free_port(self._options.ports, preferred, taken)
+            except StopIteration:
+                first, last = self._options.ports or (0, 0)
+                raise RuntimeFailure(f"every UDP port from {first} to {last} is taken (option 'ports')") from None
+            try:
+                return self._begin(image, port, gpus)
+            except _PortTakenError as error:
+                if port is None:
+                    raise RuntimeFailure(str(error)) from error
+                log.warning("UDP port %d of the engine's machine is taken by another program", port)
+                taken.add(port)
+
+    def _begin(self, image: str, port: int | None, gpus: tuple[int, ...]) -> Seen:
+        body = container(self.launch, self._options, self._owner, image, port, gpus)
+        name = name_of(self._owner, self.launch.instance, self.attempt)
+        with self._engine.asked():
+            api = self._engine.api()
+            made = str(api.create_container_from_config(body, name)["Id"])
+            try:
+                api.put_archive(made, *grant_archive(self.launch))
+                api.start(made)
+            except BaseException as error:
+                remove(self._engine, self._follower, made)
+                if isinstance(error, APIError) and any(words in explain(error) for words in _TAKEN):
+                    raise _PortTakenError(explain(error)) from error
+                raise
+        seen = self._follower.look(made)
+        if seen is None:
+            raise RuntimeFailure("its container was removed by somebody else")
+        return seen
+
+
+class _PortTakenError(Exception):
+    """Another program on the engine's machine has the port."""
+
+
+def kill(engine: Engine, container_id: str, signal: str) -> None:
+    """Send a signal; one that has ended or is gone stays so.
+
+    Raises:
+        RuntimeFailure: The engine does not answer.
+    """
+    with engine.asked():
+        try:
+            engine.api().kill(container_id, signal)
+        except APIError as error:
+            if error.status_code not in (404, 409):
+                raise
+
+
+def remove(engine: Engine, follower: Follower, container_id: str) -> None:
+    """Remove a container, whatever it does, with the volume that holds its grant.
+
+    Raises:
+        RuntimeFailure: The engine does not answer.
+    """
+    with engine.asked():
+        try:
+            engine.api().remove_container(container_id, v=True, force=True)
+        except NotFound:
+            pass
+        except APIError as error:
+            if error.status_code != 409:  # somebody else is at it
+                raise
+    follower.forget(container_id)

@@ -1,0 +1,121 @@
+"""What a Docker site is told."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+from urllib.parse import SplitResult, urlsplit
+
+from pydantic import Field, model_validator
+
+from skytether.api.manifest import Strict
+
+LOCAL_SOCKET = "/var/run/docker.sock"
+Port = Annotated[int, Field(ge=1, le=65_535)]
+
+
+class TlsOptions(Strict):
+    """Both ends prove who they are: an engine behind TCP gives whoever reaches it the whole machine."""
+
+    ca: str
+    """File with the authority that signed the engine's certificate."""
+    cert: str
+    """File with our certificate."""
+    key: str
+    """File with its key."""
+
+
+class SshOptions(Strict):
+    """For what ``~/.ssh/config`` of the orchestrator's user does not say already."""
+
+    identity: str | None = None
+    """File with the private key."""
+    known_hosts: str | None = None
+    """File with the host's key; an unknown host is refused, never asked for."""
+
+
+class DockerOptions(Strict):
+    """Options of a Docker site."""
+
+    engine: str = f"unix://{LOCAL_SOCKET}"
+    """``unix:///PATH``, ``ssh://[USER@]HOST[:PORT][/PATH]`` (PATH: its socket, /var/run/docker.sock unless given), or
+    ``tcp://HOST:PORT`` with ``tls``."""
+    tls: TlsOptions | None = None
+    ssh: SshOptions = SshOptions()
+    bind_host: str | None = None
+    """Address of the engine's machine on which instances are reached; None: loopback of a local engine, all addresses
+    of a remote one."""
+    advertise_host: str | None = None
+    """Address that robots are told; None: ``bind_host``, or the host of a remote engine."""
+    ports: tuple[Port, Port] | None = None
+    """First and last UDP port that instances may have, as a firewall lets them through; None: the engine chooses."""
+    cpu: Annotated[float, Field(gt=0)] | None = None
+    """Cores that instances may ask for in all; None: all of the engine's."""
+    memory_mb: Annotated[int, Field(gt=0)] | None = None
+    """None: all of the engine's."""
+    gpu: Annotated[int, Field(ge=0)] = 0
+    """GPUs; each instance gets its own, by number. The engine needs NVIDIA's container toolkit."""
+    devices: tuple[str, ...] = ()
+    """Device files that services may ask for, such as /dev/video0."""
+    pull: Literal["missing", "always", "never"] = "missing"
+    """When to fetch a service's image from its registry."""
+    pinned: bool = False
+    """Take only images that are named with their digest, NAME@sha256:..."""
+    registry_auth: str | None = None
+    """File with the credentials of private registries, as ``docker login`` writes it (config.json); mode 0600."""
+    network: str = "skytether"
+    """The instances' network. It is made if it is not there, and closed off: robots reach instances, these reach
+    nobody. One that somebody else made is used as it is."""
+    guard_image: str = "skytether/guard:1"
+    """Runs once to close the network off."""
+    environment: dict[str, str] = {}
+    """More variables for the services. No secrets: whoever may ask the engine sees them."""
+    owner: str | None = None
+    """Under this name containers are found again; None: one made up at first use and kept in the state folder. Needed
+    where several orchestrators share one database."""
+    timeout_s: Annotated[float, Field(gt=0, le=300)] = 10.0
+    """An engine that has not answered for this long is unreachable."""
+
+    @property
+    def address(self) -> SplitResult:
+        return urlsplit(self.engine)
+
+    @property
+    def local(self) -> bool:
+        return self.address.scheme == "unix"
+
+    @property
+    def bound(self) -> str:
+        """Where instances listen."""
+        return self.bind_host or ("127.0.0.1" if self.local else "0.0.0.0")  # noqa: S104 (a remote one is for others)
+
+    @property
+    def advertised(self) -> str:
+        """Where robots find them."""
+        return self.advertise_host or (self.bind_host if self.local else self.address.hostname) or self.bound
+
+    @model_validator(mode="after")
+    def _engine_can_be_reached(self) -> DockerOptions:
+        try:
+            address = self.address
+            complete = bool(address.path) if self.local else bool(address.hostname)
+            port = address.port  # raises if it is none
+            complete = complete and (address.scheme != "tcp" or port is not None)
+        except ValueError as error:
+            raise ValueError(f"engine: {error}") from None
+        if address.scheme not in ("unix", "ssh", "tcp") or not complete:
+            raise ValueError("engine must be unix:///PATH, ssh://[USER@]HOST[:PORT] or tcp://HOST:PORT")
+        if (address.username and address.username.startswith("-")) or (address.hostname or "").startswith("-"):
+            raise ValueError("engine: neither user nor host may begin with '-'")
+        if address.password:
+            raise ValueError("engine: no password belongs into the address; use a key, see ssh.identity")
+        if (address.scheme == "tcp") != (self.tls is not None):
+            raise ValueError("tls (ca, cert, key) goes with tcp://, and tcp:// with tls: without it anyone is let in")
+        return self
+
+    @model_validator(mode="after")
+    def _robots_can_connect(self) -> DockerOptions:
+        if self.advertise_host is None and self.bind_host in ("0.0.0.0", "::") and self.local:  # noqa: S104
+            raise ValueError("advertise_host is needed: no robot can connect to a wildcard address")
+        if self.ports is not None and self.ports[0] > self.ports[1]:
+            raise ValueError("ports: the first is above the last")
+        return self

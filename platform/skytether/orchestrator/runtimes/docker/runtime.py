@@ -1,0 +1,164 @@
+"""A Docker engine as a site: the calls of the contract."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from docker.errors import NotFound
+from typing_extensions import override
+
+from skytether.api.manifest import ServiceSpec, Strict
+
+from ..base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from .engine import Engine
+from .follow import Follower
+from .images import check_credentials
+from .launch import Job, kill, remove
+from .network import ensure_network
+from .objects import Seen, observation, refusal
+from .options import DockerOptions
+
+
+class DockerRuntime(Runtime):
+    """Runs services as containers of one engine.
+
+    Starts go on in threads of their own; what is seen comes from the engine's events. So ``start``, ``observe`` and
+    ``capacity`` wait for nothing but the first connection.
+    """
+
+    Options = DockerOptions
+
+    @override
+    def __init__(self, site: str, folder: Path, options: Strict) -> None:
+        if not isinstance(options, DockerOptions):
+            raise TypeError("options must be DockerOptions")
+        for path in (options.tls.ca, options.tls.cert, options.tls.key) if options.tls else ():
+            if not Path(path).is_file():
+                raise RuntimeFailure(f"tls: there is no file {path}")
+        if options.registry_auth is not None:
+            check_credentials(options.registry_auth)
+        self._options = options
+        self._owner = options.owner or _kept_owner(folder)
+        self._engine = Engine(options)
+        self._lock = threading.Lock()
+        self._jobs: dict[str, Job] = {}
+        self._asked: set[str] = set()
+        """Containers that were asked to end."""
+        self._network_lock = threading.Lock()
+        self._network_ready = False
+        self._follower = Follower(self._engine, self._owner, self._on_connect)
+        self._follower.start()
+
+    def _on_connect(self) -> None:
+        self._network_ready = False  # the engine's machine may have been started anew, without our filter
+        threading.Thread(target=self._prepare_early, name="docker-network", daemon=True).start()
+
+    def _prepare_early(self) -> None:
+        with suppress(RuntimeFailure):  # the first start will say it
+            self._prepare()
+
+    def _prepare(self) -> None:
+        with self._network_lock:
+            if not self._network_ready:
+                ensure_network(self._engine, self._options)
+                self._network_ready = True
+
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return refusal(spec, self._options)
+
+    def capacity(self) -> Capacity:
+        info, options = self._follower.info(self._options.timeout_s), self._options
+        cpu = options.cpu or float(info["NCPU"])
+        return Capacity(cpu, options.memory_mb or int(info["MemTotal"]) >> 20, options.gpu)
+
+    def start(self, launch: Launch) -> None:
+        self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
+        with self._lock:
+            job, newest = self._jobs.get(launch.instance), self._newest(launch.instance)
+            if job is not None and job.attempt == launch.attempt:
+                return
+            if newest is not None and newest.attempt == launch.attempt and newest.status != "created":
+                return
+            job = Job(launch, self._engine, self._options, self._owner, self._follower, self._prepare, job)
+            self._jobs[launch.instance] = job
+            job.start()
+
+    def _newest(self, instance: str) -> Seen | None:
+        seen = self._follower.of(instance)
+        return seen[-1] if seen else None
+
+    def observe(self) -> Mapping[str, Observation]:
+        newest: dict[str, Seen] = {}
+        for seen in self._follower.seen(self._options.timeout_s):
+            if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
+                newest[seen.instance] = seen
+        # One that was made and not begun is no run: the orchestrator was killed in between, or a job is just at it.
+        found = {i: observation(s, self._options) for i, s in newest.items() if s.status != "created"}
+        with self._lock:
+            jobs = dict(self._jobs)
+        for instance, job in jobs.items():
+            if instance in found and found[instance].attempt >= job.attempt:
+                continue
+            if job.failure:
+                found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure)
+            else:
+                found[instance] = Observation(job.attempt, Phase.STARTING, detail=job.detail)
+        return found
+
+    def stop(self, instance: str, *, force: bool) -> None:
+        with self._lock:
+            job = self._jobs.get(instance)
+        newest = self._newest(instance)
+        if job is not None and not job.ended and (newest is None or newest.attempt < job.attempt or not newest.runs):
+            job.cancel()
+        for seen in self._follower.of(instance):
+            if not seen.runs or (not force and seen.id in self._asked):
+                continue
+            if not force:
+                self._asked.add(seen.id)  # once only: services may take a second signal for impatience
+            kill(self._engine, seen.id, "KILL" if force else "TERM")
+
+    def remove(self, instance: str) -> None:
+        with self._lock:
+            job = self._jobs.pop(instance, None)
+        if job is not None:
+            job.cancel()
+            job.join(self._options.timeout_s)
+        for seen in self._follower.of(instance):
+            remove(self._engine, self._follower, seen.id)
+            self._asked.discard(seen.id)
+
+    def logs(self, instance: str, lines: int) -> str:
+        texts: list[str] = []
+        left = lines
+        for seen in reversed(self._follower.of(instance)):
+            with self._engine.asked():
+                try:
+                    text = self._engine.api().logs(seen.id, tail=left).decode(errors="replace")
+                except NotFound:
+                    continue
+            texts.append(text)
+            left -= text.count("\n")
+            if left <= 0:
+                break
+        return "".join(reversed(texts))
+
+    @override
+    def close(self) -> None:
+        with self._lock:
+            for job in self._jobs.values():
+                job.cancel()
+        self._follower.close()
+        self._engine.drop()
+
+
+def _kept_owner(folder: Path) -> str:
+    """Made up at first use."""
+    path = folder / "owner"
+    if not path.exists():
+        path.write_text(secrets.token_hex(6))
+    return path.read_text().strip()

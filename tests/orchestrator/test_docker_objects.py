@@ -1,0 +1,373 @@
+"""What is asked of an engine, as data: no engine needed."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+import json
+import sys
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec
+from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
+from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
+from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
+from skytether.orchestrator.runtimes.docker.objects import (
+    Seen,
+    container,
+    free_gpus,
+    free_port,
+    grant_archive,
+    last_line,
+    observation,
+    parse,
+    ready_port,
+    refusal,
+)
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
+
+KEY = base64.b64encode(bytes(range(32))).decode()
+ROOT = Path(__file__).parents[2]
+
+
+def options(**given: Any) -> DockerOptions:
+    return DockerOptions.model_validate(given)
+
+
+def spec(**given: Any) -> ServiceSpec:
+    return ServiceSpec.model_validate({"image": "toy", **given})
+
+
+def launch(**given: Any) -> Launch:
+    grant = Grant(
+        instance="i1", service="toy", robot="walker", session_id="00112233445566aa", session_key=KEY, topics=()
+    )
+    return Launch(3, spec(**given), grant)
+
+
+def body(given: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
+    asked = {"image": "sha256:1", "port": None, "gpus": ()} | more
+    return container(launch(**(given or {})), options(), "me", **asked)
+
+
+def test_a_container_may_do_nothing_that_it_need_not() -> None:
+    made = body()
+    host = made["HostConfig"]
+    assert made["User"] == "65532:65532"
+    assert host["ReadonlyRootfs"] is True
+    assert host["CapDrop"] == ["ALL"]
+    assert host["SecurityOpt"] == ["no-new-privileges"]
+    assert host["NetworkMode"] == "skytether"
+    assert not host.keys() & {"Privileged", "CapAdd", "Binds", "PidMode", "IpcMode", "UsernsMode"}
+
+
+def test_limits_come_from_the_manifest() -> None:
+    host = body({"needs": {"cpu": 0.25, "memory_mb": 200}})["HostConfig"]
+    assert (host["NanoCpus"], host["CpuShares"]) == (1_000_000_000, 256)
+    assert (host["Memory"], host["MemorySwap"], host["PidsLimit"]) == (200 << 20, 200 << 20, 256)
+    given = {"needs": {"cpu": 2, "memory_mb": 200}, "limits": {"cpu": 2.5, "memory_mb": 300, "pids": 20}}
+    host = body(given)["HostConfig"]
+    assert (host["NanoCpus"], host["Memory"], host["PidsLimit"]) == (2_500_000_000, 300 << 20, 20)
+    assert body({"needs": {"cpu": 2}})["HostConfig"]["NanoCpus"] == 2_000_000_000
+
+
+@pytest.mark.parametrize("limits", [{"cpu": 0.5}, {"memory_mb": 100}])
+def test_a_limit_below_the_need_is_refused(limits: dict[str, float]) -> None:
+    with pytest.raises(ValidationError, match="less than needs"):
+        spec(needs={"cpu": 1, "memory_mb": 128}, limits=limits)
+
+
+def test_devices_and_gpus_are_handed_over() -> None:
+    host = body({"needs": {"gpu": 2, "devices": ["/dev/video0"]}}, gpus=(1, 3))["HostConfig"]
+    assert host["Devices"] == [
+        {"PathOnHost": "/dev/video0", "PathInContainer": "/dev/video0", "CgroupPermissions": "rw"}
+    ]
+    assert host["DeviceRequests"] == [{"Driver": "nvidia", "DeviceIDs": ["1", "3"], "Capabilities": [["gpu"]]}]
+    assert body()["HostConfig"]["DeviceRequests"] == []
+
+
+def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
+    assert KEY not in json.dumps(body())
+    folder, archive = grant_archive(launch())
+    assert folder == "/run/skytether"
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        entries = {entry.name: entry for entry in tar}
+        file = tar.extractfile("instance/grant.json")
+        assert file is not None
+        grant = Grant.model_validate_json(file.read())
+    assert grant.session_key == KEY
+    assert (grant.bind_host, grant.bind_port) == ("0.0.0.0", 7600)
+    assert {entry.uid for entry in entries.values()} == {65_532}
+    assert entries["instance/grant.json"].mode == 0o400
+    assert entries["instance"].mode == entries["data/i1"].mode == 0o700
+
+
+def test_published_and_advertised_addresses_are_two_things() -> None:
+    asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
+    bindings = container(launch(), asked, "me", "x", 7700, ())["HostConfig"]["PortBindings"]
+    assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
+    seen = observation(Seen("c", "i1", 1, "running", host_port=7700, ready=True), asked)
+    assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)
+
+
+@pytest.mark.parametrize(
+    ("given", "bound", "advertised"),
+    [
+        ({}, "127.0.0.1", "127.0.0.1"),
+        ({"bind_host": "192.0.2.1"}, "192.0.2.1", "192.0.2.1"),
+        ({"engine": "ssh://me@edge:2222"}, "0.0.0.0", "edge"),
+        ({"engine": "ssh://edge", "advertise_host": "192.0.2.7"}, "0.0.0.0", "192.0.2.7"),
+    ],
+)
+def test_where_robots_find_instances(given: dict[str, str], bound: str, advertised: str) -> None:
+    assert (options(**given).bound, options(**given).advertised) == (bound, advertised)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"engine": "http://edge"}, "engine must be"),
+        ({"engine": "unix://"}, "engine must be"),
+        ({"engine": "ssh://"}, "engine must be"),
+        ({"engine": "ssh://edge:port"}, "engine: "),
+        ({"engine": "ssh://-oProxyCommand=x"}, "may begin with '-'"),
+        ({"engine": "ssh://me:secret@edge"}, "no password"),
+        ({"engine": "tcp://edge"}, "engine must be"),
+        ({"engine": "tcp://edge:2375"}, "without it anyone is let in"),
+        ({"tls": {"ca": "a", "cert": "b", "key": "c"}}, "tls"),
+        ({"bind_host": "0.0.0.0"}, "advertise_host is needed"),
+        ({"ports": [7700, 7600]}, "the first is above the last"),
+        ({"ports": [0, 7600]}, "greater than or equal to 1"),
+        ({"engin": "unix:///x"}, "Extra inputs"),
+        ({"pull": "sometimes"}, "'missing', 'always' or 'never'"),
+    ],
+)
+def test_wrong_options_are_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        options(**given)
+
+
+def test_what_a_site_can_never_run() -> None:
+    assert "no image" in str(refusal(ServiceSpec(entrypoint="x"), options()))
+    assert "digest" in str(refusal(spec(image="x:1"), options(pinned=True)))
+    assert refusal(spec(image=f"x@sha256:{'0' * 64}"), options(pinned=True)) is None
+    needing = spec(needs={"devices": ["/dev/a", "/dev/b"]})
+    assert "/dev/b" in str(refusal(needing, options(devices=["/dev/a"])))
+    assert refusal(needing, options(devices=["/dev/a", "/dev/b"])) is None
+
+
+def test_gpus_are_given_out_once() -> None:
+    assert free_gpus(0, 0, []) == ()
+    assert free_gpus(2, 4, [0, 2]) == (1, 3)
+    assert free_gpus(2, 2, [1]) is None
+
+
+def test_the_port_of_the_run_before_then_the_first_free_one() -> None:
+    assert free_port(None, None, []) is None
+    assert free_port(None, 40_000, []) == 40_000
+    assert free_port(None, 40_000, [40_000]) is None
+    assert free_port((7600, 7602), None, [7600]) == 7601
+    assert free_port((7600, 7602), 7602, [7600]) == 7602
+    assert free_port((7600, 7602), 9999, []) == 7600
+    with pytest.raises(StopIteration):
+        free_port((7600, 7601), None, [7600, 7601])
+
+
+def described(**state: Any) -> dict[str, Any]:
+    """An engine's description of a container, as far as it is read."""
+    return {
+        "Id": "c1",
+        "Config": {"Labels": {"skytether.io/instance": "i1", "skytether.io/attempt": "3", "skytether.io/gpus": "0,2"}},
+        "HostConfig": {"Memory": 64 << 20},
+        "NetworkSettings": {"Ports": {"7600/udp": [{"HostIp": "127.0.0.1", "HostPort": "40123"}]}},
+        "State": {"Status": "running", "ExitCode": 0, "OOMKilled": False, **state},
+    }
+
+
+def test_a_container_is_known_by_its_labels() -> None:
+    seen = parse(described())
+    assert seen == Seen("c1", "i1", 3, "running", memory_limit=64 << 20, host_port=40_123, gpus=frozenset({0, 2}))
+    foreign = described()
+    foreign["Config"]["Labels"] = None
+    assert parse(foreign) is None
+
+
+@pytest.mark.parametrize(
+    ("state", "status", "detail"),
+    [
+        ({"ExitCode": 1}, 1, ""),
+        ({"ExitCode": 137}, -9, ""),
+        ({"ExitCode": 143}, -15, ""),
+        ({"ExitCode": 137, "OOMKilled": True}, -9, "ran out of memory: its limit is 64 MiB"),
+        ({"ExitCode": 0, "OOMKilled": True}, 0, ""),  # a child's death that the service lived with
+    ],
+)
+def test_ends_are_told_apart(state: dict[str, Any], status: int, detail: str) -> None:
+    seen = parse(described(Status="exited", **state))
+    assert seen is not None
+    ended = observation(seen, options())
+    assert (ended.phase, ended.exit_status) == (Phase.EXITED, status)
+    assert ended.detail.startswith(detail)
+    assert bool(ended.detail) == bool(detail)
+
+
+def test_a_failed_health_check_is_told_in_its_own_words() -> None:
+    log = [{"Output": "fine\n"}, {"Output": "the service's loop has hung for 12 s\n"}]
+    seen = parse(described(Health={"Status": "unhealthy", "Log": log}))
+    assert seen is not None
+    assert seen.ill == "the service's loop has hung for 12 s"
+    for status in ("starting", "healthy"):
+        well = parse(described(Health={"Status": status, "Log": log}))
+        assert well is not None
+        assert well.ill == ""
+
+
+def tar_of(content: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        entry = tarfile.TarInfo("ready.json")
+        entry.size = len(content)
+        tar.addfile(entry, io.BytesIO(content))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("archive", "port"),
+    [
+        (tar_of(b'{"port": 7600, "pid": 7}'), 7600),
+        (tar_of(b'{"port": "7600"}'), None),
+        (tar_of(b'{"port": 70000}'), None),
+        (tar_of(b"[7600]"), None),
+        (tar_of(b'{"port"'), None),
+        (tar_of(b"[" * 100_000), None),
+        (b"no tar", None),
+        (b"", None),
+    ],
+)
+def test_a_service_may_write_anything_into_its_ready_file(archive: bytes, port: int | None) -> None:
+    assert ready_port(archive) == port
+
+
+def test_the_last_line_that_can_be_read() -> None:
+    assert last_line("a\nboom\x1b\x07\n \n\x00\n") == "boom"
+    assert last_line("x" * 400) == "x" * 300
+    assert last_line("") == ""
+
+
+def test_a_pull_tells_how_far_it_is() -> None:
+    progress = Progress("x:1")
+    said = [
+        progress.text(message)
+        for message in (
+            {"status": "Pulling from x", "id": "1"},
+            {"status": "Downloading", "id": "a", "progressDetail": {"current": 5_000_000, "total": 10_000_000}},
+            {"status": "Downloading", "id": "b", "progressDetail": {"current": 1_000_000, "total": 30_000_000}},
+            {"status": "Download complete", "id": "a"},
+            {"status": "Pull complete", "id": "b"},
+        )
+    ]
+    assert said == [
+        "pulling x:1",
+        "pulling x:1: 5 of 10 MB",
+        "pulling x:1: 6 of 40 MB",
+        "pulling x:1: 11 of 40 MB",
+        "unpacking x:1",
+    ]
+
+
+def test_credentials_must_be_private(tmp_path: Path) -> None:
+    file = tmp_path / "config.json"
+    with pytest.raises(RuntimeFailure, match="No such file"):
+        check_credentials(str(file))
+    file.write_text("{")
+    with pytest.raises(RuntimeFailure, match="no JSON"):
+        check_credentials(str(file))
+    file.write_text('{"auths": []}')
+    file.chmod(0o600)
+    with pytest.raises(RuntimeFailure, match="no 'auths'"):
+        check_credentials(str(file))
+    file.write_text('{"auths": {}}')
+    check_credentials(str(file))
+    file.chmod(0o644)
+    with pytest.raises(RuntimeFailure, match="chmod 600"):
+        check_credentials(str(file))
+
+
+def test_the_filter_is_of_one_network() -> None:
+    assert len(bridge_of("n" * 200)) <= 15
+    assert bridge_of("a") != bridge_of("b")
+    for hook in ("input", "forward"):
+        assert f'{hook} iifname "{bridge_of("a")}" drop' in rules("a")
+
+
+def test_the_ssh_client_asks_nobody() -> None:
+    given = options(engine="ssh://me@edge:2222/run/docker.sock", ssh={"identity": "/keys/id", "known_hosts": "/k"})
+    command = Tunnel(given).command(Path("/tmp/x/engine.sock"))
+    assert command[-4:] == ["-L", "/tmp/x/engine.sock:/run/docker.sock", "me@edge", "cat"]
+    assert "BatchMode=yes" in command
+    assert command[command.index("-p") + 1] == "2222"
+    assert Tunnel(options(engine="ssh://edge")).command(Path("s"))[-3] == "s:/var/run/docker.sock"
+
+
+def test_an_error_is_told_by_its_root() -> None:
+    outer = ValueError("Connection aborted", FileNotFoundError(2, "No such file or directory"))
+    assert root_cause(outer) == "No such file or directory"
+    assert root_cause(TimeoutError("x")) == "timed out"
+
+
+LOCK = """\
+numpy==2.4.6 ; python_full_version < '3.12' \\
+    --hash=sha256:aa
+    # via
+    #   skytether (pyproject.toml)
+    #   rosbags
+numpy==2.5.5 ; python_full_version >= '3.12' \\
+    --hash=sha256:bb
+    # via rosbags
+rosbags==0.11 \\
+    --hash=sha256:cc
+    # via skytether (pyproject.toml)
+mypy==2.4 \\
+    --hash=sha256:dd
+    # via skytether (pyproject.toml)
+"""
+
+
+def test_an_image_gets_what_the_lock_file_pins_for_it() -> None:
+    found = importlib.util.spec_from_file_location("images_build", ROOT / "images" / "build.py")
+    assert found is not None
+    assert found.loader is not None
+    build = importlib.util.module_from_spec(found)
+    sys.modules["images_build"] = build  # dataclasses look their module up
+    try:
+        found.loader.exec_module(build)
+    finally:
+        del sys.modules["images_build"]
+    old = build.locked(LOCK, {"python_full_version": "3.11.2"})
+    assert old["numpy"][0] == "numpy==2.4.6 \\\n    --hash=sha256:aa"
+    assert "rosbags" in old["numpy"][1]
+    assert build.closure({"rosbags"}, old) == {"rosbags", "numpy"}
+    rows = build.requirements((), "x86_64")
+    assert "numpy" in rows
+    assert "fastapi" not in rows
+    assert "mypy" not in rows
+    assert "fastapi" in build.requirements(("orchestrator",), "x86_64")
+    assert build.order(["recorder"]) == ["base", "recorder"]
+    with pytest.raises(build.BuildError, match="there is no image 'x'"):
+        build.order(["x"])
+
+
+def test_every_service_with_an_image_has_its_dockerfile() -> None:
+    for path in (ROOT / "services").glob("*/*/service.yaml"):
+        image = yaml.safe_load(path.read_text())["spec"]["image"]
+        name = image.removeprefix("skytether/").removesuffix(":1")
+        assert (ROOT / "images" / name / "Dockerfile").is_file(), image

@@ -1,0 +1,81 @@
+"""The images and sites of the tests with a real Docker engine."""
+
+from __future__ import annotations
+
+import secrets
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
+from skytether.orchestrator.runtimes.docker.network import bridge_of
+
+
+@dataclass(frozen=True)
+class Images:
+    """The images of one run of the tests, removed at its end."""
+
+    prefix: str
+    rows: list[dict[str, object]]
+    """What ``images/build.py --json`` told of them."""
+
+    @property
+    def toy(self) -> str:
+        """Runs ``skytether.testing.toy_service``."""
+        return f"{self.prefix}toy:1"
+
+    def name(self, image: str) -> str:
+        return f"{self.prefix}{image}:1"
+
+
+TOY = """\
+ARG BASE
+FROM ${BASE}
+ENTRYPOINT ["/app/bin/python", "-P", "-m", "skytether.testing.toy_service"]
+"""
+
+
+class DockerSite:
+    """Docker sites of the tests: with a network of their own, and nothing left of them at the end."""
+
+    def __init__(self, images: Images) -> None:
+        self.images = images
+        self.network = f"skytether-test-{secrets.token_hex(4)}"
+        self.owner = f"test-{secrets.token_hex(4)}"
+
+    def options(self, **changes: object) -> dict[str, object]:
+        """The site's options, as over REST."""
+        guard = self.images.name("guard")
+        return {"network": self.network, "guard_image": guard, "owner": self.owner, "pull": "never"} | changes
+
+    def open(self, folder: Path, **changes: object) -> DockerRuntime:
+        return DockerRuntime("edge", folder, DockerOptions.model_validate(self.options(**changes)))
+
+    def containers(self) -> list[str]:
+        """Ids of all that are this site's, ended ones too."""
+        filtered = f"label=skytether.io/owner={self.owner}"
+        listed = subprocess.run(
+            ["docker", "ps", "-aq", "--no-trunc", "--filter", filtered], capture_output=True, text=True
+        )
+        return listed.stdout.split()
+
+    def volumes(self) -> list[str]:
+        """Names of the volumes that hold what the services wrote."""
+        filtered = f"name=skytether-{self.owner}-data-"
+        listed = subprocess.run(["docker", "volume", "ls", "-q", "--filter", filtered], capture_output=True, text=True)
+        return listed.stdout.split()
+
+    def clean(self) -> None:
+        """Remove containers and data."""
+        for kind, names in (("container", self.containers()), ("volume", self.volumes())):
+            if names:
+                flags = ["-f", "-v"] if kind == "container" else ["-f"]
+                subprocess.run(["docker", kind, "rm", *flags, *names], capture_output=True)
+
+    def close(self) -> None:
+        """Remove the network and its filter too."""
+        self.clean()
+        subprocess.run(["docker", "network", "rm", self.network], capture_output=True)
+        table = f"skytether_{bridge_of(self.network)[4:]}"
+        command = ["docker", "run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", self.images.name("guard")]
+        subprocess.run([*command, f"delete table inet {table}"], capture_output=True)
