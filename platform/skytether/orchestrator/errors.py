@@ -51,6 +51,10 @@ class UnauthenticatedError(DomainError):
     """No token, or one that nobody was given."""
 
 
+class SilentSiteError(DomainError):
+    """What was asked for is at a site that does not answer now."""
+
+
 class TooManyError(DomainError):
     """More requests than one caller may make."""
 

@@ -13,10 +13,11 @@ from skytether.api.rest import Instance, InstanceCreate, Placement, Refusal, Ren
 
 from .access import Principal
 from .catalogue import Catalogue
-from .errors import Fault, InvalidError, NoSiteError, NotFoundError
+from .errors import Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from .metrics import Metrics
 from .reconcile import Reconciler, told
 from .records import Record
+from .runtimes.base import RuntimeFailure
 from .security import Secrets
 from .sites import Sites
 from .store import KeyReusedError, Store
@@ -155,9 +156,17 @@ class Instances:
                 pass
 
     def logs(self, principal: Principal, instance: str, lines: int) -> str:
-        """The last lines of an instance's log; empty before it has a site."""
+        """The last lines of an instance's log; empty before it has a site.
+
+        Raises:
+            NotFoundError: As for ``get``.
+            SilentSiteError: Its site does not answer.
+        """
         site = self._sites.find(self.get(principal, instance).site)
-        return site.runtime.logs(instance, lines) if site else ""
+        try:
+            return site.runtime.logs(instance, lines) if site else ""
+        except RuntimeFailure as error:
+            raise SilentSiteError(str(error)) from error
 
     def show(self, record: Record, *, with_session: bool = True) -> Instance:
         """As REST tells it."""

@@ -23,6 +23,7 @@ from .errors import (
     InvalidError,
     NoSiteError,
     NotFoundError,
+    SilentSiteError,
     TooManyError,
     UnauthenticatedError,
 )
@@ -39,6 +40,7 @@ STATUS: dict[type[DomainError], tuple[int, str]] = {
     NoSiteError: (409, "No site fits"),
     ConflictError: (409, "Not possible now"),
     InvalidError: (422, "Invalid input"),
+    SilentSiteError: (503, "Not possible now"),
 }
 """Status and title of each kind of error."""
 _HTTP = {

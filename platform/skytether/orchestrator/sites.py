@@ -199,6 +199,8 @@ class Sites:
                 raise ConflictError(
                     f"there is a site '{asked.name}' already: choose another name, or delete that first"
                 )
+            options = self._find_runtime(asked.runtime).completed(asked.options)
+            asked = asked.model_copy(update={"options": options})
             runtime = self._make_runtime(asked)
             if not self._store.add_site(asked):  # by way of another orchestrator
                 runtime.close()

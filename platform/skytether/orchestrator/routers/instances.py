@@ -68,7 +68,7 @@ def renew(core: Core, caller: Actor, instance: str, asked: Renew) -> Instance:
     return core.instances.show(core.instances.renew(caller, instance, asked))
 
 
-@router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404))
+@router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404, 503))
 def logs(core: Core, caller: Caller, instance: str, tail: Annotated[int, Query(ge=1)] = 200) -> str:
     """The last lines that the instance wrote, over all its runs."""
     return core.instances.logs(caller, instance, min(tail, core.settings.limits.log_lines))

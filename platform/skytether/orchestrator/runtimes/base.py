@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec, Strict
@@ -84,6 +84,10 @@ class Capacity:
     """As container images name it, ``amd64`` or ``arm64``; empty: not known."""
 
 
+ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
+"""Names of container images for what the kernel says."""
+
+
 class RuntimeFailure(Exception):  # noqa: N818 (not an error of ours)
     """The site did not do what it was asked, or does not answer; one sentence saying what to do."""
 
@@ -106,6 +110,11 @@ class Runtime(ABC):
         Raises:
             RuntimeFailure: It can never work with these options.
         """
+
+    @classmethod
+    def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
+        """The options of a new site, with what is made up once and has to stay as it is wherever the site is opened."""
+        return options
 
     @abstractmethod
     def refuses(self, spec: ServiceSpec) -> str | None:

@@ -30,15 +30,13 @@ from typing_extensions import override
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
-from .base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from .base import ARCHITECTURES, Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
 from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
 
 _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
-_ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
-"""Names of container images for what the kernel says."""
 _LAST_LINE = 300
 """Characters of a log's last line that are told."""
 
@@ -123,7 +121,7 @@ class ProcessRuntime(Runtime):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
         cpu = self._options.cpu or float(os.cpu_count() or 1)
         machine = platform.machine()
-        return Capacity(cpu, self._options.memory_mb or memory, architecture=_ARCHITECTURES.get(machine, machine))
+        return Capacity(cpu, self._options.memory_mb or memory, architecture=ARCHITECTURES.get(machine, machine))
 
     @override
     def load(self) -> float | None:

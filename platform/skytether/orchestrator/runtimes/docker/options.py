@@ -69,9 +69,8 @@ class DockerOptions(Strict):
     """Runs once to close the network off."""
     environment: dict[str, str] = {}
     """More variables for the services. No secrets: whoever may ask the engine sees them."""
-    owner: str | None = None
-    """Under this name containers are found again; None: one made up at first use and kept in the state folder. Needed
-    where several orchestrators share one database."""
+    owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
+    """Under this name containers are found again; None: one is made up when the site is added."""
     timeout_s: Annotated[float, Field(gt=0, le=300)] = 10.0
     """An engine that has not answered for this long is unreachable."""
 

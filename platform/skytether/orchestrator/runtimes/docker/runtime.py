@@ -7,13 +7,14 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from docker.errors import NotFound
 from typing_extensions import override
 
 from skytether.api.manifest import ServiceSpec, Strict
 
-from ..base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from ..base import ARCHITECTURES, Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
 from .engine import Engine
 from .follow import Follower
 from .images import check_credentials
@@ -53,6 +54,11 @@ class DockerRuntime(Runtime):
         self._follower = Follower(self._engine, self._owner, self._on_connect)
         self._follower.start()
 
+    @override
+    @classmethod
+    def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return {"owner": secrets.token_hex(6), **options}
+
     def _on_connect(self) -> None:
         self._network_ready = False  # the engine's machine may have been started anew, without our filter
         threading.Thread(target=self._prepare_early, name="docker-network", daemon=True).start()
@@ -73,7 +79,9 @@ class DockerRuntime(Runtime):
     def capacity(self) -> Capacity:
         info, options = self._follower.info(self._options.timeout_s), self._options
         cpu = options.cpu or float(info["NCPU"])
-        return Capacity(cpu, options.memory_mb or int(info["MemTotal"]) >> 20, options.gpu)
+        machine = str(info.get("Architecture", ""))
+        memory = options.memory_mb or int(info["MemTotal"]) >> 20
+        return Capacity(cpu, memory, options.gpu, ARCHITECTURES.get(machine, machine))
 
     def start(self, launch: Launch) -> None:
         self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
@@ -157,7 +165,7 @@ class DockerRuntime(Runtime):
 
 
 def _kept_owner(folder: Path) -> str:
-    """Made up at first use."""
+    """For a site whose options name none: made up at first use."""
     path = folder / "owner"
     if not path.exists():
         path.write_text(secrets.token_hex(6))
