@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 from collections.abc import Callable, Iterator
@@ -178,6 +179,13 @@ def shared_server() -> Iterator[Server]:
 @pytest.fixture
 def served(tmp_path: Path, server: Server) -> Iterator[Served]:
     yield from served_in(tmp_path, server)
+
+
+@pytest.fixture
+def served_with(tmp_path: Path, server: Server) -> Iterator[Callable[..., Served]]:
+    """The same with other settings."""
+    with contextlib.ExitStack() as stack:
+        yield lambda **settings: stack.enter_context(contextlib.contextmanager(served_in)(tmp_path, server, **settings))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 
 from skytether.api.rest import SiteCreate, State
+from skytether.orchestrator.catalogue import Catalogue
 from skytether.orchestrator.metrics import Metrics
+from skytether.orchestrator.moves import Moves
 from skytether.orchestrator.reconcile import Reconciler
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Phase
@@ -72,7 +74,9 @@ class Bench:
     def _site(self) -> Site:
         asked = SiteCreate(name="lab", tier="edge", runtime="fake")
         site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
-        self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
+        sites = self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
+        weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
+        self.reconciler.moves = Moves(self.store, catalogue, lambda: sites, weigh, self.clock, Timing(), Weights())
         return site
 
     def _wake(self) -> None:

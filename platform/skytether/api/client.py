@@ -19,6 +19,7 @@ from .rest import (
     Instance,
     InstanceCreate,
     InstanceEvent,
+    Migrate,
     Problem,
     Renew,
     Robot,
@@ -123,6 +124,10 @@ class Client:
     def renew_instance(self, instance_id: str, renew: Renew | None = None) -> Instance:
         """Keep the lease. What has ended is not revived: look at the state."""
         return self._one(Instance, "POST", f"/instances/{instance_id}/renew", renew or Renew())
+
+    def migrate_instance(self, instance_id: str, site: str | None = None) -> Instance:
+        """Move it; the answer is the instance that its robot changes to."""
+        return self._one(Instance, "POST", f"/instances/{instance_id}/migrate", Migrate(site=site))
 
     def delete_instance(self, instance_id: str) -> None:
         """End it; may be called again."""

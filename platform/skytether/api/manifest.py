@@ -153,6 +153,9 @@ class Needs(Strict):
     """Above this the robot's fallback takes over; None: any."""
     max_loss: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of messages; above this the robot's fallback takes over; None: any."""
+    standby: Annotated[int, Field(ge=0, le=100)] = 0
+    """Instances that are kept running for nobody, with the parameters that were asked for last: a request that has
+    the same ones gets one of them at once, and so does a robot whose instance fails."""
     tiers: Annotated[tuple[Tier, ...], Field(min_length=1)] = ("robot", "edge", "cloud")
 
 

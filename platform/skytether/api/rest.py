@@ -116,6 +116,10 @@ class Instance(Strict):
     """One sentence a person can act on; empty while all is well."""
     params: dict[str, Any] = {}
     placement: Placement | None = None
+    replaces: str | None = None
+    """The instance that its robot is to let go as soon as this one runs."""
+    successor: str | None = None
+    """The instance that this one's robot is to change to as soon as that runs."""
     session: Session | None = None
     """None for a token that may not see it."""
     restarts: int = 0
@@ -166,8 +170,18 @@ class Report(Strict):
     """Counted by bounded reason."""
 
 
+class Migrate(Strict):
+    """Move an instance: another one is started, and its robot changes to that once it runs."""
+
+    site: Name | None = None
+    """Where to; None: the best of the other sites."""
+
+
 class Renew(Strict):
     """Keep the lease; optionally report."""
+
+    measurements: dict[Name, Measurement] = {}
+    """By site; what was measured since, instead of what was told before."""
 
     lease_s: Annotated[float, Field(ge=1, le=86_400)] | None = None
     report: Report | None = None

@@ -163,7 +163,15 @@ def list_instances(url: Url = None, token_file: TokenFile = None, json: Json = F
         print_json([plain(instance) for instance in found])
         return
     rows = [
-        (i.id, i.robot, i.service, i.state, or_dash(i.placement and i.placement.site), i.restarts, i.reason)
+        (
+            i.id,
+            i.robot or "(standby)",
+            i.service,
+            i.state,
+            or_dash(i.placement and i.placement.site),
+            i.restarts,
+            i.reason,
+        )
         for i in found
     ]
     print_table(("instance", "robot", "service", "state", "site", "restarts", "reason"), rows)
@@ -224,6 +232,22 @@ def show_logs(
         print_json({"instance": instance, "lines": text.splitlines()})
     else:
         typer.echo(text, nl=False)
+
+
+@instance_app.command("migrate")
+def migrate_instance(
+    instance: str,
+    site: Annotated[str | None, typer.Option(help="Where to; without it the best of the other sites.")] = None,
+    wait: Annotated[bool, typer.Option(help="Wait until the new one runs.")] = True,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Move an instance: another one is started, its robot changes to that, and lets this one go."""
+    with connected(url, token_file) as client:
+        made = client.migrate_instance(instance, site)
+        made = client.wait_running(made.id) if wait else made
+    _show(made, json)
 
 
 @instance_app.command("events")

@@ -15,6 +15,7 @@ from .instances import Instances
 from .leader import Leadership
 from .loops import Loop
 from .metrics import Metrics, Running, SiteGauges
+from .moves import Moves
 from .reconcile import Reconciler
 from .runtimes.base import Runtime
 from .security import SecretFileError, Secrets
@@ -76,10 +77,28 @@ class Orchestrator:
             settings.state_dir / "sites", self.store, self.reconciler.site_step, settings.timing, find_runtime
         )
         self.reconciler.sites = self.sites
+        moves = Moves(
+            self.store,
+            self.catalogue,
+            lambda: self.sites,
+            self.reconciler.weigh,
+            clock,
+            settings.timing,
+            settings.weights,
+        )
+        self.reconciler.moves = moves
         self.placer = Loop("placer", self.reconciler.place_step, time.monotonic)
         self.elector = Loop("elector", self.leadership.step, time.monotonic)
         self.instances = Instances(
-            self.store, self.catalogue, self.sites, self.reconciler, self.metrics, secrets, clock, self._wake_placer
+            self.store,
+            self.catalogue,
+            self.sites,
+            self.reconciler,
+            moves,
+            self.metrics,
+            secrets,
+            clock,
+            self._wake_placer,
         )
 
     def _wake_placer(self) -> None:

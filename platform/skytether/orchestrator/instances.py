@@ -5,18 +5,19 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import secrets
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from skytether.api.rest import Instance, InstanceCreate, Placement, Refusal, Renew, Score, Session, State
+from skytether.api.rest import Instance, InstanceCreate, Migrate, Placement, Refusal, Renew, Score, Session, State
 
 from .access import Principal
 from .catalogue import Catalogue
-from .errors import Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
+from .errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from .metrics import Metrics
+from .moves import Moves
+from .placement import Decision
 from .reconcile import Reconciler, told
-from .records import Record
+from .records import Record, new_record
 from .runtimes.base import RuntimeFailure
 from .security import Secrets
 from .sites import Sites
@@ -38,6 +39,7 @@ class Instances:
         catalogue: Catalogue,
         sites: Sites,
         reconciler: Reconciler,
+        moves: Moves,
         metrics: Metrics,
         secrets_: Secrets,
         clock: Callable[[], float],
@@ -47,6 +49,7 @@ class Instances:
         self._catalogue = catalogue
         self._sites = sites
         self._reconciler = reconciler
+        self._moves = moves
         self._metrics = metrics
         self._secrets = secrets_
         self._clock = clock
@@ -66,7 +69,12 @@ class Instances:
         digest = hashlib.sha256(body).hexdigest()
         try:
             earlier = self._store.made_with(principal.owner, key, digest) if key else None
-            return earlier or self._store.add(self._new(asked), principal.owner, key, digest)
+            if earlier is not None:
+                return earlier
+            record = self._new(asked)
+            return self._claim(record, principal.owner, key, digest) or self._store.add(
+                record, principal.owner, key, digest
+            )
         except KeyReusedError:
             fault = Fault("Idempotency-Key", "came before with another body: use a new key for a new request")
             raise InvalidError([fault]) from None
@@ -77,11 +85,9 @@ class Instances:
         manifest = self._catalogue.get(asked.service)
         check_params(asked.params, manifest.spec.params, asked.service)
         now = self._clock()
-        record = Record(
-            id=secrets.token_hex(8),
+        record = new_record(
             robot=asked.robot,
             service=asked.service,
-            session_id=secrets.token_hex(8),
             manifest=manifest.model_dump(mode="json", by_alias=True),
             created_at=now,
             updated_at=now,
@@ -92,10 +98,56 @@ class Instances:
         )
         decision = self._reconciler.weigh(record)
         if decision.hopeless:
-            self._metrics.refused(record.service, decision.refused)
-            text = f"no site can run '{record.service}': {told(decision.refused)}"
-            raise NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
+            raise self._no_site(record, decision)
         return record
+
+    def _no_site(self, record: Record, decision: Decision) -> NoSiteError:
+        self._metrics.refused(record.service, decision.refused)
+        text = f"no site can run '{record.service}': {told(decision.refused)}"
+        return NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
+
+    def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:
+        """A warm instance instead of a new one, if there is one that fits."""
+        for spare in self._moves.spares_for(record):
+            robot = {"robot": record.robot, "measurements": record.measurements, "created_at": record.created_at}
+            lease = {"lease_s": record.lease_s, "lease_expires_at": record.lease_expires_at}
+            claimed = self._store.claim(spare, {**robot, **lease}, self._clock(), owner, key, digest)
+            if claimed is not None:
+                self._metrics.phase(claimed, "total", self._clock() - record.created_at)
+                return claimed
+        return None
+
+    def migrate(self, principal: Principal, instance: str, asked: Migrate) -> Record:
+        """Start another instance for the same robot elsewhere; the robot changes to it, and lets this one go.
+
+        One that is being moved already is not moved twice: the instance that is coming is given back.
+
+        Raises:
+            NotFoundError: No such instance, or no such site.
+            ConflictError: It has ended or ends, is nobody's, or is at that site already.
+            NoSiteError: No other site can take it now; nothing was started.
+        """
+        record = self.get(principal, instance)
+        if record.state.final or record.state is State.STOPPING:
+            raise ConflictError(f"instance '{instance}' is {record.state}: ask for a new one")
+        if record.spare:
+            raise ConflictError(
+                f"instance '{instance}' is a standby, which nobody uses: delete it, and another is made"
+            )
+        coming = self._store.successor(instance)
+        if coming is not None:
+            return coming
+        if asked.site is not None:
+            self._sites.get(asked.site)
+            if asked.site == record.site:
+                raise ConflictError(f"instance '{instance}' is at site '{asked.site}' already")
+        successor = self._moves.successor_of(record, asked.site)
+        decision = self._reconciler.weigh(successor)
+        if decision.site is None:
+            raise self._no_site(successor, decision)
+        added = self._store.add(successor, principal.owner, None, "")
+        self._wake_placer()
+        return added
 
     def get(self, principal: Principal, instance: str) -> Record:
         """One instance.
@@ -119,7 +171,8 @@ class Instances:
             NotFoundError: As for ``get``.
         """
         seen = self.get(principal, instance)
-        renewed = self._store.renew(instance, self._clock(), renew.lease_s)
+        measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
+        renewed = self._store.renew(instance, self._clock(), renew.lease_s, {**seen.measurements, **measured})
         if renewed is None:
             return self._store.get(instance) or seen
         if renew.report is not None:
@@ -181,6 +234,8 @@ class Instances:
             params=record.params,
             placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
             session=self._session(record) if with_session else None,
+            replaces=record.replaces,
+            successor=successor.id if with_session and (successor := self._store.successor(record.id)) else None,
             restarts=record.restarts,
             created_at=utc(record.created_at),
             updated_at=utc(record.updated_at),

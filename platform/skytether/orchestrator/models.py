@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
-from sqlalchemy import JSON, BigInteger, Column, Enum, Float, ForeignKey, Index, Integer, MetaData, String, Table
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    Enum,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    false,
+)
 
 from skytether.api.rest import State
 
@@ -93,6 +107,9 @@ instances = Table(
     Column("started_at", Float),
     Column("running_at", Float),
     Column("stopping_at", Float),
+    Column("replaces", String(32), index=True),
+    Column("pinned", String(63)),
+    Column("spare", Boolean, nullable=False, server_default=false()),
     Column("version", Integer, nullable=False),
 )
 

@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable, Sequence
 
 from skytether.api.grant import Grant
-from skytether.api.rest import Measurement, Refusal, State
+from skytether.api.rest import Measurement, Refusal, Report, State
 
 from .db import GONE
 from .metrics import Metrics
+from .moves import Moves
 from .placement import NOTHING, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
@@ -25,6 +26,8 @@ log = logging.getLogger(__name__)
 
 _TIDY = 1.0
 """Seconds between two calls of a runtime's ``tidy``."""
+_SPARE_IDLE = 86_400.0
+"""Seconds that a standby waits for a robot before it ends by itself, should the orchestrator be gone for good."""
 _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
 
@@ -32,10 +35,11 @@ _PRUNE = 60.0
 class Reconciler:
     """Makes what is what should be, while this orchestrator leads; otherwise it looks only.
 
-    ``sites`` is set before the first pass: each needs the other.
+    ``sites`` and ``moves`` are set before the first pass: each needs the other.
     """
 
     sites: Sites
+    moves: Moves
 
     def __init__(
         self,
@@ -102,19 +106,30 @@ class Reconciler:
                     placed.append(chosen)
             elif isinstance(action, Expire):
                 self._expire(action.record)
+        self.moves.keep_spares(live)
+        reports = {instance: Report.model_validate(report) for instance, report in self._store.reports().items()}
+        self.moves.watch(live, reports)
         if now - self._pruned_at >= _PRUNE:
             self._pruned_at = now
             self._prune(now)
         return self._timing.place
 
     def weigh(self, record: Record, placed: Sequence[Record] | None = None) -> Decision:
-        """Where it would run now; looks only."""
+        """Where it would run now, beside what is placed; looks only."""
         others = self._store.live() if placed is None else placed
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
         used = _used(others)
-        sites = [site.candidate(record.spec, used.get(site.name, NOTHING)) for site in self.sites.all()]
+        allowed = [site for site in self.sites.all() if self._allows(record, site)]
+        sites = [site.candidate(record.spec, used.get(site.name, NOTHING)) for site in allowed]
         spec = record.spec
         return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
+
+    def _allows(self, record: Record, site: Site) -> bool:
+        """One that replaces another does not go where that is, unless it was told to."""
+        if record.pinned is not None:
+            return site.name == record.pinned
+        replaced = self._store.get(record.replaces) if record.replaces else None
+        return replaced is None or site.name != replaced.site
 
     def _place(self, record: Record, placed: Sequence[Record]) -> Record | None:
         decision = self.weigh(record, placed)
@@ -223,7 +238,8 @@ class Reconciler:
         grant = Grant(
             instance=record.id,
             service=record.service,
-            robot=record.robot,
+            robot=record.robot or "standby",
+            idle_exit_s=_SPARE_IDLE if record.spare else Grant.model_fields["idle_exit_s"].default,
             params=record.params,
             session_id=record.session_id,
             session_key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
@@ -248,8 +264,11 @@ class Reconciler:
         if after is None:
             return
         log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
+        self.moves.fail_over(after, after.reason)
         if after.state.final:
             site.runtime.stop(after.id, force=True)
+            if after.spare:
+                self.moves.spare_failed(after)
             self._wake_placer()
 
     def _expire(self, record: Record) -> None:

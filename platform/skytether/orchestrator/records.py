@@ -5,6 +5,7 @@ Wall-clock, not monotonic: leases and back-off must mean the same after a restar
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -76,9 +77,20 @@ class Record:
     running_at: float | None = None
     """When the present run was ready."""
     stopping_at: float | None = None
+    replaces: str | None = None
+    """The instance whose robot is to change to this one as soon as it runs."""
+    pinned: str | None = None
+    """The one site where it may run; None: any but that of the one it replaces."""
+    spare: bool = False
+    """Warm, and nobody's yet: it has no robot and no lease."""
     version: int = 1
     """Counts changes: who changes a record must have seen the last one."""
 
     @property
     def spec(self) -> ServiceSpec:
         return Manifest.model_validate(self.manifest).spec
+
+
+def new_record(**values: Any) -> Record:
+    """One with an id and a session of its own, which nobody can guess."""
+    return Record(id=secrets.token_hex(8), session_id=secrets.token_hex(8), **values)

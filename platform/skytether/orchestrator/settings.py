@@ -49,6 +49,12 @@ class Timing(Group):
     """The longest wait before a restart."""
     site_silent: Seconds = 10.0
     """A site whose runtime has not answered for this long is unreachable."""
+    replace_after: Seconds = 10.0
+    """A robot that has driven by itself for this long gets its service moved, if another site would be better."""
+    replace_pause: Seconds = 60.0
+    """An instance runs for at least this long before it is moved so."""
+    spare_lease: Seconds = 15.0
+    """Lease of a standby when it is given to a robot that names none."""
     lock_up: Seconds = 30.0
     """A reconcile loop without a pass for this long makes the orchestrator not ready."""
 
@@ -60,6 +66,8 @@ class Weights(Group):
     """Delay that one unit of a site's `cost` is worth."""
     spread_ms: Weight = 2.0
     """Delay that an empty site is worth beside a full one: a few milliseconds, so that near sites fill evenly."""
+    migrate_ms: Weight = 20.0
+    """By how much another site must be better before a warm instance is left aside, or a running one is moved."""
     unmeasured_ms: Weight = 200.0
     """Round trip reckoned for a site that was not measured, when the service names no `max_rtt_ms`."""
 

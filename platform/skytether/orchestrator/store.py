@@ -189,11 +189,46 @@ class Store:
             self.on_change(new.id)
         return new
 
-    def renew(self, instance: str, now: float, lease_s: float | None) -> Record | None:
+    def claim(
+        self, spare: Record, changes: dict[str, Any], now: float, owner: str, key: str | None, body_sha256: str
+    ) -> Record | None:
+        """Give a spare to a robot; None if another request was quicker."""
+        new = dataclasses.replace(spare, version=spare.version + 1, updated_at=now, spare=False, **changes)
+        seen = (instances.c.id == spare.id) & (instances.c.version == spare.version)
+        try:
+            with self._writer.begin() as connection:
+                if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
+                    return None
+                if key is not None:
+                    row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": new.id}
+                    connection.execute(insert(idempotency).values(created_at=now, **row))
+                _add_event(connection, new)
+        except IntegrityError:
+            return None  # the same request came twice at once: the other one has it
+        self.on_change(new.id)
+        return new
+
+    def successor(self, instance: str) -> Record | None:
+        """The one that replaces an instance and has not ended."""
+        mine = (instances.c.replaces == instance) & instances.c.state.not_in([*_FINAL, State.STOPPING])
+        found = self._records(select(instances).where(mine).order_by(instances.c.created_at.desc()).limit(1))
+        return found[0] if found else None
+
+    def last_params(self, service: str) -> dict[str, Any] | None:
+        """What the last robot that asked for a service asked for; None: nobody did."""
+        newest = select(instances.c.params).where(instances.c.service == service, instances.c.spare.is_(False))
+        with self._engine.connect() as connection:
+            return connection.scalar(newest.order_by(instances.c.created_at.desc()).limit(1))
+
+    def renew(
+        self, instance: str, now: float, lease_s: float | None, measurements: dict[str, Any] | None = None
+    ) -> Record | None:
         """Keep an instance's lease; None if it has ended or ends."""
         alive = instances.c.state.not_in([*_FINAL, State.STOPPING])
         length = instances.c.lease_s if lease_s is None else lease_s
         statement = update(instances).where(instances.c.id == instance, alive)
+        if measurements is not None:
+            statement = statement.values(measurements=measurements)
         # The version counts up, so that whoever is about to end it for its old lease has to look again.
         statement = statement.values(lease_s=length, lease_expires_at=now + length, version=instances.c.version + 1)
         with self._writer.begin() as connection:

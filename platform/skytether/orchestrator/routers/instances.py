@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Header, Query
 from fastapi.responses import PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Renew
+from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew
 
 from ..core import Orchestrator
 from ..instances import utc
@@ -66,6 +66,12 @@ def delete(core: Core, caller: Actor, instance: str) -> None:
 def renew(core: Core, caller: Actor, instance: str, asked: Renew) -> Instance:
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
     return core.instances.show(core.instances.renew(caller, instance, asked))
+
+
+@router.post("/{instance}/migrate", status_code=201, responses=says(403, 404, 409, 422))
+def migrate(core: Core, caller: Actor, instance: str, asked: Migrate) -> Instance:
+    """Move an instance: another is started elsewhere; its robot changes to that once it runs, and lets this one go."""
+    return core.instances.show(core.instances.migrate(caller, instance, asked))
 
 
 @router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404, 503))

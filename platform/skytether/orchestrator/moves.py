@@ -1,0 +1,207 @@
+"""Instances beside instances: successors, to which a robot changes without a gap, and spares, which wait for a robot.
+
+Make before break: a successor is an instance of its own, for the same robot. The robot learns of it with its next
+renewal, brings a second session up, changes when that one commands, and lets the first go. Nothing here touches what
+runs, so whatever goes wrong with a successor costs the robot nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from skytether.api.manifest import Manifest
+from skytether.api.rest import Measurement, Report, State
+
+from .catalogue import Catalogue
+from .errors import InvalidError
+from .placement import Decision
+from .records import Record, new_record
+from .settings import Timing, Weights
+from .sites import Sites
+from .store import Store
+from .validation import check_params
+
+log = logging.getLogger(__name__)
+
+FOREVER = 2.5e11
+"""End of a spare's lease: a date that can be written (the year 9892)."""
+_SETTLED = 30.0
+"""Seconds that a spare with other parameters is kept: robots that ask for different ones must not wear it out."""
+
+Weigh = Callable[[Record, Sequence[Record]], Decision]
+"""Where a record would run, beside others."""
+
+
+class Moves:
+    """Decides what is moved and what is kept warm; called by the one that leads, and by requests."""
+
+    def __init__(
+        self,
+        store: Store,
+        catalogue: Catalogue,
+        sites: Callable[[], Sites],
+        weigh: Weigh,
+        clock: Callable[[], float],
+        timing: Timing,
+        weights: Weights,
+    ) -> None:
+        """``clock`` gives seconds since the epoch."""
+        self._store = store
+        self._catalogue = catalogue
+        self._sites = sites
+        self._weigh = weigh
+        self._clock = clock
+        self._timing = timing
+        self._weights = weights
+        self._not_before: dict[str, float] = {}
+        """By service: no spare before this, because the last one failed."""
+        self._bad_since: dict[str, float] = {}
+        """By instance: since when its robot has driven by itself."""
+
+    def successor_of(self, record: Record, site: str | None = None) -> Record:
+        """An instance like another one, for the same robot; not stored yet."""
+        now = self._clock()
+        return new_record(
+            robot=record.robot,
+            service=record.service,
+            manifest=record.manifest,
+            params=record.params,
+            measurements=record.measurements,
+            created_at=now,
+            updated_at=now,
+            lease_s=record.lease_s,
+            lease_expires_at=now + record.lease_s,
+            replaces=record.id,
+            pinned=site,
+        )
+
+    def spares_for(self, record: Record) -> list[Record]:
+        """Warm instances that could be this one, the best site's first; none at a site that is much worse."""
+        live = self._store.live()
+        same = [spare for spare in live if spare.spare and spare.state is State.RUNNING and _alike(spare, record)]
+        if not same:
+            return []
+        decision = self._weigh(record, [other for other in live if other not in same])
+        scores = {score.site: score.total_ms for score in decision.scores}
+        limit = min(scores.values(), default=0.0) + self._weights.migrate_ms
+        good = [s for s in same if s.site in scores and scores[s.site] <= limit and self._reachable(s)]
+        return sorted(good, key=lambda spare: (scores[spare.site or ""], spare.created_at))
+
+    def keep_spares(self, live: Sequence[Record]) -> None:
+        """Start the spares that are missing, and end those that nobody would get."""
+        now = self._clock()
+        kept: dict[str, int] = {}
+        catalogue = {manifest.metadata.name: manifest for manifest in self._catalogue.all()}
+        for spare in live:
+            if not spare.spare or spare.state is State.STOPPING:
+                continue
+            manifest = catalogue.get(spare.service)
+            wanted = manifest.spec.needs.standby if manifest else 0
+            current = manifest is not None and _document(manifest) == spare.manifest
+            if current and self._stale(spare, now):
+                current = False
+            if current and kept.get(spare.service, 0) < wanted:
+                kept[spare.service] = kept.get(spare.service, 0) + 1
+            else:
+                self._end(spare, now)
+        for name, manifest in catalogue.items():
+            if kept.get(name, 0) < manifest.spec.needs.standby and now >= self._not_before.get(name, 0.0):
+                self._add_spare(manifest, live, now)
+
+    def _stale(self, spare: Record, now: float) -> bool:
+        """It has other parameters than the last request, and has had its time."""
+        params = self._store.last_params(spare.service)
+        return params is not None and params != spare.params and now - spare.created_at > _SETTLED
+
+    def _add_spare(self, manifest: Manifest, live: Sequence[Record], now: float) -> None:
+        name = manifest.metadata.name
+        params = self._store.last_params(name) or {}
+        try:
+            check_params(params, manifest.spec.params, name)
+        except InvalidError:
+            return  # parameters are needed, and nobody has asked yet
+        spare = new_record(
+            robot="",
+            service=name,
+            manifest=_document(manifest),
+            params=params,
+            created_at=now,
+            updated_at=now,
+            lease_s=self._timing.spare_lease,
+            lease_expires_at=FOREVER,
+            spare=True,
+        )
+        if self._weigh(spare, live).site is not None:  # robots come first: a spare does not wait for room
+            self._store.add(spare, "", None, "")
+
+    def _end(self, spare: Record, now: float) -> None:
+        to = State.STOPPED if spare.site is None else State.STOPPING
+        self._store.change(spare, now, state=to, stopping_at=now, reason="this standby is not needed any more")
+
+    def spare_failed(self, record: Record) -> None:
+        """Do not try another one at once."""
+        self._not_before[record.service] = self._clock() + self._timing.backoff_max
+
+    def fail_over(self, record: Record, why: str) -> None:
+        """Give the robot of an instance that does not serve a spare, if there is one."""
+        if record.spare or self._store.successor(record.id) is not None:
+            return
+        wanted = self.successor_of(record)
+        for spare in self.spares_for(replace(wanted, replaces=None)):
+            robot = {"robot": record.robot, "measurements": record.measurements, "replaces": record.id}
+            lease = {"lease_s": record.lease_s, "lease_expires_at": wanted.lease_expires_at}
+            now = self._clock()
+            if self._store.claim(spare, {**robot, **lease, "created_at": now}, now, "", None, ""):
+                log.warning("%s for %s: %s; standby %s takes over", record.service, record.robot, why, spare.id)
+                return
+
+    def watch(self, live: Sequence[Record], reports: Mapping[str, Report]) -> None:
+        """Fail over from sites that do not answer, and move what has not been good enough for its robot for long."""
+        now = self._clock()
+        for record in live:
+            if record.state is State.RUNNING and not record.spare and not self._reachable(record):
+                self.fail_over(record, f"site {record.site} does not answer")
+        bad = {r.id for r in live if r.state is State.RUNNING and _by_itself(reports.get(r.id))}
+        self._bad_since = {i: self._bad_since.get(i, now) for i in bad}
+        for record in live:
+            if now - self._bad_since.get(record.id, now) >= self._timing.replace_after:
+                self._replace(record, reports[record.id], live, now)
+
+    def _replace(self, record: Record, report: Report, live: Sequence[Record], now: float) -> None:
+        if now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
+            return
+        wanted = self.successor_of(record)
+        others = [other for other in live if other is not record]
+        best = next(iter(self._weigh(wanted, others).scores), None)
+        rtt_ms = None if report.rtt_s is None else report.rtt_s * 1000
+        here = {record.site or "": Measurement(rtt_ms=rtt_ms).model_dump(exclude_none=True)}
+        as_it_is = replace(wanted, replaces=None, measurements={**record.measurements, **here})
+        present = next((s.total_ms for s in self._weigh(as_it_is, others).scores if s.site == record.site), None)
+        # Only for what was measured, and only for a gain: else two bad sites would hand a robot to and fro.
+        if best and best.measured and (present is None or best.total_ms + self._weights.migrate_ms < present):
+            self._bad_since.pop(record.id, None)
+            self._store.add(wanted, "", None, "")
+            log.warning(
+                "%s for %s (%s) is not good enough at %s: moving it to %s",
+                *(record.service, record.robot, record.id, record.site, best.site),
+            )
+
+    def _reachable(self, record: Record) -> bool:
+        site = self._sites().find(record.site)
+        return site is not None and not site.unreachable
+
+
+def _alike(spare: Record, record: Record) -> bool:
+    """Same service, same version, same parameters."""
+    return (spare.service, spare.manifest, spare.params) == (record.service, record.manifest, record.params)
+
+
+def _document(manifest: Manifest) -> dict[str, Any]:
+    return manifest.model_dump(mode="json", by_alias=True)
+
+
+def _by_itself(report: Report | None) -> bool:
+    return report is not None and report.control_source in ("fallback", "stop")
