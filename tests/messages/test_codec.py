@@ -42,6 +42,7 @@ from skytether.messages import (
     type_of,
     warm,
 )
+from skytether.messages.services import BOTH, service_types
 
 ENCODINGS: tuple[Encoding, ...] = ("cdr", "ros1")
 INTEGERS = {
@@ -58,6 +59,8 @@ def untouched_store(encoding: Encoding) -> Typestore:
     store = get_typestore(Stores.ROS2_JAZZY if encoding == "cdr" else Stores.ROS1_NOETIC)
     if encoding == "ros1":
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    for name, parts in BOTH.items():
+        store.register(service_types(name, *parts, hashed=False))
     return store
 
 

@@ -27,12 +27,18 @@ def test_manifest_says_what_the_code_does() -> None:
 
 def shown(document: Path) -> dict[str, str]:
     """Files that a page shows: "`wall_stop/name`:" with a block of code after it."""
-    return dict(re.findall(r"`wall_stop/([\w.]+)`:\n```\w+\n(.*?)```\n", document.read_text(), re.DOTALL))
+    return dict(re.findall(r"`(\w+/[\w.]+)`:\n```\w+\n(.*?)```\n", document.read_text(), re.DOTALL))
 
 
-@pytest.mark.parametrize("name", ["service.py", "__main__.py", "service.yaml", "test_wall_stop.py"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"wall_stop/{name}" for name in ("service.py", "__main__.py", "service.yaml", "test_wall_stop.py")),
+        "patrol/service.py",
+    ],
+)
 def test_the_page_shows_the_files_as_they_are(name: str) -> None:
-    assert shown(DOCS / "writing-a-service.md")[name] == (EXAMPLE / name).read_text()
+    assert shown(DOCS / "writing-a-service.md")[name] == (EXAMPLE.parent / name).read_text()
 
 
 def test_the_readme_shows_the_class_as_it_is() -> None:

@@ -38,6 +38,21 @@ from .geometry import (
 )
 from .nav import MapMetaData, OccupancyGrid, Odometry, Path, TFMessage
 from .sensor import CompressedImage, Imu, JointState, Joy, LaserScan, PointCloud2, PointField, Range
+from .srv import (
+    GetMap,
+    GetMapRequest,
+    GetMapResponse,
+    GetPlan,
+    GetPlanRequest,
+    GetPlanResponse,
+    ServiceType,
+    SetBool,
+    SetBoolRequest,
+    SetBoolResponse,
+    Trigger,
+    TriggerRequest,
+    TriggerResponse,
+)
 from .std import Bool, Duration, Float32, Float64, Header, String, Time
 
 __all__ = [
@@ -49,6 +64,12 @@ __all__ = [
     "Encoding",
     "Float32",
     "Float64",
+    "GetMap",
+    "GetMapRequest",
+    "GetMapResponse",
+    "GetPlan",
+    "GetPlanRequest",
+    "GetPlanResponse",
     "Header",
     "Imu",
     "JointState",
@@ -68,11 +89,18 @@ __all__ = [
     "PoseWithCovarianceStamped",
     "Quaternion",
     "Range",
+    "ServiceType",
+    "SetBool",
+    "SetBoolRequest",
+    "SetBoolResponse",
     "String",
     "TFMessage",
     "Time",
     "Transform",
     "TransformStamped",
+    "Trigger",
+    "TriggerRequest",
+    "TriggerResponse",
     "Twist",
     "TwistStamped",
     "TwistWithCovariance",

@@ -4,15 +4,19 @@ Everything that knows of sockets, sessions or the orchestrator is behind it; a s
 `skytether.messages`, nothing else of Skytether. Its tests use `skytether.testing.service.Harness`.
 """
 
-from .errors import ConfigError, ServiceError
+from .calls import Caller
+from .errors import CallError, ConfigError, ServiceError
 from .mailbox import RawReceived, Received
 from .main import run
 from .params import NoParams, param
 from .service import Context, Service, params_schema
-from .topics import AnyInput, Input, Output
+from .topics import AnyInput, Call, Input, Output, answers
 
 __all__ = [
     "AnyInput",
+    "Call",
+    "CallError",
+    "Caller",
     "ConfigError",
     "Context",
     "Input",
@@ -22,6 +26,7 @@ __all__ = [
     "Received",
     "Service",
     "ServiceError",
+    "answers",
     "param",
     "params_schema",
     "run",

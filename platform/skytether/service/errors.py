@@ -13,3 +13,7 @@ class ConfigError(ServiceError):
     """The grant or the parameters are wrong. Exit status 2: starting again would not help."""
 
     status = 2
+
+
+class CallError(Exception):
+    """A call has no answer; the text says why. A method that answers calls raises it to tell the robot why not."""

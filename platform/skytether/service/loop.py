@@ -64,6 +64,7 @@ class Loop:
         begin = idle_since = self._clock.now()
         index = 0
         while not self._stopping:
+            self._answer()
             now = self._clock.now()
             due = begin + index * period
             if now < due:
@@ -84,6 +85,7 @@ class Loop:
         stepped = None
         idle_since = self._clock.now()
         while not self._stopping:
+            self._answer()
             now = self._clock.now()
             newest = mailbox.latest
             if newest is not stepped:
@@ -96,6 +98,11 @@ class Loop:
                 return
             else:
                 self._clock.sleep_until(idle_since + self._idle_exit)
+
+    def _answer(self) -> None:
+        """What the robot asked since the last look."""
+        self._port.settle()
+        self._port.desk.work()
 
     def _step(self, now: float) -> None:
         self._step_began = now

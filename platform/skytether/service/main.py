@@ -27,9 +27,8 @@ from .clock import SystemClock
 from .errors import ConfigError, ServiceError
 from .loop import Loop
 from .params import read_params
-from .port import ServicePort
+from .port import ServicePort, classes_of
 from .service import Context, Service
-from .topics import Typed
 
 
 def run(cls: type[Service[Any]]) -> NoReturn:
@@ -72,8 +71,8 @@ def check_topics(cls: type[Service[Any]], grant: Grant) -> None:
     Raises:
         ConfigError: Names the first topic that only one of them has, or has differently.
     """
-    granted = {topic.name: (topic.direction, topic.type) for topic in grant.topics}
-    declared = {d.topic: (d.direction.value, d.type_name) for d in cls.declared}
+    granted = {topic.name: _said(topic.kind, topic.direction, topic.type) for topic in grant.topics}
+    declared = {d.topic: _said(d.kind, d.direction.value, d.type_name) for d in cls.declared}
     for name in [*declared, *granted]:
         if name not in granted:
             raise ConfigError(
@@ -111,6 +110,7 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
             except BridgeError as error:
                 raise ServiceError(str(error)) from None
             finally:
+                port.close()
                 bridge.stop()
 
 
@@ -135,12 +135,16 @@ def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant) -> in
     return 0
 
 
+def _said(kind: str, direction: str, type_name: str) -> tuple[str, ...]:
+    """A declaration in words."""
+    return (direction, type_name) if kind == "topic" else (kind, direction, type_name)
+
+
 def warm_up(service: Service[Any], grant: Grant) -> None:
     """Compile what the granted encodings need; another one that the robot chooses is compiled when it connects."""
     encodings = {topic.name: topic.encoding for topic in grant.topics}
     for declared in service.declared:
-        if isinstance(declared, Typed):
-            warm([declared.cls], encodings[declared.topic])
+        warm(classes_of(declared), encodings[declared.topic])
 
 
 def write_ready_file(grant: Grant, port: int) -> None:

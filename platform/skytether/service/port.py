@@ -3,24 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from skytether.messages import Encoding, Message, warm
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived, PeerMoved, Refused
 from skytether.wire.topic import Topic
 
+from .calls import CallPublisher, Desk, Spawn, Threads
+from .errors import CallError
 from .service import Service
-from .topics import Typed
+from .topics import Answer, Call, Declared, Typed
 
 if TYPE_CHECKING:
     from skytether.bridge.port import Publisher
 
 
-class ServicePort:
-    """Implements `Port` for one service. ``wake`` is called after every message and change of the connection."""
+def classes_of(declared: Declared) -> list[type[Message]]:
+    """Messages that a declaration stands for."""
+    if isinstance(declared, Typed):
+        return [declared.cls]
+    return [declared.srv.request, declared.srv.response] if isinstance(declared, Answer | Call) else []
 
-    def __init__(self, service: Service[Any], wake: Callable[[], None]) -> None:
+
+class ServicePort:
+    """Implements `Port` for one service.
+
+    Args:
+        service: The service.
+        wake: Called after every message, call and change of the connection.
+        spawn: Runs the service's own calls; threads unless given.
+    """
+
+    def __init__(self, service: Service[Any], wake: Callable[[], None], spawn: Spawn | None = None) -> None:
         self.connected = False
+        self.desk = Desk(wake)
+        for name, (srv, handler) in service.answers.items():
+            self.desk.open(name, srv, handler)
+        self._threads = Threads()
+        self._spawn = spawn or self._threads
         self._service = service
         self._wake = wake
         self._log = service.log
@@ -31,6 +52,12 @@ class ServicePort:
     def attach(self, publisher: Publisher) -> None:
         for sender in self._service.senders.values():
             sender.publisher = publisher
+        if self._service.callers or self._service.answers:
+            calling = cast(CallPublisher, publisher)
+            for caller in self._service.callers.values():
+                caller.publisher, caller.spawn = calling, self._spawn
+            for name in self.desk.names:
+                calling.answer(name, partial(self._answer, name))
 
     def deliver(self, message: MessageReceived) -> None:
         agreed = self._table.get(message.topic)
@@ -64,6 +91,23 @@ class ServicePort:
         while self._cold:
             warm(*self._cold.pop())
 
+    def close(self) -> None:
+        """No call is answered or made any more; before the bridge stops."""
+        self.desk.close()
+        self._threads.close()
+
+    def _answer(self, name: str, request: bytes) -> bytes:
+        """In a thread of the bridge: have the service's thread answer."""
+        from skytether.bridge import CallError as Failed
+
+        agreed = self._table.get(name + "/request")
+        if agreed is None:
+            raise Failed("the service does not know its encoding")
+        try:
+            return self.desk.ask(name, request, agreed[1]).result()
+        except CallError as error:
+            raise Failed(str(error)) from error
+
     def _agree(self, topics: tuple[Topic, ...]) -> None:
         """Take over the table of a new connection; empty at its end."""
         table: dict[str, tuple[str, Encoding]] = {}
@@ -76,6 +120,9 @@ class ServicePort:
         self._table = table
         for name, sender in self._service.senders.items():
             sender.encoding = table[name][1] if name in table else None
+        for name, caller in self._service.callers.items():
+            caller.encoding = table[name + "/request"][1] if name + "/request" in table else None
         for declared in self._service.declared:
-            if isinstance(declared, Typed) and declared.topic in table:
-                self._cold.append(([declared.cls], table[declared.topic][1]))
+            row = table.get(declared.topic + "/request" if declared.kind == "call" else declared.topic)
+            if row is not None:
+                self._cold.append((classes_of(declared), row[1]))

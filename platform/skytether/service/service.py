@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
+from skytether.messages import ServiceType
+
+from .calls import Caller
 from .mailbox import Mailbox, RawQueue, Sender
 from .params import NoParams, schema_of
-from .topics import AnyInput, Declared, Input, Output
+from .topics import Answer, AnyInput, Call, Declared, Input, Output
 
 P = TypeVar("P")
 
@@ -71,6 +76,8 @@ class Service(ABC, Generic[P]):
         self.mailboxes: dict[str, Mailbox[Any]] = {}
         self.senders: dict[str, Sender[Any]] = {}
         self.anything: RawQueue | None = None
+        self.callers: dict[str, Caller[Any, Any]] = {}
+        self.answers: dict[str, tuple[ServiceType[Any, Any], Callable[[Any], Any]]] = {}
         for declared in self.declared:
             self.__dict__[declared.attribute] = self._open(declared)
 
@@ -100,7 +107,14 @@ class Service(ABC, Generic[P]):
             case AnyInput():
                 self.anything = RawQueue(declared.max_messages, declared.max_bytes)
                 return self.anything
-        raise TypeError(f"{type(declared).__name__} is no Input, AnyInput or Output")
+            case Call():
+                self.callers[declared.topic] = Caller(declared.topic, declared.srv)
+                return self.callers[declared.topic]
+            case Answer():
+                handler = partial(declared.method, self)
+                self.answers[declared.topic] = declared.srv, handler
+                return handler
+        raise TypeError(f"{type(declared).__name__} is no Input, AnyInput, Output, Call or answer")
 
 
 def params_schema(cls: type[Service[Any]]) -> dict[str, Any]:

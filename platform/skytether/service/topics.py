@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, overload
 
-from skytether.messages import Message
+from skytether.messages import Message, ServiceType
 from skytether.wire.topic import Direction
 
+from .calls import Caller
 from .mailbox import Mailbox, RawQueue, Sender
 
 if TYPE_CHECKING:
@@ -14,12 +16,15 @@ if TYPE_CHECKING:
 
 ANY = "*"
 M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+A = TypeVar("A", bound=Message)
 
 
 class Declared:
     """Base of the declarations in a service's class body. The topic's name is the attribute's unless given."""
 
     direction: ClassVar[Direction]
+    kind: ClassVar[Literal["topic", "call"]] = "topic"
 
     def __init__(self, type_name: str, topic: str | None) -> None:
         self.type_name = type_name
@@ -86,3 +91,53 @@ class Output(Typed[M]):
     def __get__(self, service: Service[Any], owner: type[Any]) -> Sender[M]: ...
     def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Sender[M]:
         return self
+
+
+class Call(Declared, Generic[Q, A]):
+    """A call that the service makes and the robot answers: ``get_map = Call(GetMap)``."""
+
+    direction = Direction.OUT
+    kind = "call"
+
+    def __init__(self, srv: ServiceType[Q, A], name: str | None = None) -> None:
+        super().__init__(srv.name, name)
+        self.srv = srv
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> Caller[Q, A]: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Caller[Q, A]:
+        return self
+
+
+class Answer(Declared, Generic[Q, A]):
+    """A method that answers a call of the robot; made by `answers`."""
+
+    direction = Direction.IN
+    kind = "call"
+
+    def __init__(self, srv: ServiceType[Q, A], name: str | None, method: Callable[[Any, Q], A]) -> None:
+        super().__init__(srv.name, name)
+        self.srv = srv
+        self.method = method
+        self.__doc__ = method.__doc__
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> Callable[[Q], A]: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Callable[[Q], A]:
+        return self
+
+
+def answers(srv: ServiceType[Q, A], name: str | None = None) -> Callable[[Callable[[Any, Q], A]], Answer[Q, A]]:
+    """Have a method answer a call of the robot: ``@answers(SetBool)`` above ``def pause(self, request): ...``.
+
+    It runs in the thread of the steps, between two of them, and may raise `CallError` to tell the robot why not.
+
+    Args:
+        srv: What is asked and answered.
+        name: Of the call; the method's unless given.
+    """
+    return lambda method: Answer(srv, name, method)

@@ -13,18 +13,22 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from skytether.bridge import CallError as BridgeCallError
 from skytether.messages import Encoding, Message, decode, encode
 from skytether.service import Context, Service
+from skytether.service.errors import CallError
 from skytether.service.params import read_params
 from skytether.service.port import ServicePort
-from skytether.service.topics import Typed
+from skytether.service.topics import Answer, Call, Typed
 from skytether.wire.events import Connected, Disconnected, MessageReceived
 from skytether.wire.topic import Topic
 
 S = TypeVar("S", bound=Service[Any])
+T = TypeVar("T")
 
 
 class FakeClock:
@@ -108,8 +112,9 @@ class Harness(Generic[S]):
         context = Context("robot", "instance", data_dir or Path(), epoch)
         self.service = cls(read_params(cls.params_type, params or {}), context)
         self._types = {d.topic: d.type_name for d in cls.declared}
-        self._port = ServicePort(self.service, lambda: None)
-        self._port.attach(self)
+        self._robots: dict[str, Callable[[Any], Message]] = {}
+        self._port = ServicePort(self.service, lambda: None, _at_once)
+        self._port.attach(_Robot(self))
         self.connect()
         self.service.start()
 
@@ -117,7 +122,9 @@ class Harness(Generic[S]):
         """The robot is there; ``extra``: topics that only an `AnyInput` takes."""
         declared = [d for d in self.service.declared if isinstance(d, Typed)]
         typed = [Topic(d.topic, d.type_name, d.direction, encoding=self._encoding) for d in declared]
-        self._port.notify(Connected((*typed, *extra)))
+        calls = [d for d in self.service.declared if isinstance(d, Call | Answer)]
+        asked = [Topic(f"{d.topic}/request", d.type_name, d.direction, encoding=self._encoding) for d in calls]
+        self._port.notify(Connected((*typed, *asked, *extra)))
 
     def disconnect(self) -> None:
         """The robot is gone."""
@@ -134,6 +141,25 @@ class Harness(Generic[S]):
         """The link loses the topic's next message."""
         self._sequence[topic] += 1
 
+    def call(self, name: str, request: Message) -> Any:
+        """The robot calls the service.
+
+        Raises:
+            CallError: The service does not answer; the text says why.
+        """
+        answer = self._port.desk.ask(name, encode(request, self._encoding), self._encoding)
+        self._port.settle()
+        self._port.desk.work()
+        srv, _ = self.service.answers[name]
+        return decode(srv.response, answer.result(), self._encoding)
+
+    def answers(self, name: str, robot: Callable[[Any], Message]) -> None:
+        """From now on the robot answers a call of the service by a function: request in, response out.
+
+        It raises `skytether.service.CallError` to refuse.
+        """
+        self._robots[name] = robot
+
     def step(self, elapsed: float | None = None) -> None:
         """Let time pass (one period of the rate; nothing for a service with a trigger), then step once."""
         rate = self.service.rate_hz
@@ -149,7 +175,47 @@ class Harness(Generic[S]):
         """As at the end of the process."""
         self.service.stop()
 
-    def publish(self, topic: str, payload: bytes | memoryview) -> bool:
-        """The bridge's part; called by the service's outputs."""
+    def take(self, topic: str, payload: bytes | memoryview) -> None:
+        """The robot gets a message."""
         self.outputs[topic].append(decode(self._types[topic], payload, self._encoding))
+
+    def asked(self, name: str, payload: bytes | memoryview) -> bytes:
+        """The robot gets a call, and answers it at once.
+
+        Raises:
+            CallError: It does not.
+        """
+        if name not in self._robots:
+            raise CallError(f"call '{name}': this robot answers none; say how with Harness.answers")
+        request = decode(self.service.callers[name].srv.request, payload, self._encoding)
+        return encode(self._robots[name](request), self._encoding)
+
+
+class _Robot:
+    """What the service sees of a harness: the bridge's part."""
+
+    def __init__(self, harness: Harness[Any]) -> None:
+        self._harness = harness
+
+    def publish(self, topic: str, payload: bytes | memoryview) -> bool:
+        self._harness.take(topic, payload)
         return True
+
+    def call(self, name: str, payload: bytes | memoryview, timeout: float) -> bytes:  # noqa: ARG002 - made-up time
+        try:
+            return self._harness.asked(name, payload)
+        except CallError as error:
+            raise BridgeCallError(str(error)) from error
+
+    def answer(self, name: str, handler: Callable[[bytes], bytes]) -> None:
+        """The harness hands its calls to the service's desk."""
+
+
+def _at_once(work: Callable[[], T]) -> Future[T]:
+    """Instead of threads."""
+    done: Future[T] = Future()
+    try:
+        done.set_result(work())
+    except Exception as error:
+        done.set_exception(error)
+    return done

@@ -1,0 +1,1 @@
+"""Example service with calls. Walked through in ``docs/writing-a-service.md``."""
