@@ -8,7 +8,7 @@ import typer
 
 from skytether import __version__
 
-from . import bridge, demo, lab, orchestrator, relay, replay, resources, robot_run, tokens
+from . import bridge, demo, gate, lab, orchestrator, relay, replay, resources, robot_run, tokens
 from .output import log_to_console
 
 app = typer.Typer(
@@ -29,6 +29,10 @@ app.add_typer(resources.instance_app, name="instance")
 resources.robot_app.command("run")(robot_run.run)
 app.add_typer(resources.robot_app, name="robot")
 app.add_typer(tokens.app, name="token")
+resources.robot_app.command("gate")(gate.gate)
+resources.robot_app.command("gate-status")(gate.gate_status)
+resources.robot_app.command("stop")(gate.stop)
+resources.robot_app.command("reset")(gate.reset)
 app.add_typer(lab.app, name="lab")
 
 

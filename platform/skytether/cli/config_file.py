@@ -71,7 +71,7 @@ def _explain(error: ValidationError, model: type[BaseModel]) -> str:
     """The first mistake, by its key."""
     first = error.errors(include_url=False, include_input=False)[0]
     key = ".".join(str(step) for step in first["loc"])
-    if first["type"] == "extra_forbidden":
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _known_keys(first["loc"][:-1], model)
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         return f"{key}: unknown key{f', did you mean {near[0]!r}?' if near else ''}; allowed are {', '.join(known)}"
@@ -86,7 +86,10 @@ def _known_keys(place: tuple[int | str, ...], model: type[BaseModel]) -> list[st
     schema: dict[str, Any] = model.model_json_schema()
     here = schema
     for step in place:
-        here = here["items"] if isinstance(step, int) else here["properties"][step]
+        if isinstance(step, int):
+            here = here["items"]
+        else:
+            here = here.get("properties", {}).get(step) or here["additionalProperties"]
         here = next((a for a in here.get("anyOf", ()) if a.get("type") != "null"), here)
         if "$ref" in here:
             here = schema["$defs"][here["$ref"].rsplit("/", 1)[1]]

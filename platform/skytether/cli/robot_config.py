@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.api.manifest import Name, Strict
 from skytether.messages import type_of
+from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import Generation, check_name
 
@@ -140,6 +141,8 @@ class RobotConfig(Strict):
     bind: Endpoint = Endpoint(host="0.0.0.0")  # noqa: S104 - a robot has one network or several
     paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
     """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
+    safety: SafetyConfig | None = None
+    """The gate's part (``skytether robot gate``); with it, velocities go to the gate and not to the wheels."""
     ros1: Ros1Config | None = None
     ros2: Ros2Config | None = None
     """The robot's graph: one of the two."""

@@ -13,6 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf, isfinite, isnan, nan
+from typing import ClassVar
+
+from pydantic import ConfigDict
 
 from skytether.control.admittance import STANDSTILL, Velocity
 
@@ -60,6 +63,8 @@ class Limits:
         period_s: Of the control loop; used to brake with when the clock fails [s].
         max_step_s: Longest time that one step counts for, so that a stalled loop does not jump when it goes on [s].
     """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     linear_max: float = 0.25
     linear_min: float = 0.0

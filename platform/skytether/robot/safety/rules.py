@@ -92,15 +92,6 @@ class Rules:
     button: ButtonParams | None = None
     button_topic: str = "estop"
 
-    def topics(self) -> dict[str, tuple[type[Message], ...]]:
-        """What is listened to, and the message types that are understood there."""
-        topics: dict[str, tuple[type[Message], ...]] = dict.fromkeys(self.sensors, (LaserScan, Range))
-        if self.joystick is not None:
-            topics[self.joystick_topic] = (Joy,)
-        if self.button is not None:
-            topics[self.button_topic] = (Bool,)
-        return topics
-
 
 @dataclass(frozen=True, slots=True)
 class Decision:

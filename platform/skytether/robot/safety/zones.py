@@ -14,8 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from math import inf, isinf, sqrt
+from typing import ClassVar
 
 import numpy as np
+from pydantic import ConfigDict
 
 from skytether.control.admittance import Velocity
 from skytether.robot.supervisor import Limits
@@ -46,6 +48,8 @@ class ZoneParams:
         hysteresis_m: More way than this must be free, or be free beyond the slow zone, before a zone is left [m].
         reaction_s: From the light of the laser to the first effect of the brake, without the age of the scan [s].
     """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     stop_m: float = 0.1
     slow_m: float = 0.5

@@ -1,0 +1,85 @@
+"""``skytether robot gate, stop, reset, gate-status``: the last gate before the wheels, and what people say to it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .output import console, fail, print_json
+
+Folder = Annotated[
+    Path | None, typer.Option(help="The gate's folder (safety.folder in robot.yaml), if it is not the usual one.")
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With a section safety.")]) -> None:
+    """Own the wheels: let velocities through that are safe, and stop the robot when there are none.
+
+    Runs beside the agent, as processes of its own, and needs neither network nor agent. docs/safety.md tells more.
+    """
+    from skytether.robot.safety.guard import Guard, GuardError
+    from skytether.robot.safety.process import log_without_waiting
+    from skytether.robot.safety.ways import open_wheels
+
+    from .config_file import ConfigError
+    from .gate_config import load_safety
+
+    try:
+        settings = load_safety(config)
+        guard = Guard(settings, open_wheels(settings))
+    except ConfigError as error:
+        fail(str(error), 2)
+    except (GuardError, OSError) as error:
+        fail(str(error))
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    console.print(f"gate: guards the wheels; its sockets are in {settings.place()}", markup=False, soft_wrap=True)
+    if not settings.sensors:
+        console.print("warning: safety.sensors is empty: the robot does not see what it drives into", style="yellow")
+    log_without_waiting()
+    guard.run(ended.is_set)
+
+
+def stop(
+    reason: Annotated[str, typer.Argument(help="For whoever finds the robot stopped.")] = "",
+    folder: Folder = None,
+) -> None:
+    """Emergency stop, until `skytether robot reset`."""
+    _ask(folder, {"do": "stop", "reason": reason})
+    console.print("the robot is stopped; `skytether robot reset` lets it go again", markup=False)
+
+
+def reset(folder: Folder = None) -> None:
+    """End the emergency stop, after a look at the robot."""
+    _ask(folder, {"do": "reset"})
+    console.print("the emergency stop is over; the robot follows new commands", markup=False)
+
+
+def gate_status(folder: Folder = None, json: Json = False) -> None:
+    """Say who drives, what lies ahead, and what stands in the way."""
+    answer = _ask(folder, {"do": "status"})
+    if json:
+        print_json(answer)
+        return
+    way = "nothing near" if answer["way_m"] is None else f"{answer['way_m']:.2f} m to the stop zone"
+    print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
+    print(f"ahead     {answer['zone']}: {way}")
+    print(f"stopped   {answer['stopped'] or 'no'}")
+    for sentence in answer["troubles"]:
+        print(f"trouble   {sentence}")
+
+
+def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:
+    from skytether.robot.safety.client import GateError, ask
+    from skytether.robot.safety.protocol import default_folder
+
+    try:
+        return ask(folder or default_folder(), request)
+    except GateError as error:
+        fail(str(error))

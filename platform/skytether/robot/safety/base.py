@@ -1,0 +1,37 @@
+"""A robot whose wheels are behind a gate, as the agent sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from skytether.control.admittance import Velocity
+from skytether.messages import Message, Twist
+from skytether.robot.driver import Base
+
+from .client import GateLink
+
+
+class GatedBase:
+    """A `Base` that reads as another does, and writes to the gate.
+
+    Args:
+        base: For the readings; its ``write`` is never called.
+        link: To the gate.
+    """
+
+    def __init__(self, base: Base, link: GateLink) -> None:
+        self.topics: Mapping[str, type[Message]] = base.topics
+        self._base = base
+        self._link = link
+
+    def read(self, now: float) -> Iterable[tuple[str, Message]]:
+        """Base: the other's readings."""
+        return self._base.read(now)
+
+    def write(self, twist: Twist) -> None:
+        """Base: ask the gate.
+
+        Raises:
+            OSError: There is no gate; tried again at the next tick.
+        """
+        self._link.send(Velocity(twist.linear.x, twist.angular.z))

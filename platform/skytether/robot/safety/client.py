@@ -1,0 +1,74 @@
+"""What others say to the gate: the agent its velocities, people stop, reset and how is it."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from skytether.control.admittance import Velocity
+
+from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, pack_command
+
+_LARGEST_ANSWER = 256 * 1024
+
+
+class GateError(Exception):
+    """The gate cannot be asked; the text says why and what to do."""
+
+
+class GateLink:
+    """The agent's end: sends velocities and never waits.
+
+    Args:
+        folder: The gate's.
+        clock: Monotonic seconds; must be this machine's.
+    """
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        self._address = str(folder / COMMAND_SOCKET)
+        self._clock = clock
+        self._epoch = time.monotonic_ns()
+        self._sequence = 0
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def send(self, velocity: Velocity) -> None:
+        """Ask the gate for a velocity.
+
+        Raises:
+            OSError: There is no gate, or its queue is full.
+        """
+        self._sequence += 1
+        self._socket.sendto(pack_command(self._epoch, self._sequence, self._clock(), velocity), self._address)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def ask(folder: Path, request: dict[str, Any], timeout: float = 3.0) -> dict[str, Any]:
+    """Put a request to the gate: ``{"do": "status"}``, ``"reset"``, or ``"stop"`` with a ``"reason"``.
+
+    Raises:
+        GateError: It does not answer, or answers no.
+    """
+    path = folder / CONTROL_SOCKET
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+            link.settimeout(timeout)
+            link.connect(str(path))
+            link.send(json.dumps(request).encode())
+            answer = json.loads(link.recv(_LARGEST_ANSWER))
+    except PermissionError as error:
+        raise GateError(f"{path} is not open to you: only the user that the gate runs as may ask it") from error
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise GateError(f"no gate listens at {path}; start it with: skytether robot gate robot.yaml") from error
+    except (OSError, ValueError) as error:
+        raise GateError(f"the gate at {path} does not answer: {error}") from error
+    if not isinstance(answer, dict) or "refused" in answer:
+        raise GateError(answer["refused"] if isinstance(answer, dict) else f"{path} answers no JSON object")
+    return answer

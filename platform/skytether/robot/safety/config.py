@@ -1,0 +1,217 @@
+"""The section ``safety`` of robot.yaml: what people write, checked, and the rules that follow from it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from math import inf, radians
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from skytether.api.manifest import Strict
+from skytether.messages import Bool, Joy, LaserScan, Message, Range
+from skytether.robot.supervisor import Limits
+
+from .footprint import Footprint, circle, polygon
+from .joystick import JoystickParams
+from .latch import ButtonParams
+from .protocol import default_folder
+from .ranges import Mount
+from .rules import Action, RangeSensor, Rules
+from .zones import ZoneParams
+
+_Metres = Annotated[float, Field(ge=-100, le=100)]
+_Topic = Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class _Numbers(Strict):
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+class OutlineConfig(_Numbers):
+    """The robot with all that it carries, seen from above: a polygon or a circle about the origin."""
+
+    polygon: Annotated[tuple[tuple[_Metres, _Metres], ...], Field(min_length=3, max_length=100)] | None = None
+    """Corners (x forward, y left) in the base frame [m], in any order; of a dented outline the hull is taken."""
+    radius: Annotated[float, Field(gt=0, le=100)] | None = None
+    """[m]"""
+
+    @model_validator(mode="after")
+    def _is_one(self) -> OutlineConfig:
+        if (self.polygon is None) == (self.radius is None):
+            raise ValueError("give either polygon or radius")
+        self.footprint()
+        return self
+
+    def footprint(self) -> Footprint:
+        """The outline as geometry."""
+        return polygon(self.polygon) if self.polygon is not None else circle(self.radius or 0.0)
+
+
+class SensorConfig(_Numbers):
+    """A laser or a sonar, as it is mounted."""
+
+    kind: Literal["laser", "sonar"] = "laser"
+    """sensor_msgs/msg/LaserScan or sensor_msgs/msg/Range."""
+    x: _Metres = 0.0
+    """Forward of the base's origin [m]."""
+    y: _Metres = 0.0
+    """Left of it [m]."""
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Where its middle looks; positive to the left."""
+    upside_down: bool = False
+    range_min: Annotated[float, Field(ge=0)] = 0.0
+    """[m]; 0: as its messages say."""
+    range_max: Annotated[float, Field(ge=0)] = 0.0
+    """[m]; 0: as its messages say."""
+    ignore_deg: tuple[tuple[float, float], ...] = ()
+    """Sectors (from, to), in its own angles, in which it sees the robot itself."""
+    max_gap_deg: Annotated[float, Field(ge=0, le=360)] = 5.0
+    """Widest sector without a reading that is not blindness."""
+    no_echo_is_free: bool = False
+    """NaN and zero mean that nothing is there (lasers outdoors); never where all readings are such."""
+    max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.3
+    """Silence after which it is stale."""
+    on_unknown: Literal["stop", "slow"] = "stop"
+    """When it is blind, silent or makes no sense."""
+    on_empty: Literal["stop", "slow", "free"] = "slow"
+    """When a laser reports nothing within reach in any direction."""
+
+    def sensor(self) -> RangeSensor:
+        """The sensor as the rules take it."""
+        mount = Mount(
+            x=self.x,
+            y=self.y,
+            yaw=radians(self.yaw_deg),
+            upside_down=self.upside_down,
+            range_min=self.range_min,
+            range_max=self.range_max,
+            ignore=tuple((radians(first), radians(last)) for first, last in self.ignore_deg),
+            max_gap=radians(self.max_gap_deg),
+            no_echo_is_free=self.no_echo_is_free,
+        )
+        return RangeSensor(mount, self.max_age_s, Action(self.on_unknown), Action(self.on_empty))
+
+
+class JoystickConfig(_Numbers):
+    """A joystick or gamepad (sensor_msgs/msg/Joy), repeated at 10 Hz or more while the button is held."""
+
+    topic: _Topic = "joy"
+    deadman: Annotated[int, Field(ge=0, le=63)] = 4
+    """Index of the button to be held."""
+    linear_axis: Annotated[int, Field(ge=0, le=63)] = 1
+    angular_axis: Annotated[int, Field(ge=0, le=63)] = 0
+    linear: float = 0.2
+    """At the end of the axis [m/s]; negative turns the axis round."""
+    angular: float = 0.4
+    """At the end of the axis [rad/s]."""
+    max_age_s: Annotated[float, Field(gt=0, le=2)] = 0.3
+    """Silence after which a held joystick is lost."""
+
+
+class ButtonConfig(_Numbers):
+    """An emergency stop button (std_msgs/msg/Bool)."""
+
+    topic: _Topic = "estop"
+    pressed_is: bool = True
+    """Its value when pressed; false for a circuit that opens."""
+    max_age_s: Annotated[float, Field(gt=0, le=60)] | None = 0.5
+    """Silence after which the robot stops; null: it speaks only when it changes."""
+
+
+class SocketsConfig(_Numbers):
+    """Drivers that speak to the gate through datagram sockets; ``unix:PATH`` or ``udp:HOST:PORT``."""
+
+    sensors: str | None = None
+    """Where the gate listens: the topic's name, a zero byte, the message as CDR; null: ``sensors.sock``."""
+    wheels: str | None = None
+    """Where velocities go: a geometry_msgs/msg/Twist as CDR; null: ``wheels.sock`` in the gate's folder."""
+
+    @field_validator("sensors", "wheels")
+    @classmethod
+    def _an_address(cls, text: str | None) -> str | None:
+        if text is not None:
+            address(text)
+        return text
+
+
+class SafetyConfig(_Numbers):
+    """The whole section."""
+
+    footprint: OutlineConfig
+    limits: Limits | None = None
+    """Of the wheels, whoever drives; null: the file's own ``limits``."""
+    zones: ZoneParams = ZoneParams()
+    sensors: Annotated[dict[_Topic, SensorConfig], Field(max_length=32)]
+    """By topic. Without any the robot is blind and drives all the same: write ``{}`` to have that."""
+    joystick: JoystickConfig | None = None
+    estop: ButtonConfig | None = None
+    rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
+    """Of the gate's loop."""
+    guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
+    """The guard brakes when the gate has said nothing for this long, and the gate when the guard has not."""
+    folder: Path | None = None
+    """Of the gate's sockets; null: ``/run/skytether`` for root, else ``$XDG_RUNTIME_DIR/skytether``."""
+    sockets: SocketsConfig = SocketsConfig()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> SafetyConfig:
+        topics = [*self.sensors, *(part.topic for part in (self.joystick, self.estop) if part)]
+        for topic in topics:
+            if topics.count(topic) > 1:
+                raise ValueError(f"the topic '{topic}' cannot be two things")
+        if self.guard_s < 2 / self.rate_hz:
+            raise ValueError(f"guard_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
+        limits = self.limits or Limits()
+        if limits.max_gap_s < 2 / self.rate_hz:
+            raise ValueError(f"limits.max_gap_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
+        return self
+
+    def rules(self) -> Rules:
+        """The rules that follow."""
+        limits = replace(self.limits or Limits(), period_s=1 / self.rate_hz)
+        joystick, button = self.joystick, self.estop
+        return Rules(
+            footprint=self.footprint.footprint(),
+            limits=limits,
+            zones=self.zones,
+            sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
+            joystick=None if joystick is None else JoystickParams(**joystick.model_dump(exclude={"topic"})),
+            joystick_topic=joystick.topic if joystick else "",
+            button=None if button is None else ButtonParams(button.pressed_is, button.max_age_s or inf),
+            button_topic=button.topic if button else "",
+        )
+
+    def place(self) -> Path:
+        """The gate's folder."""
+        return self.folder or default_folder()
+
+    def kinds(self) -> dict[str, type[Message]]:
+        """Message type of each topic that the gate listens to."""
+        kinds: dict[str, type[Message]] = {
+            name: LaserScan if sensor.kind == "laser" else Range for name, sensor in self.sensors.items()
+        }
+        if self.joystick is not None:
+            kinds[self.joystick.topic] = Joy
+        if self.estop is not None:
+            kinds[self.estop.topic] = Bool
+        return kinds
+
+
+def address(text: str) -> str | tuple[str, int]:
+    """A socket's address: a path, or host and port.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "unix" and rest:
+        if len(os.fsencode(rest)) > 100:
+            raise ValueError(f"'{text}' is longer than the 100 bytes that a socket's path may have")
+        return rest
+    host, _, port = rest.rpartition(":")
+    if kind == "udp" and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536:
+        return host.strip("[]"), int(port)
+    raise ValueError(f"must be unix:PATH or udp:HOST:PORT, not '{text}'")

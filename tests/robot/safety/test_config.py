@@ -1,0 +1,132 @@
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+
+from skytether.cli.config_file import ConfigError
+from skytether.cli.gate_config import load_safety
+from skytether.messages import Joy, LaserScan, Range
+from skytether.robot.safety.config import SafetyConfig, address, default_folder
+from skytether.robot.safety.rules import Action
+
+LEAST = {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}}
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(safety, **more) -> SafetyConfig:
+        path = tmp_path / "robot.yaml"
+        path.write_text(yaml.safe_dump({"safety": safety, **more}))
+        return load_safety(path)
+
+    return load
+
+
+def test_little_need_be_written(load):
+    config = load(LEAST)
+    rules = config.rules()
+    assert rules.limits.period_s == 0.02
+    assert rules.limits.linear_max == 0.25
+    assert rules.sensors["scan"].on_unknown is Action.STOP
+    assert rules.joystick is None
+    assert rules.button is None
+
+
+def test_everything_can_be_written_and_goes_to_the_gate_unchanged(load):
+    config = load(
+        {
+            "footprint": {"polygon": [[0.3, 0.2], [-0.3, 0.2], [-0.3, -0.2], [0.3, -0.2]]},
+            "limits": {"linear_max": 0.5, "linear_min": -0.1},
+            "zones": {"stop_m": 0.15, "slow_m": 0.8},
+            "sensors": {
+                "scan": {"x": 0.2, "yaw_deg": 90, "ignore_deg": [[-135, -90]], "on_unknown": "slow"},
+                "sonar/left": {"kind": "sonar", "max_age_s": 1},
+            },
+            "joystick": {"deadman": 5},
+            "estop": {"topic": "button", "pressed_is": False, "max_age_s": None},
+            "rate_hz": 100,
+            "guard_s": 0.05,
+            "folder": "/run/walker",
+            "sockets": {"sensors": "udp:127.0.0.1:5000", "wheels": "unix:/run/wheels"},
+        }
+    )
+    assert SafetyConfig.model_validate_json(config.model_dump_json()) == config
+    rules = config.rules()
+    mount = rules.sensors["scan"].mount
+    assert mount.yaw == pytest.approx(math.pi / 2)
+    assert mount.ignore[0] == pytest.approx((-0.75 * math.pi, -math.pi / 2))
+    assert rules.joystick.deadman == 5
+    assert (rules.button.pressed_is, rules.button.max_age_s) == (False, math.inf)
+    assert config.kinds()["scan"] is LaserScan
+    assert config.kinds()["sonar/left"] is Range
+    assert config.kinds()["joy"] is Joy
+    assert config.place() == Path("/run/walker")
+
+
+def test_the_robots_own_limits_hold_unless_the_section_has_some(load):
+    assert load(LEAST, limits={"linear_max": 0.4}).rules().limits.linear_max == 0.4
+    assert load(LEAST | {"limits": {"linear_max": 0.2}}, limits={"linear_max": 0.4}).rules().limits.linear_max == 0.2
+
+
+def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
+    assert load(LEAST, srevice="virtual-trail")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"zoens": {}}, "safety.zoens: unknown key, did you mean 'zones'?"),
+        ({"zones": {"stop": 0.1}}, "safety.zones.stop: unknown key, did you mean 'stop_m'?"),
+        ({"zones": {"stop_m": -0.1}}, "safety.zones: zones: stop_m must be above 0 and finite, not -0.1"),
+        ({"zones": {"stop_m": math.nan}}, "safety.zones.stop_m: input should be a finite number"),
+        ({"limits": {"linear_mx": 1}}, "safety.limits.linear_mx: unknown key, did you mean 'linear_max'?"),
+        ({"limits": {"linear_max": math.inf}}, "safety.limits.linear_max: input should be a finite number"),
+        ({"limits": {"linear_braking": 0.1}}, "braking must not be slower than ordinary acceleration"),
+        ({"limits": {"max_gap_s": 0.03}}, "limits.max_gap_s must be two periods of rate_hz or more: 0.04"),
+        ({"footprint": {}}, "safety.footprint: give either polygon or radius"),
+        ({"footprint": {"radius": 0}}, "safety.footprint.radius: input should be greater than 0"),
+        ({"footprint": {"polygon": [[0, 0], [1, 0], [2, 0]]}}, "three corners that are not on one line"),
+        ({"sensors": {"scan": {"kind": "lidar"}}}, "safety.sensors.scan.kind: input should be 'laser' or 'sonar'"),
+        ({"sensors": {"scan": {"yaw": 90}}}, "safety.sensors.scan.yaw: unknown key, did you mean 'yaw_deg'?"),
+        ({"sensors": {"scan": {"on_unknown": "free"}}}, "on_unknown: input should be 'stop' or 'slow'"),
+        ({"joystick": {"topic": "scan"}}, "safety: the topic 'scan' cannot be two things"),
+        ({"guard_s": 0.03}, "guard_s must be two periods of rate_hz or more: 0.04"),
+        ({"sockets": {"wheels": "wheels.sock"}}, "must be unix:PATH or udp:HOST:PORT, not 'wheels.sock'"),
+    ],
+)
+def test_a_mistake_names_its_key(load, change, says):
+    with pytest.raises(ConfigError) as error:
+        load(LEAST | change)
+    assert says in str(error.value)
+
+
+def test_a_section_that_is_missing_or_misspelt_is_named(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("saftey: {}")
+    with pytest.raises(ConfigError, match="safety: is missing"):
+        load_safety(path)
+
+
+def test_the_example_of_the_documentation_is_a_configuration(load):
+    text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
+    example = yaml.safe_load(text.split("```yaml")[1].split("```")[0])
+    rules = load(example["safety"]).rules()
+    assert set(rules.sensors) == {"scan", "sonar_left"}
+
+
+def test_addresses():
+    assert address("unix:/run/x") == "/run/x"
+    assert address("udp:127.0.0.1:80") == ("127.0.0.1", 80)
+    assert address("udp:[::1]:80") == ("::1", 80)
+    for bad in ("", "/run/x", "unix:", "udp:1", "udp:h:0", "udp:h:99999", "udp::5", "unix:/" + "x" * 120):
+        with pytest.raises(ValueError, match=r"must be unix:PATH|longer than"):
+            address(bad)
+
+
+def test_the_usual_folder_is_the_users_own(monkeypatch):
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1000")
+    assert default_folder() == Path("/run/user/1000/skytether")
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    assert default_folder() == Path("/run/skytether")

@@ -1,0 +1,276 @@
+"""Guard, gate and agent as real processes, killed and frozen in every way: the wheels stop, each time."""
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from skytether.messages import Bool, Joy, LaserScan, Message, Twist, decode, encode
+from skytether.robot.safety.client import GateError, ask
+
+pytestmark = pytest.mark.slow
+
+PATIENCE_S = 30.0
+HERE = Path(__file__).parent
+CONFIG = {
+    "footprint": {"radius": 0.3},
+    "sensors": {"scan": {"max_age_s": 1.0}},
+    "joystick": {"deadman": 0, "linear_axis": 0, "angular_axis": 1, "max_age_s": 1.0},
+    "estop": {"max_age_s": 2.0},
+    "guard_s": 0.5,
+    "limits": {"max_gap_s": 0.5},
+}
+
+
+class Robot:
+    """Hardware in this process: wheels that remember, a laser, a button. Guard and agent beside it."""
+
+    def __init__(self, folder: Path, log: Path) -> None:
+        self.folder = folder
+        self.wall = 5.0
+        self.pad: Joy | None = None
+        self.told: list[tuple[float, float]] = []
+        self._log = log
+        self._ended = threading.Event()
+        self._wheels = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._wheels.bind(str(folder / "wheels.sock"))
+        self._wheels.settimeout(0.2)
+        self._threads = [threading.Thread(target=target) for target in (self._turn, self._sense)]
+        for thread in self._threads:
+            thread.start()
+        config = folder.parent / "robot.yaml"
+        config.write_text(yaml.safe_dump({"safety": CONFIG | {"folder": str(folder)}}))
+        with log.open("ab") as output:
+            self.guard = subprocess.Popen(
+                [sys.executable, "-m", "skytether.cli", "robot", "gate", str(config)], stdout=output, stderr=output
+            )
+        self.agent = self.start_agent()
+
+    def start_agent(self) -> subprocess.Popen[bytes]:
+        with self._log.open("ab") as output:
+            return subprocess.Popen(
+                [sys.executable, str(HERE / "agent_process.py"), str(self.folder)], stdout=output, stderr=output
+            )
+
+    def status(self) -> dict:
+        return ask(self.folder, {"do": "status"}, timeout=PATIENCE_S)
+
+    def drives(self) -> None:
+        wait(lambda: self._newest()[0] > 0.15, "the robot drives", self)
+
+    def stands(self, seconds: float = 0.5) -> None:
+        """It comes to a standstill, and stays there."""
+        wait(lambda: self._newest() == (0.0, 0.0), "the robot stands", self)
+        self.told.clear()
+        time.sleep(seconds)
+        assert set(self.told) <= {(0.0, 0.0)}
+
+    def close(self) -> None:
+        for process in (self.agent, self.guard):
+            process.send_signal(signal.SIGCONT)
+            process.terminate()
+        for process in (self.agent, self.guard):
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        self._wheels.close()
+
+    def _newest(self) -> tuple[float, float]:
+        return self.told[-1] if self.told else (0.0, 0.0)
+
+    def _turn(self) -> None:
+        while not self._ended.is_set():
+            try:
+                twist = decode(Twist, self._wheels.recv(256))
+            except TimeoutError:
+                continue
+            self.told.append((twist.linear.x, twist.angular.z))
+
+    def _sense(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+            link.settimeout(0.2)
+            while not self._ended.wait(0.04):
+                self._send(link, "scan", self._scan())
+                self._send(link, "estop", Bool())
+                if self.pad is not None:
+                    self._send(link, "joy", self.pad)
+
+    def _send(self, link: socket.socket, topic: str, message: Message) -> None:
+        try:
+            link.sendto(topic.encode() + b"\0" + encode(message), str(self.folder / "sensors.sock"))
+        except OSError:  # the gate is not there, or does not take it: so much the worse for it
+            return
+
+    def _scan(self) -> LaserScan:
+        ranges = np.full(181, self.wall, dtype=np.float32)
+        return LaserScan(
+            angle_min=-math.pi / 2, angle_increment=math.pi / 180, range_min=0.05, range_max=8.0, ranges=ranges
+        )
+
+
+def wait(condition: Callable[[], bool], what: str, robot: Robot | None = None) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > end:
+            log = robot._log.read_text() if robot else ""
+            pytest.fail(f"not within {PATIENCE_S} s: {what}\n{log}")
+        time.sleep(0.02)
+
+
+def fill(path: Path) -> None:
+    """Write until nothing more goes on the disk."""
+    with path.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+
+
+def gate_pid(robot: Robot, other_than: int = 0) -> int:
+    """The gate's process id, as soon as there is one that answers."""
+
+    def found() -> int:
+        try:
+            pid = int(robot.status()["pid"])
+        except GateError:
+            return 0
+        return 0 if pid == other_than else pid
+
+    wait(lambda: found() != 0, "the gate answers", robot)
+    return int(robot.status()["pid"])
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    robot = Robot(folder, tmp_path / "log")
+    yield robot
+    robot.close()
+
+
+def test_the_agent_killed_or_frozen(robot):
+    robot.drives()
+    robot.agent.send_signal(signal.SIGSTOP)
+    robot.stands()
+    robot.agent.send_signal(signal.SIGCONT)
+    robot.drives()
+    robot.agent.kill()
+    robot.agent.wait()
+    robot.stands()
+    robot.agent = robot.start_agent()
+    robot.drives()
+    said = robot._log.read_text().count("the last valid command is too old")
+    assert said <= 2  # once each time, not fifty times a second
+
+
+def test_the_gate_killed_or_frozen(robot):
+    robot.drives()
+    first = gate_pid(robot)
+    os.kill(first, signal.SIGKILL)
+    robot.stands(0.0)
+    second = gate_pid(robot, other_than=first)
+    robot.drives()
+    os.kill(second, signal.SIGSTOP)
+    robot.stands(0.0)
+    third = gate_pid(robot, other_than=second)  # a frozen one is ended and started anew
+    robot.drives()
+    ask(robot.folder, {"do": "stop", "reason": "a test"}, PATIENCE_S)
+    robot.stands()
+    wait(lambda: "a test" in (robot.folder / "latch").read_text(), "the stop is kept", robot)
+    os.kill(third, signal.SIGKILL)
+    gate_pid(robot, other_than=third)
+    robot.stands()
+    assert "a test" in robot.status()["stopped"]
+    ask(robot.folder, {"do": "reset"}, PATIENCE_S)
+    robot.drives()
+
+
+def test_the_guard_frozen_or_killed(robot):
+    robot.drives()
+    gate = gate_pid(robot)
+    robot.guard.send_signal(signal.SIGSTOP)
+    robot.stands()
+    robot.guard.send_signal(signal.SIGCONT)
+    robot.drives()
+    robot.guard.kill()
+    robot.guard.wait()
+    robot.stands()
+    wait(lambda: not _alive(gate), "the gate ends without its guard", robot)
+
+
+def test_the_disk_is_full(tmp_path, netns):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], check=True)
+    try:
+        folder = disk / "run"
+        folder.mkdir()
+        robot = Robot(folder, disk / "log")
+        try:
+            robot.drives()
+            with pytest.raises(OSError, match="No space left"):
+                fill(disk / "fill")
+            robot.drives()
+            ask(folder, {"do": "stop", "reason": "full"}, PATIENCE_S)
+            robot.stands()
+            wait(lambda: "full" in (folder / "latch").read_text(), "the stop is kept on a full disk", robot)
+            first = gate_pid(robot)
+            os.kill(first, signal.SIGKILL)
+            gate_pid(robot, other_than=first)
+            robot.stands()
+            ask(folder, {"do": "reset"}, PATIENCE_S)
+            robot.drives()
+            robot.agent.kill()
+            robot.stands()
+        finally:
+            robot.close()
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def test_people_and_things_in_the_way(robot):
+    robot.drives()
+    robot.wall = 0.38
+    robot.stands()
+    assert robot.status()["zone"] == "stop"
+    robot.wall = 5.0
+    robot.drives()
+    robot.pad = Joy(axes=np.array([0.0, 0.5], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+    wait(lambda: robot._newest() == pytest.approx((0.0, 0.2)), "the joystick turns the robot", robot)
+    robot.pad = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32))
+    robot.drives()
+    cli = [sys.executable, "-m", "skytether.cli", "robot"]
+    there = ["--folder", str(robot.folder)]
+    subprocess.run([*cli, "stop", "somebody fell", *there], check=True, capture_output=True)
+    robot.stands()
+    shown = subprocess.run([*cli, "gate-status", *there], check=True, capture_output=True, text=True).stdout
+    assert "stopped   somebody fell" in shown
+    status = subprocess.run([*cli, "gate-status", "--json", *there], check=True, capture_output=True, text=True)
+    assert json.loads(status.stdout)["hand"] == "nobody"
+    subprocess.run([*cli, "reset", *there], check=True, capture_output=True)
+    robot.drives()
+    for name in ("control.sock", "command.sock", "sensors.sock"):
+        assert (robot.folder / name).stat().st_mode & 0o007 == 0  # closed to other users
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
