@@ -161,6 +161,15 @@ def postgres(postgres_server: PostgresServer) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
+def sshd() -> str:
+    """The program of an SSH server, for engines that are reached through one."""
+    program = shutil.which("sshd", path=f"{os.environ['PATH']}:/usr/sbin")
+    if program is None:
+        require("docker", "the program 'sshd' is missing: install openssh-server")
+    return program
+
+
+@pytest.fixture(scope="session")
 def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Images]:
     """The base image, the network's guard, one service and the toy, built from this very code."""
     from docker_site import TOY, Images

@@ -35,6 +35,8 @@ class Behaviour:
     """Says the names of all its environment variables."""
     flood: int = 0
     """Says this many lines."""
+    hog_mb: int = 0
+    """Takes this much memory before it is ready."""
 
 
 def main() -> int:
@@ -53,6 +55,7 @@ def main() -> int:
         if child.stdout:
             child.stdout.readline()
         print(f"child {child.pid}")  # noqa: T201
+    hoard = b"x" * (wanted.hog_mb << 20)
     for number in range(wanted.flood):
         print(f"line {number}")  # noqa: T201
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
@@ -63,6 +66,7 @@ def main() -> int:
             draft.write_text(json.dumps({"port": bound.getsockname()[1], "pid": os.getpid()}))
             draft.replace(ready)
         ended.wait()
+    del hoard
     return 0
 
 

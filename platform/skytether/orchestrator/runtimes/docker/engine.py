@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 _POOL = 32
 """Connections that are kept: as many calls may be under way at once."""
+_OLDEST = "1.41"
+"""Version of the engine's interface with which its newest is asked for: Docker 20.10's."""
 _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 
@@ -59,14 +61,19 @@ class Engine:
 
     def _connect(self, timeout: float) -> APIClient:
         address, tls = self._options.engine, self._options.tls
-        arguments: dict[str, Any] = {"version": "auto", "timeout": timeout, "max_pool_size": _POOL}
+        arguments: dict[str, Any] = {"timeout": timeout, "max_pool_size": _POOL}
         if self._tunnel is not None:
-            return APIClient(f"unix://{self._tunnel.open()}", **arguments)
+            address = f"unix://{self._tunnel.open()}"
         if tls is not None:
             pair = (tls.cert, tls.key)
             arguments["tls"] = TLSConfig(client_cert=pair, ca_cert=tls.ca, verify=True)
             address = address.replace("tcp://", "https://", 1)
-        return APIClient(address, **arguments)
+        first = _plain(APIClient(address, version=_OLDEST, **arguments))
+        try:
+            version = str(first.version(api_version=False)["ApiVersion"])
+        finally:
+            first.close()
+        return _plain(APIClient(address, version=version, **arguments))
 
     def drop(self) -> None:
         """Let go of all connections; the next call makes new ones."""
@@ -93,6 +100,12 @@ class Engine:
             raise EngineGoneError(
                 f"the Docker engine at {self._options.engine} does not answer: {root_cause(error)}"
             ) from error
+
+
+def _plain(client: APIClient) -> APIClient:
+    """Without what the environment says of proxies and authorities: it is meant for the Internet, not for an engine."""
+    client.trust_env = False
+    return client
 
 
 def explain(error: APIError) -> str:

@@ -1,0 +1,389 @@
+"""The Docker runtime on a real engine: what the contract does not ask of every runtime."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import socket
+import ssl
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from docker_site import DockerSite
+from engine_ways import EngineProxy, Registry, ssh_server
+
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec
+from skytether.lab.bench.transports.certificate import write_certificate
+from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.docker import DockerRuntime
+
+pytestmark = [pytest.mark.docker, pytest.mark.slow]
+
+KEY = base64.b64encode(bytes(range(32))).decode()
+PATIENCE = 30.0
+PYTHON = "/app/bin/python"
+
+
+def launch(site: DockerSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
+    params, image = more.pop("params", {}), more.pop("image", site.images.toy)
+    grant = Grant(
+        instance=instance,
+        service="toy",
+        robot="walker",
+        params=params,
+        session_id="00112233445566aa",
+        session_key=KEY,
+        topics=(),
+    )
+    return Launch(attempt, ServiceSpec.model_validate({"image": image, **more}), grant)
+
+
+def until(what: Callable[[], Any]) -> Any:
+    """Wait for a condition; gives what it gave."""
+    deadline = time.monotonic() + PATIENCE
+    while not (found := what()):
+        assert time.monotonic() < deadline, "it did not come to pass"
+        time.sleep(0.02)
+    return found
+
+
+def until_phase(runtime: DockerRuntime, phase: Phase, instance: str = "i1") -> Observation:
+    def there() -> Observation | None:
+        seen = runtime.observe().get(instance)
+        return seen if seen is not None and seen.phase is phase else None
+
+    return until(there)
+
+
+def until_gone(runtime: DockerRuntime) -> str:
+    """Why it does not answer, once it does not."""
+
+    def failure() -> str:
+        try:
+            runtime.observe()
+        except RuntimeFailure as error:
+            return str(error)
+        return ""
+
+    return until(failure)
+
+
+def docker(*arguments: str, check: bool = True) -> str:
+    done = subprocess.run(["docker", *arguments], capture_output=True, text=True)
+    assert not check or done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def inside(container: str, program: str) -> Any:
+    """What a Python program in the container prints, as JSON."""
+    return json.loads(docker("exec", container, PYTHON, "-c", program))
+
+
+@pytest.fixture
+def runtime(docker_site: DockerSite, tmp_path: Path) -> Iterator[DockerRuntime]:
+    with closing(docker_site.open(tmp_path)) as runtime:
+        yield runtime
+
+
+@pytest.fixture
+def host_ports() -> Iterator[dict[str, int]]:
+    """Ports of this machine, as an orchestrator or anything else may have them open: TCP and UDP."""
+    with socket.create_server(("0.0.0.0", 0)) as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+        udp.bind(("0.0.0.0", 0))
+        udp.settimeout(1)
+        yield {"tcp": tcp.getsockname()[1], "udp": udp.getsockname()[1], "fd": udp.fileno()}
+
+
+_TRY = """
+import json, socket
+from concurrent.futures import ThreadPoolExecutor
+def reaches(address):
+    try:
+        socket.create_connection(address, timeout=1.5).close()
+    except OSError:
+        return False
+    return True
+with ThreadPoolExecutor(64) as pool:
+    print(json.dumps(list(pool.map(reaches, TRIED))))
+"""
+
+
+def addresses() -> list[str]:
+    """All of this machine's, bridges of the engine among them."""
+    rows = json.loads(subprocess.run(["ip", "-j", "-4", "address"], check=True, capture_output=True).stdout)
+    return [a["local"] for row in rows for a in row["addr_info"] if not a["local"].startswith("127.")]
+
+
+def test_a_container_reaches_nobody(
+    docker_site: DockerSite, runtime: DockerRuntime, host_ports: dict[str, int]
+) -> None:
+    for instance in ("i1", "i2"):
+        runtime.start(launch(docker_site, instance))
+    until_phase(runtime, Phase.RUNNING, "i1")
+    until_phase(runtime, Phase.RUNNING, "i2")
+    one, other = docker_site.containers()
+    network = json.loads(docker("network", "inspect", docker_site.network))[0]
+    gateway = network["IPAM"]["Config"][0]["Gateway"]
+    neighbour = network["Containers"][other]["IPv4Address"].partition("/")[0]
+    tried = [(host, host_ports["tcp"]) for host in {gateway, *addresses()}] + [(neighbour, 22), ("192.0.2.1", 80)]
+    # The same question from a container on the engine's own network shows that it is a good one.
+    asked = _TRY.replace("TRIED", repr(tried[:1]))
+    free = docker("run", "--rm", "--entrypoint", PYTHON, docker_site.images.toy, "-c", asked)
+    assert json.loads(free) == [True]
+    assert inside(one, _TRY.replace("TRIED", repr(tried))) == [False] * len(tried)
+    send = "import socket; s = socket.socket(type=socket.SOCK_DGRAM)"
+    inside(one, f"{send}\nfor h in {[gateway, *addresses()]!r}: s.sendto(b'x', (h, {host_ports['udp']}))\nprint(1)")
+    with socket.fromfd(host_ports["fd"], socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.settimeout(1)
+        with pytest.raises(TimeoutError):
+            udp.recv(10)
+
+
+def test_a_container_may_do_little(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    runtime.start(launch(docker_site, needs={"memory_mb": 100}, limits={"cpu": 0.5, "pids": 40}))
+    until_phase(runtime, Phase.RUNNING)
+    (container,) = docker_site.containers()
+    status = inside(
+        container,
+        "import json; print(json.dumps(dict(l.split(':', 1) for l in open('/proc/self/status').read().splitlines())))",
+    )
+    said = {key: value.split() for key, value in status.items()}
+    assert set(said["Uid"]) == set(said["Gid"]) == {"65532"}
+    assert {said[key][0] for key in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
+    assert said["NoNewPrivs"] == ["1"]
+    assert said["Seccomp"] == ["2"]
+    tried = inside(
+        container,
+        """
+import json, os
+def writes(folder):
+    try:
+        open(os.path.join(folder, "x"), "w").close()
+    except OSError as error:
+        return error.strerror
+    return ""
+print(json.dumps([writes(f) for f in ("/", "/app", "/run/skytether", "/tmp", "/run/skytether/data/i1")]))
+""",
+    )
+    assert tried == ["Read-only file system", "Read-only file system", "Permission denied", "", ""]
+    host = json.loads(docker("inspect", container))[0]["HostConfig"]
+    assert (host["Memory"], host["NanoCpus"], host["PidsLimit"]) == (100 << 20, 500_000_000, 40)
+    assert 10 < inside(container, _THREADS) < 40
+
+
+_THREADS = """
+import threading, time
+n = 0
+try:
+    while n < 60:
+        threading.Thread(target=time.sleep, args=(3,), daemon=True).start()
+        n += 1
+except RuntimeError:
+    pass
+print(n)
+"""
+
+
+def test_the_key_is_seen_by_the_service_alone(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    runtime.start(launch(docker_site, params={"environment": True}))
+    until_phase(runtime, Phase.RUNNING)
+    (container,) = docker_site.containers()
+    grant = "/run/skytether/instance/grant.json"
+    assert inside(container, f"print(open('{grant}').read())")["session_key"] == KEY
+    mode = inside(container, f"import json, os; s = os.stat('{grant}'); print(json.dumps([s.st_uid, oct(s.st_mode)]))")
+    assert mode == [65_532, "0o100400"]
+    assert docker("exec", "-u", "1000:1000", container, "cat", grant, check=False) == ""
+    told = [docker("inspect", container), docker("exec", container, "env"), docker("logs", container)]
+    told.append(docker("top", container, "-eo", "pid,args"))
+    assert not [text for text in told if KEY in text]
+    volume = next(m for m in json.loads(told[0])[0]["Mounts"] if m["Destination"] == "/run/skytether")
+    runtime.remove("i1")
+    assert volume["Name"] not in docker("volume", "ls", "-q").split()
+
+
+def test_what_it_writes_stays(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    runtime.start(launch(docker_site))
+    until_phase(runtime, Phase.RUNNING)
+    (container,) = docker_site.containers()
+    inside(container, "open('/run/skytether/data/i1/recording', 'w').write('kept'); print(1)")
+    runtime.remove("i1")
+    assert docker_site.containers() == []
+    (volume,) = docker_site.volumes()
+    toy = docker_site.images.toy
+    assert docker("run", "--rm", "-v", f"{volume}:/d", "--entrypoint", "cat", toy, "/d/i1/recording") == "kept"
+
+
+def test_ends_are_told_apart(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    runtime.start(launch(docker_site, "hog", params={"hog_mb": 200}, needs={"memory_mb": 40}))
+    runtime.start(launch(docker_site, "killed"))
+    runtime.start(launch(docker_site, "missing", image="skytether/no-such-thing:1"))
+    runtime.start(launch(docker_site, "bad", params={"exit_status": 3, "say": "boom"}))
+    until_phase(runtime, Phase.RUNNING, "killed")
+    docker("kill", *[c for c in docker_site.containers() if "killed" in docker("inspect", "-f", "{{.Name}}", c)])
+    assert until_phase(runtime, Phase.EXITED, "killed").exit_status == -9
+    hog = until_phase(runtime, Phase.EXITED, "hog")
+    assert hog.detail.startswith("ran out of memory: its limit is 40 MiB")
+    missing = until_phase(runtime, Phase.EXITED, "missing")
+    assert missing.detail.startswith("could not be started: image 'skytether/no-such-thing:1' is not on the engine")
+    bad = until_phase(runtime, Phase.EXITED, "bad")
+    assert (bad.exit_status, bad.detail, bad.last_line) == (3, "", "boom")
+
+
+def test_a_port_that_is_taken(docker_site: DockerSite, tmp_path: Path) -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        with closing(docker_site.open(tmp_path, ports=[port, port])) as runtime:
+            runtime.start(launch(docker_site))
+            seen = until_phase(runtime, Phase.EXITED)
+            assert (
+                seen.detail == f"could not be started: every UDP port from {port} to {port} is taken (option 'ports')"
+            )
+            assert docker_site.containers() == []
+
+
+def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
+    image = docker_site.images.name("ill")
+    often = "--interval=200ms --start-period=1ms --retries=2"
+    check = f'HEALTHCHECK {often} CMD ["/bin/sh", "-c", "echo its arm is stuck; exit 1"]'
+    (tmp_path / "Dockerfile").write_text(f"FROM {docker_site.images.toy}\n{check}\n")
+    environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
+    subprocess.run(
+        ["docker", "build", "-q", "-t", image, str(tmp_path)], check=True, env=environment, capture_output=True
+    )
+    try:
+        runtime.start(launch(docker_site, image=image))
+        until(lambda: (seen := runtime.observe()["i1"]).phase is Phase.RUNNING and seen.detail == "its arm is stuck")
+    finally:
+        runtime.remove("i1")
+        docker("image", "rm", "-f", image)
+
+
+def test_what_is_not_ours_is_left_alone(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    labels = ["--label", "skytether.io/instance=i1", "--label", "skytether.io/attempt=1"]
+    toy, sleep = docker_site.images.toy, ["--entrypoint", "sleep"]
+    plain = docker("run", "-d", *sleep, toy, "100")
+    elsewhere = docker("run", "-d", *labels, "--label", "skytether.io/owner=somebody-else", *sleep, toy, "100")
+    try:
+        assert runtime.observe() == {}
+        runtime.start(launch(docker_site))
+        until_phase(runtime, Phase.RUNNING)
+        runtime.stop("i1", force=True)
+        runtime.remove("i1")
+        states = [docker("inspect", "-f", "{{.State.Status}}", c) for c in (plain, elsewhere)]
+        assert states == ["running", "running"]
+    finally:
+        docker("rm", "-f", plain, elsewhere)
+
+
+def test_an_engine_that_goes_away_and_comes_back(docker_site: DockerSite, tmp_path: Path) -> None:
+    proxy = EngineProxy(tmp_path / "engine.sock")
+    with closing(docker_site.open(tmp_path, engine=proxy.engine)) as runtime:
+        assert "does not answer: No such file or directory" in until_gone(runtime)
+        proxy.start()
+        until(lambda: runtime_answers(runtime))
+        runtime.start(launch(docker_site))
+        before = until_phase(runtime, Phase.RUNNING)
+        proxy.cut()
+        assert "does not answer" in until_gone(runtime)
+        with pytest.raises(RuntimeFailure):
+            runtime.capacity()
+        with pytest.raises(RuntimeFailure):
+            runtime.logs("i1", 10)
+        (container,) = docker_site.containers()
+        docker("kill", container)  # while nobody looks
+        proxy.start()
+        until(lambda: runtime_answers(runtime))
+        after = until_phase(runtime, Phase.EXITED)
+        assert (after.attempt, after.exit_status) == (before.attempt, -9)
+    proxy.cut()
+
+
+def runtime_answers(runtime: DockerRuntime) -> bool:
+    try:
+        runtime.observe()
+    except RuntimeFailure:
+        return False
+    return True
+
+
+def test_an_engine_behind_tls(docker_site: DockerSite, tmp_path: Path) -> None:
+    ca, cert, key = map(str, write_certificate("127.0.0.1", tmp_path))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(cert, key)
+    context.load_verify_locations(ca)
+    context.verify_mode = ssl.CERT_REQUIRED
+    proxy = EngineProxy(context=context)
+    proxy.start()
+    folder = tmp_path / "stranger"
+    folder.mkdir()
+    stranger = dict(zip(("ca", "cert", "key"), map(str, write_certificate("127.0.0.1", folder)), strict=True))
+    try:
+        ours = {"engine": proxy.engine, "tls": {"ca": ca, "cert": cert, "key": key}, "bind_host": "127.0.0.1"}
+        with closing(docker_site.open(tmp_path, **ours)) as runtime:
+            runtime.start(launch(docker_site))
+            seen = until_phase(runtime, Phase.RUNNING)
+            assert seen.host == "127.0.0.1"
+            assert "toy service" in runtime.logs("i1", 10)
+        for wrong in (stranger, {**stranger, "ca": ca}):  # we do not know it; it does not know us
+            with closing(docker_site.open(tmp_path, **{**ours, "tls": wrong})) as runtime:
+                assert "does not answer" in until_gone(runtime)
+    finally:
+        proxy.cut()
+
+
+def test_an_engine_behind_ssh(sshd: str, docker_site: DockerSite, tmp_path: Path) -> None:
+    with ssh_server(sshd) as options:
+        with closing(docker_site.open(tmp_path, **options, bind_host="127.0.0.1")) as runtime:
+            runtime.start(launch(docker_site))
+            seen = until_phase(runtime, Phase.RUNNING)
+            assert seen.host == "127.0.0.1"
+            assert "toy service" in runtime.logs("i1", 10)
+            tunnel = runtime._engine._tunnel
+            assert tunnel is not None
+            assert tunnel._process is not None
+            tunnel._process.kill()  # the network is gone for a moment
+            tunnel._process.wait()
+            until(lambda: runtime_answers(runtime) and runtime.observe()["i1"].phase is Phase.RUNNING)
+            runtime.stop("i1", force=True)
+            until_phase(runtime, Phase.EXITED)
+        unknown = {**options, "ssh": {**options["ssh"], "known_hosts": str(tmp_path / "none")}}
+        with closing(docker_site.open(tmp_path, **unknown)) as runtime:
+            assert "Host key verification failed" in until_gone(runtime)
+
+
+def test_a_private_registry_with_digests(docker_site: DockerSite, tmp_path: Path) -> None:
+    registry = Registry()
+    pinned = f"{registry.image}@{registry.digest}"
+    told: set[str] = set()
+    try:
+        wrong = registry.credentials(tmp_path, "open")
+        with closing(docker_site.open(tmp_path, pull="missing", registry_auth=wrong)) as runtime:
+            runtime.start(launch(docker_site, image=pinned))
+            seen = until_phase(runtime, Phase.EXITED)
+            assert seen.detail.startswith(f"could not be started: image '{pinned}' is not on the engine and cannot")
+        right = registry.credentials(tmp_path)
+        with closing(docker_site.open(tmp_path, pull="missing", registry_auth=right, pinned=True)) as runtime:
+            assert "digest" in str(runtime.refuses(ServiceSpec(image=f"{registry.image}:1")))
+            runtime.start(launch(docker_site, image=pinned, attempt=2))
+
+            def ended() -> bool:
+                seen = runtime.observe()["i1"]
+                told.add(seen.detail)
+                return seen.phase is Phase.EXITED
+
+            until(ended)
+            # It came as it is named; that there is nothing in it to run is another matter.
+            assert registry.digest in docker("image", "inspect", "-f", "{{.RepoDigests}}", pinned)
+            assert any(text.endswith(" of 3 MB") for text in told), told
+            assert runtime.observe()["i1"].exit_status == 127
+    finally:
+        registry.close()
+        docker("image", "rm", "-f", pinned, check=False)
