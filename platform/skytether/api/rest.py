@@ -168,6 +168,14 @@ class Report(Strict):
     """Who drives: ``cloud``, ``fallback`` or ``stop``."""
     fallback_transitions: dict[str, int] = {}
     """Counted by bounded reason."""
+    objections: dict[str, int] = {}
+    """What the velocity supervisor found wrong with commands, counted by bounded kind."""
+    load: float | None = None
+    """Share of the robot's processors that is busy."""
+    battery: float | None = None
+    """Charge, 0 to 1."""
+    overruns: int | None = None
+    """Ticks of the control loop that came more than a period late."""
 
 
 class Migrate(Strict):

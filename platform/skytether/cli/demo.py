@@ -64,7 +64,7 @@ def _walk(running: Demo) -> DemoResult:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from skytether.robot import driver as robot_driver
-    from skytether.robot.agent import AgentStatus
+    from skytether.robot.snapshot import AgentStatus
 
     logging.getLogger(robot_driver.__name__).setLevel(logging.ERROR)  # its hand-overs are told here, in people's words
     handed_over = 0.0

@@ -11,22 +11,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from skytether.api.manifest import ANY_TOPIC
-from skytether.api.rest import Refusal, Report, TopicReport
+from skytether.api.report_metrics import INSTANCE, Sums, counter, gauge, of_reports
+from skytether.api.rest import Refusal, Report
 
 from .records import Record
 from .runtimes.base import Capacity, Observation
 
-OUTCOMES = ("sent", "delivered", "lost", "late", "expired", "replaced", "superseded", "duplicate")
-SOURCES = ("cloud", "fallback", "stop")
 _REASON = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _MAX_REASONS = 32
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0, 30.0)
-_TOPIC = ("robot", "service", "topic", "priority", "direction")
-_INSTANCE = ("robot", "service", "site")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +97,13 @@ class Metrics(Collector):
         """A robot's report on one instance, without what would make series that nobody declared."""
         known = {topic.name for topic in record.spec.topics}
         topics = [t for t in report.topics if t.topic in known or ANY_TOPIC in known][: self._max_topics]
-        reasons = {r: n for r, n in report.fallback_transitions.items() if _REASON.fullmatch(r)}
-        bounded = dict(list(reasons.items())[:_MAX_REASONS])
-        return report.model_copy(update={"topics": tuple(topics), "fallback_transitions": bounded})
+        return report.model_copy(
+            update={
+                "topics": tuple(topics),
+                "fallback_transitions": _few(report.fallback_transitions),
+                "objections": _few(report.objections),
+            }
+        )
 
     def forget_site(self, site: str) -> None:
         self._start.remove_by_labels({"site": site})
@@ -122,50 +123,23 @@ class Metrics(Collector):
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield from _instances(running)
         yield from _sites(self._sites(), running)
-        yield from _control(reports)
-        yield from _topics([(record, topic) for record, report in reports for topic in report.topics])
-
-
-class _Sums(dict[tuple[str, ...], float]):
-    """Samples by labels. A robot may hold two instances of one service: counts add up, and of gauges the last stays."""
-
-    def add(self, labels: Iterable[object], value: float) -> None:
-        key = tuple(str(label) for label in labels)
-        self[key] = self.get(key, 0.0) + value
-
-    def put(self, labels: Iterable[object], value: float | None) -> None:
-        if value is not None:
-            self[tuple(str(label) for label in labels)] = value
-
-
-def _gauge(name: str, text: str, labels: Iterable[str], samples: Mapping[tuple[str, ...], float]) -> Metric:
-    family = GaugeMetricFamily(f"skytether_{name}", text, labels=list(labels))
-    for key, value in samples.items():
-        family.add_metric(key, value)
-    return family
-
-
-def _counter(name: str, text: str, labels: Iterable[str], samples: Mapping[tuple[str, ...], float]) -> Metric:
-    family = CounterMetricFamily(f"skytether_{name}", text, labels=list(labels))
-    for key, value in samples.items():
-        family.add_metric(key, value)
-    return family
+        yield from of_reports([((r.robot, r.service, r.site or ""), report) for r, report in reports])
 
 
 def _instances(running: Iterable[Running]) -> Iterator[Metric]:
-    cpu, memory = _Sums(), _Sums()
+    cpu, memory = Sums(), Sums()
     for one in running:
         labels = (one.record.robot, one.record.service, one.record.site or "")
         if one.observation and one.observation.cpu_s is not None:
             cpu.add(labels, one.observation.cpu_s)
         if one.observation and one.observation.memory_bytes is not None:
             memory.add(labels, one.observation.memory_bytes)
-    yield _counter("instance_cpu_seconds", "Processor time of the present runs", _INSTANCE, cpu)
-    yield _gauge("instance_memory_bytes", "Resident memory", _INSTANCE, memory)
+    yield counter("instance_cpu_seconds", "Processor time of the present runs", INSTANCE, cpu)
+    yield gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
 
 
 def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Metric]:
-    up, cores, memory, load, promised, count = _Sums(), _Sums(), _Sums(), _Sums(), _Sums(), _Sums()
+    up, cores, memory, load, promised, count = Sums(), Sums(), Sums(), Sums(), Sums(), Sums()
     for site in sites:
         labels = (site.name,)
         up.put(labels, float(site.capacity is not None))
@@ -179,40 +153,14 @@ def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[
         if (one.record.site or "",) in up:
             promised.add((one.record.site,), one.record.spec.needs.cpu)
             count.add((one.record.site,), 1)
-    yield _gauge("site_up", "1 while the site answers", ("site",), up)
-    yield _gauge("site_cpu_cores", "Processors of the site", ("site",), cores)
-    yield _gauge("site_memory_bytes", "Memory of the site", ("site",), memory)
-    yield _gauge("site_load_ratio", "Share of the site's processors that is busy", ("site",), load)
-    yield _gauge("site_promised_cpu_cores", "Processors that the instances there asked for", ("site",), promised)
-    yield _gauge("site_instances", "Instances there that have not ended", ("site",), count)
+    yield gauge("site_up", "1 while the site answers", ("site",), up)
+    yield gauge("site_cpu_cores", "Processors of the site", ("site",), cores)
+    yield gauge("site_memory_bytes", "Memory of the site", ("site",), memory)
+    yield gauge("site_load_ratio", "Share of the site's processors that is busy", ("site",), load)
+    yield gauge("site_promised_cpu_cores", "Processors that the instances there asked for", ("site",), promised)
+    yield gauge("site_instances", "Instances there that have not ended", ("site",), count)
 
 
-def _control(reports: Iterable[tuple[Record, Report]]) -> Iterator[Metric]:
-    rtt, source, transitions = _Sums(), _Sums(), _Sums()
-    for record, report in reports:
-        rtt.put((record.robot, record.service, record.site or ""), report.rtt_s)
-        if report.control_source in SOURCES:
-            for name in SOURCES:
-                source.put((record.robot, record.service, name), float(name == report.control_source))
-        for reason, count in report.fallback_transitions.items():
-            transitions.add((record.robot, record.service, reason), count)
-    yield _gauge("path_rtt_seconds", "Round trip between robot and service", _INSTANCE, rtt)
-    yield _gauge("control_source", "1 for who drives, 0 for who does not", ("robot", "service", "source"), source)
-    labels = ("robot", "service", "reason")
-    yield _counter("fallback_transitions", "Hand-overs to the robot's own controller", labels, transitions)
-
-
-def _topics(topics: Iterable[tuple[Record, TopicReport]]) -> Iterator[Metric]:
-    delay, jitter, messages, sent = _Sums(), _Sums(), _Sums(), _Sums()
-    for record, topic in topics:
-        labels = (record.robot, record.service, topic.topic, topic.priority, topic.direction)
-        delay.put((*labels, "0.5"), topic.delay_p50_s)
-        delay.put((*labels, "0.99"), topic.delay_p99_s)
-        jitter.put(labels, topic.jitter_s)
-        sent.add(labels, topic.bytes_sent)
-        for outcome in OUTCOMES:
-            messages.add((*labels, outcome), getattr(topic, outcome))
-    yield _gauge("topic_one_way_delay_seconds", "From publish to delivery", (*_TOPIC, "quantile"), delay)
-    yield _gauge("topic_jitter_seconds", "Mean difference of successive delays", _TOPIC, jitter)
-    yield _counter("topic_messages", "Messages of the present session", (*_TOPIC, "outcome"), messages)
-    yield _counter("topic_bytes", "Bytes sent, redundancy included", _TOPIC, sent)
+def _few(counts: Mapping[str, int]) -> dict[str, int]:
+    """Of counts by reason, those whose reason can be a label, and not too many."""
+    return dict([(reason, n) for reason, n in counts.items() if _REASON.fullmatch(reason)][:_MAX_REASONS])

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from math import isfinite, nan
+from math import nan
 from random import Random
 from types import TracebackType
 from typing import Any
@@ -31,15 +31,17 @@ from . import fallback
 from .arbiter import Needs
 from .asker import Asker, Orchestrator
 from .command import Source
-from .driver import Base, Driver, DriverStatus, Observer
+from .driver import Base, Driver, Observer
 from .graph_base import Graph
 from .link import Quality
 from .notices import Notices
 from .service_manager import ServiceManager, terms
 from .session import Endpoint, LiveSession
+from .snapshot import AgentStatus, report
+from .status import StatusServer, document, metrics
 from .supervisor import Limits
 from .table import Offer, robot_table
-from .task_manager import Decision, PathQuality
+from .task_manager import PathQuality, RobotView
 from .tasks import TaskConfig, Tasks
 
 _log = logging.getLogger(__name__)
@@ -105,35 +107,6 @@ class AgentConfig:
     fresh_token: Callable[[], str] | None = None
     status_port: int | None = None
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
-
-
-@dataclass(frozen=True, slots=True)
-class AgentStatus:
-    """A snapshot of everything. Times are monotonic seconds.
-
-    Attributes:
-        driver: What the control loop knows.
-        instance: The last that was heard of it.
-        trouble: What stands in the way of a session, in one sentence; empty while all is well.
-        asked_at: When the service was first asked for.
-        connected: The bridge has a session.
-        session: The bridge's counters.
-        rtt: Round trip [s].
-        loss: Share of messages lost over the last seconds.
-        overruns: Ticks that started more than one period late.
-        decision: The task manager's; None: there is none.
-    """
-
-    driver: DriverStatus
-    instance: rest.Instance | None
-    trouble: str
-    asked_at: float | None
-    connected: bool
-    session: SessionStats | None
-    rtt: float
-    loss: float
-    overruns: int
-    decision: Decision | None = None
 
 
 MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
@@ -215,11 +188,13 @@ class Agent:
         self._overruns = 0
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._server: StatusServer | None = None
 
     def start(self) -> None:
         """Start driving and asking; returns at once."""
         warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
+        self._serve()
         targets = [self._control, self._ask, self._watch, *([self._decide] if self._tasks else [])]
         for target in targets:
             thread = threading.Thread(target=target, name=f"agent{target.__name__}", daemon=True)
@@ -235,12 +210,33 @@ class Agent:
                 _log.error("thread %s does not end; going on without it", thread.name)
         self._threads.clear()
         self._driver.halt()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
         session, self._driver.session = self._driver.session, None
         if session is not None:
             session.close()
         self._asker.release()
         if self._own_client is not None:
             self._own_client.close()
+
+    @property
+    def status_port(self) -> int | None:
+        """Where ``/status`` and ``/metrics`` are on loopback; None: nowhere."""
+        return self._server.port if self._server else None
+
+    def _serve(self) -> None:
+        config = self._config
+        if config.status_port is None:
+            return
+        try:
+            self._server = StatusServer(
+                config.status_port,
+                lambda: document(config.robot, config.service, self.status(), self._clock()),
+                lambda: metrics(config.robot, config.service, self.status(), self.report()),
+            )
+        except OSError as error:  # somebody else has the port; that is no reason not to drive
+            _log.error("no status on port %d of loopback: %s", config.status_port, error.strerror)
 
     def tick(self, now: float) -> None:
         """One turn of the control loop; called by its thread, or by a test with made-up time."""
@@ -264,12 +260,23 @@ class Agent:
             rtt=self._driver.quality.rtt,
             loss=self._driver.quality.loss,
             overruns=self._overruns,
+            late=self._driver.quality.late,
             decision=self._tasks.decision if self._tasks else None,
+            load=self._tasks.robot.load if self._tasks else nan,
+            battery=self._tasks.robot.battery if self._tasks else None,
         )
 
     def report(self) -> rest.Report:
         """What the orchestrator is told with each renewal."""
-        return report(self._driver.status(), self._stats, self._driver.quality.rtt)
+        robot = self._tasks.robot if self._tasks else RobotView()
+        return report(
+            self._driver.status(),
+            self._stats,
+            self._driver.quality.rtt,
+            load=robot.load,
+            battery=robot.battery,
+            overruns=self._overruns,
+        )
 
     def _control(self) -> None:
         period = 1 / self._config.rate_hz
@@ -414,36 +421,3 @@ class Agent:
 def offers(topics: Mapping[str, type[Message]]) -> dict[str, Offer]:
     """What a robot with these message classes can send."""
     return {name: Offer(cls.TYPE, type_hash(cls, "cdr"), "cdr") for name, cls in topics.items()}
-
-
-def report(driver: DriverStatus | None, stats: SessionStats | None, rtt: float) -> rest.Report:
-    """Say for the orchestrator's metrics what bridge and control loop counted."""
-    return rest.Report(
-        rtt_s=_known(rtt),
-        topics=tuple(
-            rest.TopicReport(
-                topic=topic.topic,
-                direction="in" if topic.direction == "in" else "out",
-                priority=topic.priority,
-                sent=topic.sent,
-                delivered=topic.delivered,
-                lost=topic.lost,
-                late=topic.late,
-                expired=topic.expired,
-                replaced=topic.replaced,
-                superseded=topic.superseded,
-                duplicate=topic.duplicate,
-                bytes_sent=topic.bytes_sent,
-                delay_p50_s=_known(topic.delay_p50),
-                delay_p99_s=_known(topic.delay_p99),
-                jitter_s=_known(topic.jitter),
-            )
-            for topic in (stats.topics if stats else ())
-        ),
-        control_source=driver.source if driver else None,
-        fallback_transitions=dict(driver.transition_counts) if driver else {},
-    )
-
-
-def _known(value: float) -> float | None:
-    return value if isfinite(value) else None

@@ -24,9 +24,10 @@ from skytether.wire.events import Connected, Event, MessageReceived, Refused
 from skytether.wire.stats import SessionStats, TopicStats
 from skytether.wire.topic import Direction, Role, Topic
 
-from .agent import Address, report
+from .agent import Address
 from .asker import Asker, Orchestrator
 from .bag import Bag
+from .snapshot import report
 from .table import robot_table
 
 _START_S = 30.0

@@ -1,0 +1,96 @@
+"""``skytether robot status``: what the agent on this machine does, and why."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .connection import Json
+from .output import console, fail, print_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_TIMEOUT_S = 5.0
+
+
+def status(
+    port: Annotated[
+        int, typer.Option(min=1, max=65_535, envvar="SKYTETHER_STATUS_PORT", help="status_port of robot.yaml.")
+    ] = 8610,
+    json: Json = False,
+) -> None:
+    """Show who drives this robot and why, where its service runs, and what the link is like.
+
+    Asks the agent on this machine (`skytether robot run`), not the orchestrator.
+    """
+    import httpx
+
+    try:
+        answer = httpx.get(f"http://127.0.0.1:{port}/status", timeout=_TIMEOUT_S, trust_env=False)
+        answer.raise_for_status()
+        found = answer.json()
+        if json:
+            print_json(found)
+            return
+        for table in _tables(found):
+            console.print(table)
+    except (httpx.TransportError, OSError):
+        fail(f"no agent answers on port {port} of this machine; start one with `skytether robot run robot.yaml`")
+    except (httpx.HTTPStatusError, ValueError, KeyError, TypeError):
+        fail(f"what answers on port {port} of this machine is no agent; give its status_port with --port")
+
+
+def _tables(found: dict[str, Any]) -> list[Table]:
+    from rich.table import Table
+
+    link, task, instance = found["link"], found["task"], found["instance"]
+    about = Table(title=f"{found['robot']}: {found['service']}", show_header=False, title_justify="left")
+    rows = [
+        ("driven by", f"{found['source']} ({found['why']})"),
+        ("velocity", _velocity(found["velocity"])),
+        ("task", task["why"] if task else "the service is always asked for"),
+        ("service", _instance(instance)),
+        ("link", _link(link)),
+        ("processors", _share(found["robot_load"])),
+        ("battery", _share(found["battery"])),
+        ("trouble", found["trouble"] or "none"),
+    ]
+    for name, value in rows:
+        about.add_row(name, value)
+    tables = [about]
+    if task and task["options"]:
+        options = Table("where", "cost", "of which", title="Where it could be done", title_justify="left")
+        for option in task["options"]:
+            parts = ", ".join(f"{name} {value:.2f}" for name, value in option["parts"].items())
+            cost = "-" if option["cost"] is None else f"{option['cost']:.2f}"
+            options.add_row(option["name"], cost, option["refused"] or parts)
+        tables.append(options)
+    changes = Table("ago [s]", "driven by", "because", title="Hand-overs", title_justify="left")
+    for change in reversed(found["transitions"]):
+        changes.add_row(f"{change['ago_s']:.1f}", change["source"], change["reason"])
+    tables.append(changes)
+    return tables
+
+
+def _instance(instance: dict[str, Any] | None) -> str:
+    if instance is None:
+        return "none"
+    where = f" at {instance['site']}" if instance["site"] else ""
+    return f"{instance['id']}: {instance['state']}{where}{', ' + instance['reason'] if instance['reason'] else ''}"
+
+
+def _link(link: dict[str, Any]) -> str:
+    if not link["connected"]:
+        return "not connected"
+    rtt = "-" if link["rtt_ms"] is None else f"{link['rtt_ms']:.1f} ms"
+    return f"round trip {rtt}, lost {_share(link['loss'])}, late {_share(link['late'])}"
+
+
+def _velocity(velocity: dict[str, float]) -> str:
+    return f"{velocity['linear_m_s']:.2f} m/s, {velocity['angular_rad_s']:.2f} rad/s"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0%}"

@@ -1,0 +1,92 @@
+"""What an agent says of itself: a snapshot for those who look, a report for the orchestrator. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, nan
+
+from skytether.api import rest
+from skytether.wire.stats import SessionStats
+
+from .driver import DriverStatus
+from .task_manager import Decision
+
+
+@dataclass(frozen=True, slots=True)
+class AgentStatus:
+    """A snapshot of everything. Times are monotonic seconds.
+
+    Attributes:
+        driver: What the control loop knows.
+        instance: The last that was heard of it.
+        trouble: What stands in the way of a session, in one sentence; empty while all is well.
+        asked_at: When the service was first asked for.
+        connected: The bridge has a session.
+        session: The bridge's counters.
+        rtt: Round trip [s].
+        loss: Share of messages lost over the last seconds.
+        overruns: Ticks that started more than one period late.
+        late: Share of messages that missed their lifespan over the last seconds.
+        decision: The task manager's; None: there is none.
+        load: Share of the robot's processors that is busy; NaN: not known.
+        battery: Charge, 0 to 1; None: not known.
+    """
+
+    driver: DriverStatus
+    instance: rest.Instance | None
+    trouble: str
+    asked_at: float | None
+    connected: bool
+    session: SessionStats | None
+    rtt: float
+    loss: float
+    overruns: int
+    late: float = nan
+    decision: Decision | None = None
+    load: float = nan
+    battery: float | None = None
+
+
+def report(
+    driver: DriverStatus | None,
+    stats: SessionStats | None,
+    rtt: float,
+    *,
+    load: float = nan,
+    battery: float | None = None,
+    overruns: int | None = None,
+) -> rest.Report:
+    """Say for the orchestrator's metrics what bridge and control loop counted."""
+    return rest.Report(
+        rtt_s=_known(rtt),
+        topics=tuple(
+            rest.TopicReport(
+                topic=topic.topic,
+                direction="in" if topic.direction == "in" else "out",
+                priority=topic.priority,
+                sent=topic.sent,
+                delivered=topic.delivered,
+                lost=topic.lost,
+                late=topic.late,
+                expired=topic.expired,
+                replaced=topic.replaced,
+                superseded=topic.superseded,
+                duplicate=topic.duplicate,
+                bytes_sent=topic.bytes_sent,
+                delay_p50_s=_known(topic.delay_p50),
+                delay_p99_s=_known(topic.delay_p99),
+                jitter_s=_known(topic.jitter),
+            )
+            for topic in (stats.topics if stats else ())
+        ),
+        control_source=driver.source if driver else None,
+        fallback_transitions=dict(driver.transition_counts) if driver else {},
+        objections=dict(driver.objections) if driver else {},
+        load=_known(load),
+        battery=battery,
+        overruns=overruns,
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if isfinite(value) else None

@@ -1,0 +1,204 @@
+"""How the robot is, for whoever asks on the robot itself: ``/status`` as JSON, ``/metrics`` for Prometheus.
+
+On loopback only: there is no password, and nothing in it is secret or changes anything.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from math import isfinite
+from typing import Any
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import Metric
+from prometheus_client.registry import Collector
+
+from skytether.api import rest
+from skytether.api.report_metrics import Sums, counter, gauge, of_reports
+
+from .snapshot import AgentStatus
+from .task_manager import Decision, Option
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_PORT = 8610
+_LOOPBACK = "127.0.0.1"
+_PATIENCE_S = 2.0
+"""For one request; the next waits as long."""
+_TRANSITIONS = 20
+"""The newest that ``/status`` tells."""
+
+
+def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[str, Any]:
+    """What ``/status`` says.
+
+    Args:
+        robot: Its name.
+        service: What it wants.
+        status: The agent's.
+        now: Monotonic seconds, for ages.
+    """
+    driver, instance = status.driver, status.instance
+    site = instance.placement.site if instance and instance.placement else None
+    return {
+        "robot": robot,
+        "service": service,
+        "source": driver.source,
+        "why": driver.why,
+        "trouble": status.trouble,
+        "task": None if status.decision is None else _decision(status.decision, now),
+        "instance": None
+        if instance is None
+        else {"id": instance.id, "state": instance.state, "site": site, "reason": instance.reason},
+        "link": {
+            "connected": status.connected,
+            "rtt_ms": _ms(status.rtt),
+            "loss": _known(status.loss),
+            "late": _known(status.late),
+            "paths": [
+                {
+                    "path": path.path,
+                    "rtt_ms": _ms(path.rtt),
+                    "loss_out": _known(path.loss_out),
+                    "loss_in": _known(path.loss_in),
+                    "health": path.health,
+                    "mtu": path.mtu,
+                }
+                for path in (status.session.paths if status.session else ())
+            ],
+        },
+        "velocity": {"linear_m_s": driver.velocity.linear, "angular_rad_s": driver.velocity.angular},
+        "robot_load": _known(status.load),
+        "battery": status.battery,
+        "seconds": {str(source): round(seconds, 2) for source, seconds in driver.seconds.items()},
+        "transitions": [
+            {"ago_s": round(now - change.at, 2), "source": change.source, "reason": change.reason}
+            for change in driver.transitions[-_TRANSITIONS:]
+        ],
+        "objections": dict(driver.objections),
+        "errors": dict(driver.errors),
+        "overruns": status.overruns,
+    }
+
+
+def metrics(robot: str, service: str, status: AgentStatus, report: rest.Report) -> bytes:
+    """What ``/metrics`` says: the report that the orchestrator gets too, and what is the robot's own business."""
+    registry = CollectorRegistry()
+    registry.register(_Once(_families(robot, service, status, report)))
+    return generate_latest(registry)
+
+
+class StatusServer:
+    """Answers in a thread of its own, one request after the other.
+
+    Attributes:
+        port: Where it listens on loopback.
+    """
+
+    def __init__(self, port: int, status: Callable[[], dict[str, Any]], metrics: Callable[[], bytes]) -> None:
+        """Bind and begin.
+
+        Raises:
+            OSError: The port is taken.
+        """
+        answers: dict[str, Callable[[], tuple[str, bytes]]] = {
+            "/status": lambda: ("application/json", json.dumps(status(), allow_nan=False).encode()),
+            "/metrics": lambda: ("text/plain; version=0.0.4; charset=utf-8", metrics()),
+        }
+
+        class Handler(_Handler):
+            pages = answers
+
+        self._server = HTTPServer((_LOOPBACK, port), Handler)
+        self.port: int = self._server.server_address[1]
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="status", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._server.shutdown()
+        self._thread.join(_PATIENCE_S)
+        self._server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    pages: dict[str, Callable[[], tuple[str, bytes]]]
+    timeout = _PATIENCE_S
+
+    def do_GET(self) -> None:
+        page = self.pages.get(self.path.split("?", 1)[0])
+        if page is None:
+            self.send_error(404, "there are /status and /metrics")
+            return
+        try:
+            kind, body = page()
+        except Exception as error:  # whoever looks at a robot must not be able to harm it
+            _log.debug("status failed", exc_info=error)
+            self.send_error(500, "the status cannot be told")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Looks are not logged."""
+
+
+class _Once(Collector):
+    def __init__(self, families: Iterable[Metric]) -> None:
+        self._families = list(families)
+
+    def collect(self) -> Iterable[Metric]:
+        return self._families
+
+
+def _families(robot: str, service: str, status: AgentStatus, report: rest.Report) -> Iterator[Metric]:
+    instance = status.instance
+    site = instance.placement.site if instance and instance.placement else ""
+    yield from of_reports([((robot, service, site), report)])
+    seconds, connected, errors, cost = Sums(), Sums(), Sums(), Sums()
+    for source, spent in status.driver.seconds.items():
+        seconds.add((robot, service, source), spent)
+    connected.put((robot, service), float(status.connected))
+    for part, count in status.driver.errors.items():
+        errors.add((robot, part), count)
+    for option in status.decision.options if status.decision else ():
+        cost.put((robot, service, option.name), option.cost)
+    yield counter("control_seconds", "Time under each source", ("robot", "service", "source"), seconds)
+    yield gauge("session_connected", "1 while the bridge has a session", ("robot", "service"), connected)
+    yield counter("control_errors", "Exceptions caught in the control loop", ("robot", "part"), errors)
+    labels = ("robot", "service", "option")
+    yield gauge("task_cost", "What the task manager reckons for each site and for local; +Inf: ruled out", labels, cost)
+
+
+def _decision(decision: Decision, now: float) -> dict[str, Any]:
+    challenger = decision.challenger
+    return {
+        "offload": decision.offload,
+        "site": decision.site,
+        "why": decision.why,
+        "for_s": round(now - decision.since, 1),
+        "options": [_option(option) for option in decision.options],
+        "challenger": None
+        if challenger is None
+        else {"name": challenger[0].name, "for_s": round(now - challenger[1], 1)},
+    }
+
+
+def _option(option: Option) -> dict[str, Any]:
+    parts = {name: round(value, 4) for name, value in option.parts.items()}
+    return {"name": option.name, "cost": _known(option.cost), "parts": parts, "refused": option.refused}
+
+
+def _known(value: float) -> float | None:
+    return round(value, 4) if isfinite(value) else None
+
+
+def _ms(seconds: float) -> float | None:
+    return round(seconds * 1000, 2) if isfinite(seconds) else None

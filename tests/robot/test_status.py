@@ -1,0 +1,107 @@
+import json
+from dataclasses import replace
+
+import httpx
+import pytest
+from typer.testing import CliRunner
+
+from skytether.api.rest import Placement
+from skytether.cli.app import app
+from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.status import StatusServer, document, metrics
+from skytether.robot.task_manager import Option
+from skytether.robot.tasks import TaskConfig
+from skytether.wire.stats import PathStats, SessionStats, TopicStats
+
+CONFIG = AgentConfig(
+    robot="walker", url="", token="secret", service="guide", fallback="admittance", task=TaskConfig(), status_port=0
+)
+
+
+@pytest.fixture
+def agent(base, orchestrator):
+    agent = Agent(CONFIG, base, client=orchestrator, clock=lambda: 50.0)
+    for i in range(10):
+        agent.tick(50.0 + i / 100)
+    return agent
+
+
+@pytest.fixture
+def busy(agent):
+    """After a while: an instance, a session, a decision."""
+    agent._asker.step()
+    agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
+    topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
+    agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
+    options = (Option("edge", {"delay": 0.3, "loss": 0.1}), Option("cloud", refused="answers no probe"))
+    agent._tasks._decision = replace(agent._tasks.decision, options=options, challenger=(options[0], 45.0))
+    return agent
+
+
+def test_the_document_says_everything_in_plain_numbers(busy):
+    found = document("walker", "guide", busy.status(), 60.0)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert (found["source"], found["why"]) == ("fallback", "no command has come yet")
+    assert found["instance"] == {"id": "i1", "state": "running", "site": "edge", "reason": ""}
+    assert found["task"]["options"][1] == {"name": "cloud", "cost": None, "parts": {}, "refused": "answers no probe"}
+    assert found["task"]["challenger"] == {"name": "edge", "for_s": 15.0}
+    assert found["link"]["paths"][0]["mtu"] == 1400
+    assert found["transitions"] == [{"ago_s": 10.0, "source": "fallback", "reason": "start"}]
+    assert "secret" not in json.dumps(found)
+
+
+def test_metrics_are_those_of_the_report_and_the_robots_own(busy):
+    text = metrics("walker", "guide", busy.status(), busy.report()).decode()
+    for line in (
+        'skytether_control_source{robot="walker",service="guide",source="fallback"} 1.0',
+        'skytether_fallback_transitions_total{reason="start",robot="walker",service="guide"} 1.0',
+        'skytether_task_cost{option="edge",robot="walker",service="guide"} 0.4',
+        'skytether_task_cost{option="cloud",robot="walker",service="guide"} +Inf',
+        'skytether_session_connected{robot="walker",service="guide"} 0.0',
+        'skytether_control_overruns_total{robot="walker"} 0.0',
+    ):
+        assert line in text
+    assert (
+        'skytether_topic_one_way_delay_seconds{direction="out",priority="127",quantile="0.5",robot="walker",'
+        'service="guide",topic="cmd_vel"} 0.02'
+    ) in text
+
+
+@pytest.fixture
+def served(busy):
+    busy._serve()
+    yield busy
+    busy.close()
+    assert busy.status_port is None
+
+
+def test_both_are_served_on_loopback_and_nothing_else_is(served):
+    url = f"http://127.0.0.1:{served.status_port}"
+    assert httpx.get(f"{url}/status").json()["robot"] == "walker"
+    assert httpx.get(f"{url}/metrics?x=1").headers["content-type"].startswith("text/plain")
+    assert httpx.get(f"{url}/token").status_code == 404
+    assert httpx.post(f"{url}/status").status_code == 501
+
+
+def test_the_command_prints_tables_or_json(served):
+    port = str(served.status_port)
+    result = CliRunner().invoke(app, ["robot", "status", "--port", port, "--json"])
+    assert json.loads(result.stdout)["service"] == "guide"
+    result = CliRunner().invoke(app, ["robot", "status", "--port", port])
+    assert result.exit_code == 0
+
+
+def test_a_status_that_cannot_be_told_harms_nobody():
+    server = StatusServer(0, lambda: {"x": 1 / 0}, lambda: b"")
+    assert httpx.get(f"http://127.0.0.1:{server.port}/status").status_code == 500
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(server.port)])
+    assert result.exit_code == 1
+    server.close()
+    assert CliRunner().invoke(app, ["robot", "status", "--port", str(server.port)]).exit_code == 1
+
+
+def test_a_port_that_is_taken_keeps_no_robot_from_driving(served, base, orchestrator, caplog):
+    other = Agent(replace(CONFIG, status_port=served.status_port), base, client=orchestrator)
+    other._serve()
+    assert other.status_port is None
+    assert "no status on port" in caplog.text
