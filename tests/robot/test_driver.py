@@ -325,3 +325,28 @@ def test_what_else_the_service_sends_is_not_a_command(rig, bridge):
     message = encode(Twist(linear=Vector3(x=0.2)), "cdr")
     rig.cloud.session.deliver(type("M", (), {"topic": "path", "payload": message})())
     assert rig.cloud.session.take() == []
+
+
+class Watcher(Stop):
+    """A fallback that has eyes, and that may fail to look."""
+
+    drives = True
+
+    def __init__(self):
+        self.seen = []
+
+    def watch(self, velocity, readings, dt):
+        self.seen.append((velocity, set(readings), dt))
+        if len(self.seen) > 200:
+            raise ZeroDivisionError
+
+
+def test_a_fallback_may_watch_while_the_cloud_drives_and_its_mistakes_stop_nobody(base, make_cloud, bridge):
+    watcher = Watcher()
+    rig = Rig(base, make_cloud, fallback=watcher)
+    rig.connect(bridge)
+    status = rig.run(3.0, linear=0.2)
+    assert status.source is Source.CLOUD
+    assert watcher.seen[150] == (pytest.approx((0.2, 0.1)), {"force"}, pytest.approx(TICK))
+    assert status.errors == {"fallback": 100}
+    assert base.velocity[0] == pytest.approx(0.2)

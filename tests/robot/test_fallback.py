@@ -53,7 +53,7 @@ def test_fallbacks_are_found_by_name_with_their_options():
 @pytest.mark.parametrize(
     ("name", "options", "sentence"),
     [
-        ("levitate", {}, "there is no fallback 'levitate'; known are: admittance, broken, missing, stop"),
+        ("levitate", {}, "there is no fallback 'levitate'; known are: admittance, broken, missing, (path, )?stop"),
         ("admittance", {"mass": -1.0}, "fallback 'admittance' refuses its options: admittance: mass must be above 0"),
         ("admittance", {"weight": 1.0}, "refuses its options: .*weight"),
         ("broken", {}, "fallback 'broken' cannot be loaded from nowhere.to.be:found: No module named 'nowhere'"),

@@ -14,8 +14,9 @@ import typer
 from .output import console, fail
 
 if TYPE_CHECKING:
-    from skytether.robot.agent import AgentConfig, AgentStatus
+    from skytether.robot.agent import AgentConfig
     from skytether.robot.ros1 import Ros1RobotConfig
+    from skytether.robot.snapshot import AgentStatus
     from skytether.ros.ros1.node import Node
 
     from .robot_config import RobotConfig, Ros1Config

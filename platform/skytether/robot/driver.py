@@ -20,7 +20,7 @@ from skytether.wire.events import MessageReceived
 from . import arbiter, service_manager, supervisor
 from .arbiter import Choice, Link, Needs
 from .command import Command, Source
-from .fallback import Fallback, Reading
+from .fallback import Fallback, Reading, Watching
 from .link import Quality
 from .notices import Notices
 from .service_manager import Patience, Terms
@@ -131,6 +131,7 @@ class Driver:
         self.quality = Quality()
         self._base = base
         self._fallback = fallback
+        self._watching = fallback if isinstance(fallback, Watching) else None
         self._limits = limits
         self._observer = observer
         self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
@@ -255,8 +256,13 @@ class Driver:
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
+        dt = min(max(0.0, now - self._now), self._limits.max_step_s)
+        if self._watching is not None:
+            try:
+                self._watching.watch(self._supervised.velocity, self._readings, dt)
+            except Exception as error:  # who only watches must not stop who drives
+                self._caught("fallback", error)
         if source is Source.FALLBACK:
-            dt = min(max(0.0, now - self._now), self._limits.max_step_s)
             wanted = self._fallback.step(self._supervised.velocity, self._readings, dt)
             if wanted is not None:
                 (linear, angular), read_at = wanted

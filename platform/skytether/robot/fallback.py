@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from math import isfinite
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from skytether.control import admittance
 from skytether.control.admittance import AdmittanceParams, Velocity
@@ -45,6 +45,21 @@ class Fallback(Protocol):
 
         Returns:
             The velocity it wants and when the readings behind it were taken; None if it cannot say: the robot stops.
+        """
+        ...
+
+
+@runtime_checkable
+class Watching(Protocol):
+    """What a fallback may have besides: eyes while somebody else drives."""
+
+    def watch(self, velocity: Velocity, readings: Mapping[str, Reading], dt: float) -> None:
+        """Called at every tick, whoever drives, and before `Fallback.step` when this one does.
+
+        Args:
+            velocity: What the wheels were told in the tick before, by whomever.
+            readings: The robot's newest readings by topic name.
+            dt: Time since that tick [s].
         """
         ...
 

@@ -99,6 +99,10 @@ class Guide:
         if all(map(math.isfinite, (stamp, *pose))):
             self._odometry.anchor(stamp, pose)
 
+    def go_on(self, velocity: Velocity) -> None:
+        """Take the velocity that the walker was told, if it was not the last step's: the next goes on from it."""
+        self._velocity = velocity
+
     def step(self, now: float) -> Velocity | None:
         """The velocity to command now; None while there is nothing to go by.
 
