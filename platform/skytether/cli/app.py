@@ -8,7 +8,7 @@ import typer
 
 from skytether import __version__
 
-from . import (bridge, demo, echo, gate, lab, orchestrator, relay, replay, resources, robot_run, robot_status, tokens)
+from . import (bridge, demo, doctor, echo, gate, lab, orchestrator, relay, replay, resources, robot_run, robot_status, tokens)
 from .output import log_to_console
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app.command()(replay.replay)
 app.command()(bridge.bridge)
 app.command()(relay.relay)
 app.command()(echo.echo)
+app.command()(doctor.doctor)
 app.command()(resources.apply)
 resources.robot_app.command("status")(robot_status.status)
 app.add_typer(orchestrator.app, name="orchestrator")

@@ -45,14 +45,20 @@ class Finding:
     good: bool = True
 
 
-def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> bool:
-    """Look, and print a table. True if nothing is wrong."""
+def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> list[Finding]:
+    """Everything that a run will need, one by one."""
     manifest, findings = _orchestrator(settings, token)
     findings.append(_master(node))
     if manifest is not None and findings[-1].good:
         specs = manifest.spec.topics
         findings += _topics(settings, graph.names(specs), node, specs)
         findings.append(_wheels(graph, node))
+    return findings
+
+
+def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> bool:
+    """Look, and print a table. True if nothing is wrong."""
+    findings = look(settings, graph, node, token)
     table = Table(box=None, pad_edge=False)
     for head in ("", "what", "in the graph", "type", "found"):
         table.add_column(head, overflow="fold")

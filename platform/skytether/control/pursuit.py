@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from .admittance import STANDSTILL, Velocity
 
@@ -60,7 +61,7 @@ class Track:
         if len(self._points) < 2:
             raise ValueError("path: it needs at least two points that differ")
         self._s = [0.0]
-        for a, b in zip(self._points, self._points[1:], strict=False):
+        for a, b in pairwise(self._points):
             self._s.append(self._s[-1] + math.dist(a, b))
         self._place: float | None = None
 
