@@ -8,7 +8,21 @@ import typer
 
 from skytether import __version__
 
-from . import (bridge, demo, doctor, echo, gate, lab, orchestrator, relay, replay, resources, robot_run, robot_status, tokens)
+from . import (
+    bridge,
+    demo,
+    doctor,
+    echo,
+    gate,
+    lab,
+    orchestrator,
+    relay,
+    replay,
+    resources,
+    robot_run,
+    robot_status,
+    tokens,
+)
 from .output import log_to_console
 
 app = typer.Typer(
