@@ -59,18 +59,18 @@ def test_a_clean_link_costs_next_to_nothing(world):
     measured = Measured(world, delay=0.02)
     assert set(measured.delivered.values()) == {1.0}
     assert measured.path.redundancy < 0.02
-    assert measured.path.rate == 50e6
+    assert measured.path.rate == 100e6
 
 
 @pytest.mark.parametrize(("loss", "camera"), [(0.01, 0.995), (0.05, 0.99)])
 def test_random_loss(world, loss, camera):
-    measured = Measured(world, delay=0.05, loss=loss, seed=3)
+    measured = Measured(world, settle=1.0, delay=0.05, loss=loss, seed=3)
     for topic in measured.small():
         assert measured.delivered[topic] >= 0.999
         assert measured.p99[topic] <= 0.056
     assert measured.delivered["camera"] >= camera
     assert measured.p99["camera"] <= 0.065
-    assert measured.path.rate == 50e6
+    assert measured.path.rate == 100e6
 
 
 @pytest.mark.parametrize("in_order", [False, True])
@@ -96,7 +96,7 @@ def test_thirty_percent(world):
     measured = Measured(world, delay=0.05, loss=0.3, seed=4)
     for topic in measured.small():
         assert measured.delivered[topic] >= 0.99
-    assert measured.path.rate == 50e6
+    assert measured.path.rate == 100e6
 
 
 def test_a_link_that_the_camera_saturates_delays_urgent_messages_by_milliseconds(world):

@@ -125,7 +125,8 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     config = Config(max_message=200_000, reassembly_limit=400_000)
     world = make_world(2)
     delay = LinkConditions(delay=0.005)
-    link = world.link(service={"config": config}, up=delay, down=delay, record=True)
+    robot = {"config": Config(rate_bps=1e9)}  # a message that takes long to send is evicted by the flood meanwhile
+    link = world.link(robot=robot, service={"config": config}, up=delay, down=delay, record=True)
     epoch = packet.pull_header(link.sent[ROBOT][-1][1])[2]
     sent = []
 

@@ -196,7 +196,7 @@ def test_a_velocity_command_waits_for_one_burst_at_most(world, topics):
 
 
 def test_a_burst_is_a_bound_for_each_call(world):
-    config = Config(rate_bps=1e10, burst=6000)
+    config = Config(rate_bps=1e11, burst=6000)
     link = world.link(robot={"config": config})
     robot = link.sessions[ROBOT]
     for _ in range(3):

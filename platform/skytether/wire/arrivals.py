@@ -149,12 +149,25 @@ class DelayMeter:
     """Twice the log likelihood ratio from which a limit is believed to be there (a false alarm in 16,000)."""
     CERTAIN = 40.0
     """Evidence beyond this is not collected, so that it is forgotten in time."""
+    LOOK = 6.0
+    """Most evidence that one look adds: a pause of a machine on the way is no slow link, however late it makes what
+    arrives. Looks that agree make a limit."""
     POSSIBLE = 8.0
     """Twice the log likelihood ratio up to which a higher rate is preferred to the best."""
+    FIRST = 3
+    """Looks at a burst for which that does not hold: the first frame should not fill a queue until others agree."""
+    STEADY = 0.002
+    """Standard deviation of delays up to which it does not."""
+    BURST = 8000
+    """Bytes of such a burst."""
     QUIET = 0.0003
     """Standard deviation of delays that is taken for granted: timers, batches."""
     BASE_TIME = 30.0
     """Seconds that the shortest delay is remembered: clocks drift, routes change."""
+    LOOKS = 2
+    """Looks at least that see a queue before it is one: it stands, a pause of a machine is over at the next look."""
+    STANDING = 0.08
+    """Seconds for which all looks have to see it."""
     QUARTERS = 13
     """Intervals whose levels tell how much a level varies by itself."""
     RATE_TIME = 0.2
@@ -169,11 +182,12 @@ class DelayMeter:
     """The same where delays vary by more than a queue does."""
 
     __slots__ = (
-        "_arrivals", "_backlog", "_base", "_bytes", "_evidence", "_last", "_level", "_noise", "_quarters", "_reference",
-        "_sizes", "_times", "_updated", "capacity", "pending", "queue", "rate",
+        "_arrivals", "_backlog", "_base", "_bursts", "_bytes", "_evidence", "_last", "_level", "_looks", "_noise",
+        "_numbers", "_quarters", "_reference", "_sizes", "_times", "_updated", "capacity", "pending", "queue", "rate",
     )  # fmt: skip
 
     def __init__(self) -> None:
+        self._numbers = array("I")
         self._times = array("H")
         self._sizes = array("H")
         self._arrivals = array("d")
@@ -186,12 +200,16 @@ class DelayMeter:
         """Bytes waiting at that time if the path had each of the rates."""
         self._evidence = np.zeros(len(self.RATES) + 1)
         """Against each of the rates, and against no limit."""
+        self._bursts = 0
+        """Looks at bursts, as far as they count."""
         self._noise = math.nan
         """Variance of delays that no queue explains."""
         self._level = math.nan
         self._quarters: deque[float] = deque(maxlen=self.QUARTERS)
         self._base: deque[tuple[float, float]] = deque()
         """Candidates for the lowest level of the next `BASE_TIME`: time and level, both rising."""
+        self._looks: deque[tuple[float, float]] = deque()
+        """Time and level of the looks of the last `STANDING`."""
         self._updated = math.nan
         self.capacity = math.inf
         """Highest rate that is possible, bits per second."""
@@ -202,8 +220,9 @@ class DelayMeter:
         self.pending = 0
         """Packets that came since the last evaluation."""
 
-    def add(self, time: int, size: int, now: float) -> None:
+    def add(self, number: int, time: int, size: int, now: float) -> None:
         """A packet of ``size`` bytes arrived; its time of sending is in ticks."""
+        self._numbers.append(number)
         self._times.append(time)
         self._sizes.append(size)
         self._bytes += size
@@ -212,9 +231,10 @@ class DelayMeter:
         if len(self._times) >= COLLECT:
             self.evaluate(now)
 
-    def add_all(self, times: bytes, size: int, now: float) -> None:
-        """Several equal packets arrived: native unsigned 16-bit times."""
+    def add_all(self, numbers: bytes, times: bytes, size: int, now: float) -> None:
+        """Several equal packets arrived: native unsigned 32-bit numbers, 16-bit times."""
         count = len(times) // 2
+        self._numbers.frombytes(numbers)
         self._times.frombytes(times)
         self._sizes.extend([size] * count)
         self._bytes += size * count
@@ -241,6 +261,7 @@ class DelayMeter:
             self.capacity = float(self.RATES[np.flatnonzero(self._evidence[:-1] <= self.POSSIBLE)[-1]]) * 8
 
     def _take(self, now: float) -> None:
+        numbers = np.frombuffer(self._numbers, np.uint32)
         times = np.frombuffer(self._times, np.uint16).astype(np.float64)
         sizes = np.frombuffer(self._sizes, np.uint16).astype(np.float64)
         arrivals = np.frombuffer(self._arrivals, np.float64)
@@ -248,20 +269,22 @@ class DelayMeter:
         if self._reference is None:
             self._reference = int(transit[0])
         delays = (np.mod(transit - self._reference + TICKS / 2, TICKS) - TICKS / 2) * TICK
-        sent = arrivals - delays
+        # Whole ticks: what was sent at once is equal, and has the order of its numbers.
+        sent = np.rint((arrivals - delays) / TICK) * TICK
         spread = 0.0 if math.isnan(self._noise) else 3 * math.sqrt(self._noise)
         jittery = spread > self.JITTERY
         ready = sent <= sent.max() - (min(spread, 0.1) if jittery and len(sent) < COLLECT else 0.0)
         if np.count_nonzero(ready) < (self.LEAST_OF_JITTER if jittery else self.LEAST):
             return
         keep = ~ready
+        self._numbers = array("I", numbers[keep].tobytes())
         self._times = array("H", times[keep].astype(np.uint16).tobytes())
         self._sizes = array("H", sizes[keep].astype(np.uint16).tobytes())
         self._arrivals = array("d", arrivals[keep].tobytes())
         ready &= sent > self._last - TICK / 2  # a burst has one time of sending
         if np.count_nonzero(ready) < 2:
             return
-        order = np.argsort(sent[ready], kind="stable")
+        order = np.lexsort(((numbers[ready] - numbers[0]).astype(np.int32), sent[ready]))
         sent, delays, total = sent[ready][order], delays[ready][order], np.cumsum(sizes[ready][order])
         if len(sent) > self.MOST:
             step = -(-len(sent) // self.MOST)
@@ -285,7 +308,13 @@ class DelayMeter:
         squares = np.einsum("ij,ij->i", unexplained, unexplained)
         noise = max(float(squares.min()) / (len(sent) - 1), self.QUIET**2)
         self._noise = noise if math.isnan(self._noise) else self._noise + 0.2 * (noise - self._noise)
-        self._evidence += squares / max(self._noise, noise)
+        squares /= max(self._noise, noise)
+        most = self.LOOK
+        if self._bursts < self.FIRST and total[-1] >= self.BURST:
+            self._bursts += 1
+            if max(self._noise, noise) < self.STEADY**2:
+                most = self.CERTAIN
+        self._evidence += np.minimum(squares - squares.min(), most)
 
     def _measure(self, delays: npt.NDArray[np.float64], now: float) -> None:
         """The level of the fastest quarter, against the lowest of late."""
@@ -297,8 +326,13 @@ class DelayMeter:
             # Jitter that keeps the order is not independent from packet to packet: how intervals differ tells more.
             changes = np.abs(np.diff(np.array(self._quarters), 2))
             error = max(error, 2 * float(np.median(changes)))
+        looks = self._looks
+        looks.append((now, quarter))
+        while len(looks) > self.LOOKS and looks[1][0] <= now - self.STANDING:
+            looks.popleft()
+        lowest = min(level for _, level in looks)
         weight = 0.3 if error > 0.001 else 1.0
-        self._level = quarter if math.isnan(self._level) else self._level + weight * (quarter - self._level)
+        self._level = lowest if math.isnan(self._level) else self._level + weight * (lowest - self._level)
         base = self._base
         while base and base[-1][1] >= self._level:
             base.pop()

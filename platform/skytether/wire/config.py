@@ -19,7 +19,7 @@ class Config:
     on it too), and IP never fragments: where it does not pass, a probe finds out (`mtu`)."""
     max_mtu: int = 1400
     """Largest UDP payload that is tried; not above ``mtu``: none larger."""
-    rate_bps: float = 50e6
+    rate_bps: float = 100e6
     """Most that a path is used with, bits per second of UDP payload; less where delays show a queue (rule 6)."""
     burst: int = 19_200
     """Most that one call of ``transmit`` returns: 16 packets. A higher priority waits for no more than this."""

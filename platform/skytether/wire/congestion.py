@@ -16,8 +16,8 @@ import math
 
 from .control import Feedback
 
-TARGET = 0.004
-"""Seconds of standing queue that are tolerated."""
+TARGET = 0.002
+"""Seconds of standing queue that are tolerated; on a slow path the time of one and a half packets."""
 MARGIN = 0.95
 """Share of the measured capacity that is used."""
 LOWEST = 200e3
@@ -28,6 +28,14 @@ STEP = 10 * PACKET
 """Growth in bits per second per second, soon after a reduction."""
 HASTE = 2.0
 """Seconds without a reduction after which growth is twice as fast; five times as fast after double that time."""
+DOUBLE = 2.0
+"""Growth in a second of a rate that only bursts (a camera's frames) make full use of, while delays do not grow."""
+FAR = 0.4
+"""Share of a measured capacity below which a rate used without pause grows like that too."""
+STEADY = 0.05
+"""Most growth in a second, as a share of the rate, up to where there was a queue: the next is noticed after 0.2 s."""
+NEAR = 0.05
+"""Share of the rate at which there was a queue that counts as near: there the growth is the slowest."""
 SATURATED = 0.7
 """Share of the rate used from which a path is taken to be used without pause."""
 USED_TIME = 0.3
@@ -39,7 +47,7 @@ KEEP = 0.9
 """What remains of the rate that arrives through a standing queue: the decrease that shares a bottleneck."""
 SMOOTH = 1.2
 """The same for a path that is not used without pause: then it is no more than bursts that make the queue."""
-DRAIN = 0.15
+DRAIN = 0.08
 """Seconds in which a standing queue is drained, at the most of half the rate."""
 REST = 0.3
 """Seconds beyond a round trip after which a reduction must have shown."""
@@ -56,6 +64,11 @@ YIELD = 0.5
 """What remains of the rate after losses in somebody else's queue, as of TCP's window (RFC 5681)."""
 
 
+START = 50e6
+"""Bits per second that a path is first used with, if the ceiling allows; half of a ceiling that is higher than twice
+that, for who configures it knows the path."""
+
+
 class RateControl:
     """Rate of one path.
 
@@ -65,17 +78,19 @@ class RateControl:
     """
 
     __slots__ = (
-        "_before", "_calm_since", "_ceiling", "_cut_at", "_drain", "_foreign_since", "_hold", "_share", "_updated",
-        "_used", "_usual", "competing", "rate",
+        "_before", "_calm_since", "_ceiling", "_cut_at", "_drain", "_foreign_since", "_full", "_hold", "_share",
+        "_updated", "_used", "_usual", "competing", "rate",
     )  # fmt: skip
 
     def __init__(self, ceiling: float, now: float) -> None:
         self._ceiling = ceiling
-        self._share = self.rate = ceiling
+        self._share = self.rate = max(min(ceiling, START), ceiling / 2)
         self._drain = math.inf
         """Rate until the queue is gone."""
         self.competing = False
         self._updated = self._cut_at = now
+        self._full = 0.0
+        """Rate at which there was a queue."""
         self._hold = -math.inf
         """No reduction for queue or loss before this: those made have not shown yet."""
         self._calm_since = now
@@ -114,30 +129,45 @@ class RateControl:
                 self._hold = now + rtt + REST
         else:
             growth = STEP * (1 + ((now - self._cut_at) / HASTE) ** 2)
+            if self._share < (1 + NEAR) * self._full:
+                growth = min(growth, max(STEP, STEADY * self._share))
+                if self._share > (1 - NEAR) * self._full:
+                    growth, self._cut_at = STEP / 2, now
             self._evade(feedback, rtt, now)
         if self._share < before:
             self._cut_at = now
         elif waited and (self.competing or self._share < MARGIN * feedback.capacity):
+            bursts = self._used < SATURATED * self.rate or self._share < FAR * feedback.capacity < math.inf
+            if bursts and not self.competing and not self._queued(feedback):
+                growth = max(growth, math.log(DOUBLE) * self._share)
             self._share += growth * elapsed
         self._share = min(max(self._share, LOWEST), self._ceiling)
         self.rate = min(self._share, max(self._drain, LOWEST))
 
     def _evade(self, feedback: Feedback, rtt: float, now: float) -> None:
         """Keep below the capacity, and without a queue."""
-        queued, saturated = feedback.queue > TARGET, self._used >= SATURATED * self.rate
+        queued, saturated = self._queued(feedback), self._used >= SATURATED * self.rate
         limit = MARGIN * feedback.capacity
         if not queued:
             # A rate that is used without pause and makes no queue is no more than the capacity, whatever that seems.
             self._drain = math.inf
             limit = max(limit, self._share if saturated else BURSTS * feedback.rate)
+            if limit < self._share:
+                self._full = min(feedback.capacity, self._share)
+                self._hold = now + rtt + REST  # what waits by now is not the new rate's queue
         elif now >= self._hold:
             self._hold = now + rtt + REST
-            if limit >= self._share:  # not a queue that was made before the capacity was known
+            self._full = min(feedback.capacity, self._share)
+            if limit > KEEP * self._share:  # not a queue that was made before the capacity was known
+                self._full = max(feedback.rate, self._share / 2)
                 limit = KEEP * min(self._share, max(feedback.rate, self._share / 2))
             if not saturated:  # smoother bursts, but no less
                 limit = max(limit, SMOOTH * feedback.rate)
-            self._drain = min(limit, self._share) * (1 - min(feedback.queue / DRAIN, 0.5))
+        else:
+            limit = self._share
         self._share = min(self._share, limit)
+        if queued:
+            self._drain = self._share * (1 - min(feedback.queue / DRAIN, 0.5))
 
     def _beyond_usual(self, settled: float, lost: float, now: float) -> bool:
         """Whether more packets were lost than the path loses without congestion."""
@@ -149,10 +179,13 @@ class RateControl:
         expected = settled * losses / packets if packets else 0.0
         return lost > expected + 3 * math.sqrt(expected)
 
+    def _queued(self, feedback: Feedback) -> bool:
+        return feedback.queue > max(TARGET, 1.5 * PACKET / self._share)
+
     def _watch(self, feedback: Feedback, now: float) -> None:
         """Find out whose queue it is."""
         queue = feedback.queue
-        self._calm_since = math.inf if queue > TARGET else min(self._calm_since, now)
+        self._calm_since = math.inf if self._queued(feedback) else min(self._calm_since, now)
         if queue <= FOREIGN:
             self._foreign_since = math.inf
         elif self._foreign_since == math.inf:

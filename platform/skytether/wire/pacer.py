@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 BUCKET_TIME = 0.003
 """Seconds of sending that may be saved up: covers late timers, and bounds the queue a burst makes on the link."""
 QUANTUM_TIME = 0.002
 """Seconds of sending worth waking up for in the midst of a large message: a camera frame of 47 kB at 50 Mbit/s goes in
 four or five system calls, and what is more urgent waits in the link for no more than this."""
 
+BURST = 10_000
+"""Bytes sent between two reports of the peer whose way tells what a path is good for: most of a TCP's first window."""
 ROUNDING = 1e-6
 """Seconds added to a time of waiting, so that rounding never makes it end too early to send anything."""
 
@@ -15,7 +19,9 @@ ROUNDING = 1e-6
 class Pacer:
     """Sending is allowed while tokens are positive; the last packet may overdraw them by its size."""
 
-    __slots__ = ("_burst", "_mtu", "_spent", "_tokens", "_updated", "_waited", "capacity", "quantum", "rate")
+    __slots__ = (
+        "_burst", "_mtu", "_spent", "_tokens", "_updated", "_waited", "burst_at", "capacity", "quantum", "rate",
+    )  # fmt: skip
 
     def __init__(self, rate_bps: float, mtu: int, burst: int, now: float) -> None:
         self._mtu = mtu
@@ -26,12 +32,14 @@ class Pacer:
         self._updated = now
         self._spent = 0
         self._waited = False
+        self.burst_at = math.inf
+        """When the first `BURST` was sent."""
 
     def set_rate(self, rate_bps: float) -> None:
         """From now on; what is saved up remains."""
         self.rate = rate_bps / 8
         """Bytes per second."""
-        self.capacity = max(2.0 * self._mtu, self.rate * BUCKET_TIME)
+        self.capacity = max(float(self._mtu), self.rate * BUCKET_TIME)
         self.quantum = min(max(self.rate * QUANTUM_TIME, self._mtu), self._burst)
         """Bytes that a large message waits for, so that it goes in few batches."""
 
@@ -46,6 +54,8 @@ class Pacer:
         """Account for ``size`` bytes sent."""
         self._tokens -= size
         self._spent += size
+        if self._spent >= BURST and self.burst_at == math.inf:
+            self.burst_at = self._updated
 
     def usage(self) -> tuple[int, bool]:
         """Bytes sent, and whether anything waited for its turn, since the last call."""

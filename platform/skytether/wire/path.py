@@ -27,6 +27,11 @@ MUCH = 48
 """Packets after which the peer is told of them without waiting for the next ping."""
 MUCH_AT_FIRST = 8
 """The same on a path not known well yet: that it is too slow for the first bursts should be known before the next."""
+UNKNOWN = 8e6, 0.08
+"""Bits per second until a burst was seen, and share of a ceiling that is higher than usual: on a slow link a first
+frame at full speed would be a queue of its length."""
+BURST_TIME = 0.03
+"""Seconds in which it arrives, beyond a round trip until the peer has told so."""
 FAMILIAR = 500
 """Packets from which a path is known well."""
 OWN_DELAY = 0.02
@@ -47,10 +52,10 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "_arrived_at", "_assumed_loss", "_fed_back_at", "_settle_at", "address", "bytes_received", "bytes_sent",
-        "claims", "control", "cost", "delays", "echo", "heard_at", "id", "large", "liveness", "loss_in", "loss_out",
-        "losses", "mtu", "newest", "next_number", "pacer", "packets_received", "packets_sent", "peer",
-        "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
+        "_arrived_at", "_assumed_loss", "_cautious", "_fed_back_at", "_known", "_settle_at", "address",
+        "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo", "heard_at", "id", "large",
+        "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number", "pacer", "packets_received",
+        "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -73,12 +78,15 @@ class Path:
         self.mtu = MtuSearch(config.mtu, config.max_mtu)
         self.large = False
         """Whether packets of the largest size were sent since the last look."""
-        self.pacer = Pacer(config.rate_bps, max(config.mtu, config.max_mtu), config.burst, now)
+        self.control = RateControl(config.rate_bps, now)
+        self._known = False
+        """Whether the peer has told what became of a burst."""
+        self._cautious = max(min(config.rate_bps, UNKNOWN[0]), config.rate_bps * UNKNOWN[1])
+        self.pacer = Pacer(self._cautious, max(config.mtu, config.max_mtu), config.burst, now)
         self.next_number = 0
         self.packets_sent = self.packets_received = self.bytes_sent = self.bytes_received = 0
         self.rtt = math.nan
         self.rtts = Histogram()
-        self.control = RateControl(config.rate_bps, now)
         self.redundancy = Redundancy(config)
         self._assumed_loss = config.assumed_loss
         self._arrived_at = now
@@ -105,12 +113,12 @@ class Path:
     def arrived(self, number: int, time: int, size: int) -> None:
         """A packet of ``size`` bytes came; ``time`` is that of its sending in ticks."""
         self.losses.add(number, time)
-        self.delays.add(time, size, self._arrived_at)
+        self.delays.add(number, time, size, self._arrived_at)
 
     def arrived_all(self, numbers: bytes, times: bytes, size: int) -> None:
         """Several packets came: native unsigned 32-bit numbers, 16-bit times."""
         self.losses.add_all(numbers, times)
-        self.delays.add_all(times, size, self._arrived_at)
+        self.delays.add_all(numbers, times, size, self._arrived_at)
 
     @property
     def much_arrived(self) -> bool:
@@ -137,8 +145,11 @@ class Path:
             return
         self._fed_back_at = now
         used, waited = self.pacer.usage()
+        if now >= self.pacer.burst_at + self.rtts.minimum + BURST_TIME:
+            self._known = True
+        waited = waited and self._known
         self.control.take(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
-        self.pacer.set_rate(self.control.rate)
+        self.pacer.set_rate(self.control.rate if self._known else min(self.control.rate, self._cautious))
 
     def shared(self, batches: list[Transmit]) -> list[Transmit]:
         """Copies for addresses where the peer may be, as far as they may have them."""
