@@ -3,6 +3,7 @@ import base64
 import pytest
 
 from skytether.api.manifest import TopicSpec
+from skytether.bridge import Bridge, LocalPath
 from skytether.bridge.spec import SessionSpec, topic_from_api
 from skytether.wire.topic import Direction, Role, Topic
 
@@ -70,3 +71,34 @@ def test_a_topic_that_is_listed_twice_is_refused():
 def test_an_id_out_of_range_is_refused():
     with pytest.raises(ValueError, match="64 bits"):
         SessionSpec(1 << 64, KEY, Role.ROBOT, ())
+
+
+@pytest.mark.parametrize(
+    ("role", "options", "says"),
+    [
+        (Role.ROBOT, {"bind": ("127.0.0.1", 70_000)}, "bind: port must be 0 to 65535, not 70000"),
+        (Role.ROBOT, {"bind": ("127.0.0.1", -1)}, "bind: port must be 0 to 65535, not -1"),
+        (Role.ROBOT, {"peer": ("127.0.0.1", 0)}, "peer: port must be 1 to 65535, not 0"),
+        (Role.ROBOT, {"paths": "all"}, "paths: must be 'auto' or a list of LocalPath, not 'all'"),
+        (Role.SERVICE, {"paths": "auto"}, "paths: only the robot's end has them"),
+    ],
+)
+def test_wrong_arguments_of_a_bridge_are_named(role, options, says):
+    spec = SessionSpec(1, bytes(32), role, ())
+    with pytest.raises(ValueError, match=says):
+        Bridge(spec, None, **options)
+
+
+def test_a_robot_is_told_to_look_at_a_port_that_there_is():
+    bridge = Bridge(SessionSpec(1, bytes(32), Role.ROBOT, ()), None)
+    with pytest.raises(ValueError, match="peer: port must be 1 to 65535, not 65536"):
+        bridge.set_peer("127.0.0.1", 65_536)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [(("eth0", 256), "cost of eth0 must be 0 to 255, not 256"), (("", 0), "local must be an interface's name")],
+)
+def test_wrong_arguments_of_a_path_are_named(options, says):
+    with pytest.raises(ValueError, match=says):
+        LocalPath(*options)

@@ -63,7 +63,7 @@ TARGET = {"host": "127.0.0.1", "port": 9}
     ("config", "says"),
     [
         ({}, "name at least one route, or an upstream"),
-        ({"upstream": TARGET, "rotues": []}, "rotues: unknown key, did you mean 'routes'?; allowed are listen, routes"),
+        ({"upstream": TARGET, "rotues": []}, "rotues: unknown key, did you mean 'routes'?"),
         ({"routes": [{"id": "ff", "target": TARGET}]}, "routes.0.id: 'ff' must be a session's 16 hexadecimal digits"),
         ({"routes": [{"id": ID}]}, "routes.0.target: is missing"),
         ({"routes": [{"id": ID, "target": {"host": "h", "port": 0}}]}, "routes.0.target.port: input should be greater"),

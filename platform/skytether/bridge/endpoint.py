@@ -44,6 +44,16 @@ class BridgeError(Exception):
     """An endpoint cannot do what it was told; the text says what to change."""
 
 
+def _check_port(what: str, port: int, least: int) -> None:
+    """Refuse what is no port.
+
+    Raises:
+        ValueError: The text names the argument and the range.
+    """
+    if not least <= port <= 65_535:
+        raise ValueError(f"{what}: port must be {least} to 65535, not {port}")
+
+
 class Bridge:
     """Holds one end of a session: connects by itself, stays connected by itself, and moves messages.
 
@@ -76,8 +86,14 @@ class Bridge:
             config: Of the protocol.
 
         Raises:
-            ValueError: The service's end has no paths of its own: it learns its robot's.
+            ValueError: A port is out of its range, or paths is a word other than "auto", or the service's end has any:
+                it learns its robot's.
         """
+        _check_port("bind", bind[1], 0)
+        if peer is not None:
+            _check_port("peer", peer[1], 1)
+        if isinstance(paths, str) and paths != "auto":
+            raise ValueError(f"paths: must be 'auto' or a list of LocalPath, not '{paths}'")
         if paths and spec.role is not Role.ROBOT:
             raise ValueError("paths: only the robot's end has them; the service's end learns them")
         self._wanted: Wanted = paths
@@ -210,7 +226,9 @@ class Bridge:
 
         Raises:
             BridgeError: The name has no address.
+            ValueError: The port is out of its range.
         """
+        _check_port("peer", port, 1)
         self._peer = (host, port)
         if self._thread is not None:
             address = self._resolve(host, port)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
+from skytether.api.faults import explain
 from skytether.api.manifest import Strict
 from skytether.api.yaml import YamlError, parse_yaml, read_bounded
 
@@ -64,33 +64,4 @@ def check_config(document: Any, model: type[_Model], where: str) -> _Model:
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(f"{where}: {_explain(error, model)}") from error
-
-
-def _explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first mistake, by its key."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    key = ".".join(str(step) for step in first["loc"])
-    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _known_keys(first["loc"][:-1], model)
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        return f"{key}: unknown key{f', did you mean {near[0]!r}?' if near else ''}; allowed are {', '.join(known)}"
-    if first["type"] == "missing":
-        return f"{key}: is missing"
-    says = str(first["msg"]).removeprefix("Value error, ")
-    return f"{key}: {says[:1].lower()}{says[1:]}" if key else says
-
-
-def _known_keys(place: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
-    """Keys that the schema has at one place of the document."""
-    schema: dict[str, Any] = model.model_json_schema()
-    here = schema
-    for step in place:
-        if isinstance(step, int):
-            here = here["items"]
-        else:
-            here = here.get("properties", {}).get(step) or here["additionalProperties"]
-        here = next((a for a in here.get("anyOf", ()) if a.get("type") != "null"), here)
-        if "$ref" in here:
-            here = schema["$defs"][here["$ref"].rsplit("/", 1)[1]]
-    return list(here["properties"])
+        raise ConfigError(f"{where}: {'; '.join(map(str, explain(error, model)))}") from error

@@ -7,20 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-
-@dataclass(frozen=True)
-class Fault:
-    """One wrong key of a document: where, and what is wrong with it."""
-
-    key: str
-    """Path with dots, ``spec.topics.0.prority``; empty: the document itself."""
-    detail: str
-
-    def __str__(self) -> str:
-        return f"{self.key}: {self.detail}" if self.key else self.detail
+from skytether.api.faults import Fault as Fault
 
 
 class DomainError(Exception):

@@ -12,6 +12,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from skytether.api.faults import faults
 from skytether.api.rest import Problem
 
 from .db import GONE
@@ -27,7 +28,6 @@ from .errors import (
     TooManyError,
     UnauthenticatedError,
 )
-from .validation import faults
 
 log = logging.getLogger(__name__)
 

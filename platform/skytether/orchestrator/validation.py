@@ -1,8 +1,7 @@
-"""Turns what pydantic and jsonschema find wrong into faults: full key path, and the nearest known key."""
+"""Refuses documents and parameters with all that is wrong in them."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -13,7 +12,9 @@ from pydantic import ValidationError as PydanticError
 from referencing import Registry
 from referencing.exceptions import Unresolvable
 
-from .errors import Fault, InvalidError
+from skytether.api.faults import Fault, explain, unknown
+
+from .errors import InvalidError
 
 Model = TypeVar("Model", bound=BaseModel)
 _MAX_FAULTS = 10
@@ -29,56 +30,7 @@ def parse(model: type[Model], document: Any, what: str = "", prefix: Sequence[st
     try:
         return model.model_validate(document)
     except PydanticError as error:
-        raise InvalidError(faults(error.errors(), model.model_json_schema(), prefix), what) from None
-
-
-def faults(errors: Iterable[Mapping[str, Any]], schema: Mapping[str, Any], prefix: Sequence[str] = ()) -> list[Fault]:
-    """Pydantic's errors in words; ``schema`` is the document's JSON schema, to find known keys in."""
-    found = []
-    for error in errors:
-        path = list(error["loc"])
-        if error["type"] == "extra_forbidden":
-            detail = unknown(str(path[-1]), _keys(schema, path[:-1]))
-        elif error["type"] == "missing":
-            detail = "is missing"
-        elif error["type"] in ("model_type", "model_attributes_type", "dict_type"):
-            detail = "must be a mapping of keys to values"
-        else:
-            message = str(error["msg"]).removeprefix("Value error, ")
-            detail = message[:1].lower() + message[1:]
-        found.append(Fault(".".join([*prefix, *(str(p) for p in path)]), detail))
-    return found[:_MAX_FAULTS]
-
-
-def unknown(key: str, known: Iterable[str]) -> str:
-    """What to say of an unknown key."""
-    candidates = list(known)
-    near = difflib.get_close_matches(key, candidates, n=1)
-    if near:
-        return f"unknown key, did you mean '{near[0]}'?"
-    return f"unknown key; known are {', '.join(candidates)}" if candidates else "unknown key; there are none"
-
-
-def _keys(schema: Mapping[str, Any], path: Sequence[Any]) -> list[str]:
-    """Known keys at a place in a document, by its JSON schema."""
-    places = [schema]
-    for step in [*path, None]:
-        places = [_resolve(schema, place) for place in places]
-        places = [p for place in places for p in (place, *(_resolve(schema, a) for a in place.get("anyOf", [])))]
-        if step is None:
-            break
-        if isinstance(step, int):
-            places = [place["items"] for place in places if isinstance(place.get("items"), Mapping)]
-        else:
-            places = [place["properties"][step] for place in places if step in place.get("properties", {})]
-    return sorted({key for place in places for key in place.get("properties", {})})
-
-
-def _resolve(schema: Mapping[str, Any], place: Mapping[str, Any]) -> Mapping[str, Any]:
-    if "$ref" in place:
-        found = schema.get("$defs", {}).get(str(place["$ref"]).removeprefix("#/$defs/"), {})
-        return found if isinstance(found, Mapping) else {}
-    return place
+        raise InvalidError(explain(error, model, prefix), what) from None
 
 
 def check_schema(schema: Mapping[str, Any], prefix: str) -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 MIN_MTU = 512
 """Smaller than any path in use; bounds the number of shards that a message may claim to have."""
 MAX_MTU = 65_507
 """Largest UDP payload over IPv4."""
+MAX_COPIES = 100
+_POSITIVE = (
+    "rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence", "hello_retry",
+    "hello_retry_max",
+)  # fmt: skip
+_NOT_NEGATIVE = "max_parity", "copy_spacing", "old_keys", "path_stable", "path_overlap"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,24 +76,22 @@ class Config:
         if not MIN_MTU <= self.max_mtu <= MAX_MTU:
             raise ValueError(f"max_mtu must be {MIN_MTU} to {MAX_MTU} bytes, not {self.max_mtu}")
         largest = max(self.mtu, self.max_mtu)
-        if self.burst < largest:
+        if not largest <= self.burst < math.inf:
             raise ValueError(f"burst must be at least mtu and max_mtu ({largest} bytes), not {self.burst}")
         if not 0 < self.max_message <= 2**30:
             raise ValueError(f"max_message must be 1 to {2**30} bytes, not {self.max_message}")
-        if self.queue_limit < self.max_message:
+        if not self.max_message <= self.queue_limit < math.inf:
             raise ValueError(f"queue_limit must be at least max_message ({self.max_message} bytes)")
         needed = self.max_message * 3 // 2 + 4096  # with the book-keeping of its shards, however small they are
-        if self.reassembly_limit < needed:
+        if not needed <= self.reassembly_limit < math.inf:
             raise ValueError(f"reassembly_limit must be at least 1.5 times max_message plus 4 KiB ({needed} bytes)")
-        positive = ("rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence")
-        for name in (*positive, "hello_retry", "hello_retry_max"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+        for name in _POSITIVE:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name)}")
+        for name in _NOT_NEGATIVE:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be 0 or more and finite, not {getattr(self, name)}")
         if not 0 <= self.assumed_loss < 0.9:
             raise ValueError(f"assumed_loss must be 0 to below 0.9, not {self.assumed_loss}")
-        if self.max_copies < 1 or self.max_parity < 0 or self.copy_spacing < 0 or self.old_keys < 0:
-            raise ValueError(
-                "max_copies must be at least 1; max_parity, copy_spacing and old_keys must not be negative"
-            )
-        if self.path_stable < 0 or self.path_overlap < 0:
-            raise ValueError("path_stable and path_overlap must not be negative")
+        if not 1 <= self.max_copies <= MAX_COPIES:
+            raise ValueError(f"max_copies must be 1 to {MAX_COPIES}, not {self.max_copies}")
