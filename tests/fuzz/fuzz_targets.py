@@ -144,9 +144,7 @@ def shards(data: bytes) -> None:
             step, first = script.number() % 5, script.number()
             indices = [(first + i * step) % MAX_SHARDS for i in range(count)]
             if op & 8:
-                rows = np.zeros((count, packet.HEADER_SIZE + size), np.uint8)
-                rows[:, packet.INDEX_AT] = indices
-                whole = store.add_rows(entry, block, rows)
+                whole = store.add_all(entry, block, np.array(indices, np.uint8), np.zeros((count, size), np.uint8))
             else:
                 whole = next(
                     (w for i in indices if entry.alive and (w := store.add(entry, block, i, bytes(size)))), None

@@ -3,16 +3,19 @@
 import math
 from random import Random
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.wire.measure import Histogram, Inbound, SequenceTracker
 
 
-@given(st.lists(st.floats(1e-6, 1e4), min_size=1, max_size=200), st.floats(0, 1))
-def test_quantiles_are_within_one_percent(values, share):
+@given(st.lists(st.floats(1e-6, 1e4), min_size=1, max_size=200), st.floats(0, 1), st.integers(0, 200))
+def test_quantiles_are_within_one_percent(values, share, together):
     histogram = Histogram()
-    for value in values:
+    histogram.add_all(np.array(values[:together]))
+    for value in values[together:]:
         histogram.add(value)
     exact = sorted(values)[max(0, math.ceil(share * len(values) - 1e-9) - 1)]
     assert abs(histogram.quantile(share) / exact - 1) <= 0.0101
@@ -25,6 +28,7 @@ def test_a_histogram_is_bounded_and_takes_anything():
     for exponent in range(-30_000, 30_000):
         histogram.add(10 ** (exponent / 1000))
     histogram.add(-1.0)
+    histogram.add_all(np.array([-1.0, 0.0, 1e300]))
     assert len(histogram._counts) <= 1300
 
 
@@ -65,11 +69,18 @@ def test_endless_gaps_are_bounded():
     assert tracker.lost == 4999 - tracker.MAX_GAPS
 
 
-def test_jitter_with_and_without_reordering():
+@pytest.mark.parametrize("counted_after", [set(), {1}, {0, 1, 2}])
+def test_jitter_with_and_without_reordering(counted_after):
     inbound = Inbound()
     # Sequence 0, 2, 1, 3 with delays 10, 10, 30, 12 ms: by arrival |0| + |20| + |18| over 3; in order |0| + |2| over 2.
-    for now, delay, in_order in ((0.0, 0.01, True), (0.1, 0.01, True), (0.11, 0.03, False), (0.2, 0.012, True)):
-        inbound.arrived(delay, 0.001, in_order, now)
+    arrivals = (0.0, 0.01, True), (0.1, 0.01, True), (0.11, 0.03, False), (0.2, 0.012, True)
+    for i, (now, delay, in_order) in enumerate(arrivals):
+        inbound.arrived(delay, 0.001 * i, in_order, now)
+        if i in counted_after:
+            inbound.settle()
+    inbound.settle()
+    assert inbound.delay.total == 4
+    assert inbound.delay_error == 0.003
     assert math.isclose(inbound.jitter.value, 0.038 / 3)
     assert math.isclose(inbound.jitter_in_order.value, 0.001)
     assert math.isclose(inbound.period.quantile(0.5), 0.09, rel_tol=0.011)
@@ -79,6 +90,16 @@ def test_without_a_clock_offset_no_delay_is_made_up():
     inbound = Inbound()
     inbound.arrived(0.0, math.inf, True, 0.0)
     inbound.arrived(0.0, math.inf, True, 0.5)
+    inbound.settle()
     assert inbound.delay.total == 0
     assert math.isnan(inbound.delay_error)
     assert inbound.period.total == 1
+
+
+def test_arrivals_that_nobody_asks_for_are_counted_all_the_same():
+    inbound = Inbound()
+    for i in range(100_000):
+        inbound.arrived(0.01, 0.001, True, i * 0.01)
+    assert len(inbound._arrivals) < 10_000
+    inbound.settle()
+    assert (inbound.delay.total, inbound.period.total) == (100_000, 99_999)

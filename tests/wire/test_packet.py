@@ -32,7 +32,20 @@ def test_round_trip(kind, session_id, epoch, number, topic, length, block, index
     assert header[packet.PATH_AT] == path
     assert int.from_bytes(header[packet.NUMBER_AT : packet.TIME_AT], "big") == packet_number
     assert int.from_bytes(header[packet.TIME_AT : packet.HEADER_SIZE], "big") == time
-    assert int.from_bytes(header[packet.COMMON_SIZE : packet.BLOCK_END], "big") == block
+    assert int.from_bytes(header[packet.COMMON_SIZE : packet.INDEX_AT], "big") == block
+
+
+def test_an_array_of_packets_has_the_same_fields():
+    common = [packet.push_common(packet.DATA, 2**64 - 1, 7, 2**40 + i, 9, 2400) for i in (1, 1, 2)]
+    rows = [c + packet.push_shard(3, i, 4, 2**31 + i, 2**15 + i) + bytes((i,)) * 100 for i, c in enumerate(common)]
+    packets = packet.pull_packets(b"".join(rows), 3, 132)
+    assert packets["keys"][0].tobytes() == packet.KEYS.pack(packet.DATA, 2**64 - 1, 7)
+    assert [b.tobytes() for b in packets["block"]] == [row[: packet.BLOCK.size] for row in rows]
+    assert packet.BLOCK.unpack(packets["block"][1].tobytes())[-1] == 3
+    for name, first in (("index", 0), ("number", 2**31), ("time", 2**15)):
+        assert packets[name].tolist() == [first, first + 1, first + 2]
+    assert packets["path"].tolist() == [4, 4, 4]
+    assert packets["shard"].tolist() == [[i] * 100 for i in range(3)]
 
 
 def test_the_header_is_as_small_as_documented():

@@ -57,7 +57,7 @@ def test_batches_singles_and_repetitions_give_the_same_message(shards, parity, s
             batch = np.concatenate([batch, batch[::-1]])
         entry, block = claim(reassembly, shape, rows[start])
         if len(batch) > 2:
-            whole = reassembly.add_rows(entry, block, batch.copy())
+            whole = reassembly.add_all(entry, block, batch[:, packet.INDEX_AT].copy(), batch[:, HEADER:].copy())
         else:
             for row in batch:
                 whole = whole or reassembly.add(entry, block, int(row[24]), row[HEADER:].data)
@@ -130,9 +130,9 @@ def test_a_flood_never_exceeds_the_bound(seed):
         if random.random() < 0.5:
             reassembly.add(entry, block, random.randrange(256), memoryview(bytes(shape.size)))
         else:
-            rows = np.zeros((random.randint(3, 20), HEADER + shape.size), np.uint8)
-            rows[:, packet.INDEX_AT] = random.randrange(200) + np.arange(len(rows))
-            reassembly.add_rows(entry, block, rows)
+            shards = np.zeros((random.randint(3, 20), shape.size), np.uint8)
+            indices = (random.randrange(200) + np.arange(len(shards))).astype(np.uint8)
+            reassembly.add_all(entry, block, indices, shards)
         assert 0 <= reassembly.used <= limit
     assert reassembly.evicted
 

@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from skytether.wire import Session
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived
+from skytether.wire.path import Transmit
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role, Topic
 
@@ -46,7 +47,7 @@ class Driver:
         self._calls = calls
         self._loop = loop
         self._timer: asyncio.TimerHandle | None = None
-        self._unsent: dict[int, deque[tuple[memoryview, Address, int | None, int]]] = {}
+        self._unsent: dict[int, deque[Transmit]] = {}
         """What a socket whose buffer is full has not taken yet."""
         self._errors: Counter[str] = Counter()
         """Of sockets that are closed."""
@@ -132,14 +133,19 @@ class Driver:
 
     def _on_writable(self, path: int) -> None:
         self._loop.remove_writer(self._sockets[path])
-        self._send_unsent(path)
+        unsent = self._unsent.pop(path)
+        while unsent:
+            rest = self._send(path, unsent.popleft())
+            if rest is not None:
+                unsent.appendleft(rest)
+                self._unsent[path] = unsent
+                break
         self._advance()
 
     def _advance(self) -> None:
         """What every turn ends with."""
         self._pass_events()
-        self._transmit()
-        self._set_timer()
+        self._set_timer(self._transmit())
 
     def _pass_events(self) -> None:
         while (event := self._session.next_event()) is not None:
@@ -164,37 +170,40 @@ class Driver:
                 self._complained.add(kind)
                 _log.exception("The graph's %s failed; the bridge goes on and does not repeat this", method.__name__)
 
-    def _transmit(self) -> None:
-        """Send what the session wants to send, as long as the socket takes it.
+    def _transmit(self) -> float | None:
+        """Send what the session wants to send, as long as the socket takes it; returns when it wants to do more.
 
         While its buffer is full the session keeps the rest, so that what waits still waits by priority and age.
         """
-        while batches := self._session.transmit(time.monotonic(), self._unsent):
+        session, full = self._session, self._unsent
+        while True:
+            now = time.monotonic()
+            batches = session.transmit(now, full)
             for batch in batches:
                 path = 0 if self._service else batch.path
-                unsent = self._unsent.setdefault(path, deque())
-                unsent.append((memoryview(batch.data), cast(Address, batch.address), batch.segment, batch.path))
-                if len(unsent) == 1:
-                    self._send_unsent(path)
+                if path in full:
+                    full[path].append(batch)
+                elif (rest := self._send(path, batch)) is not None:
+                    full[path] = deque((rest,))
+            due = session.next_timer(full)
+            if not batches or due is None or due > now:
+                return due
 
-    def _send_unsent(self, path: int) -> None:
-        """Hand to a path's socket what it takes."""
-        unsent, sock = self._unsent[path], self._sockets.get(path)
-        while unsent and sock is not None:
-            data, address, segment, by = unsent[0]
-            done = sock.send(data, address, segment)
-            if sock.too_large is not None:
-                self._session.shrink(by, sock.too_large, time.monotonic())
-                sock.too_large = None
-            if done < len(data):
-                unsent[0] = (data[done:], address, segment, by)
-                self._loop.add_writer(sock, self._on_writable, path)
-                return
-            unsent.popleft()
-        del self._unsent[path]
+    def _send(self, path: int, batch: Transmit) -> Transmit | None:
+        """Hand a batch to a path's socket; returns what that does not take yet."""
+        sock = self._sockets.get(path)
+        if sock is None:
+            return None
+        done = sock.send(batch.data, cast(Address, batch.address), batch.segment)
+        if sock.too_large is not None:
+            self._session.shrink(batch.path, sock.too_large, time.monotonic())
+            sock.too_large = None
+        if done == len(batch.data):
+            return None
+        self._loop.add_writer(sock, self._on_writable, path)
+        return batch._replace(data=memoryview(batch.data)[done:])
 
-    def _set_timer(self) -> None:
-        due = self._session.next_timer()
+    def _set_timer(self, due: float | None) -> None:
         if self._timer is not None:
             if self._timer.when() == due:
                 return

@@ -110,6 +110,7 @@ class ReceiveTopic:
         if self.inbox is not None:
             self.counters.lost += self.inbox.skipped
             self.inbox.skipped = 0
+        self.counters.settle()
         tracker = self.tracker
         tracker.settle(now)
         self.counters.lost += tracker.lost - self.settled

@@ -119,6 +119,7 @@ class Ledger:
                 period_p99=row.period_p99,
             )  # fmt: skip
         c = self._in.get(topic.name, Inbound())
+        c.settle()
         base = replace(
             base, delivered=c.delivered, lost=c.lost, late=c.late, expired=c.expired, superseded=c.superseded,
             duplicate=c.duplicate, bytes_delivered=c.bytes_delivered, delay_p50=c.delay.quantile(0.5),

@@ -3,45 +3,67 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import deque
+
+import numpy as np
+import numpy.typing as npt
 
 _GROWTH = math.log(1.02)
 _SMALLEST = 1e-6
+_LARGEST = 86_400.0
+_COLLECT = 512
+"""Arrivals held before they are counted: 16 KiB of each topic."""
+
+
+Values = npt.NDArray[np.float64]
+_NONE: Values = np.empty(0)
 
 
 class Histogram:
     """Quantiles of positive seconds within 1 %, in bounded memory: logarithmic buckets, each 2 % wide.
 
-    One microsecond to a day makes 1,271 buckets at most.
+    One microsecond to a day makes 1,272 buckets.
     """
 
     __slots__ = ("_counts", "maximum", "minimum", "total")
 
     def __init__(self) -> None:
-        self._counts: dict[int, int] = {}
+        self._counts = np.zeros(_bucket(_LARGEST) + 1, np.int64)
         self.total = 0
         self.maximum = self.minimum = math.nan
 
     def add(self, seconds: float) -> None:
         """Take one value; below a microsecond (or negative, by a clock's error) counts as one."""
-        seconds = min(max(seconds, _SMALLEST), 86_400.0)
-        bucket = int(math.log(seconds / _SMALLEST) / _GROWTH)
-        self._counts[bucket] = self._counts.get(bucket, 0) + 1
-        if not seconds <= self.maximum:
-            self.maximum = seconds
-        if not seconds >= self.minimum:
-            self.minimum = seconds
-        self.total += 1
+        seconds = min(max(seconds, _SMALLEST), _LARGEST)
+        self._counts[_bucket(seconds)] += 1
+        self._extend(seconds, seconds, 1)
+
+    def add_all(self, seconds: Values) -> None:
+        """Take several."""
+        if len(seconds):
+            seconds = np.clip(seconds, _SMALLEST, _LARGEST)
+            buckets = (np.log(seconds / _SMALLEST) / _GROWTH).astype(np.intp)
+            self._counts += np.bincount(buckets, minlength=len(self._counts))
+            self._extend(float(seconds.min()), float(seconds.max()), len(seconds))
 
     def quantile(self, share: float) -> float:
         """Value that ``share`` of all are at most; NaN if there are none."""
-        wanted = share * self.total
-        seen = 0
-        for bucket in sorted(self._counts):
-            seen += self._counts[bucket]
-            if seen >= wanted:
-                return _SMALLEST * math.exp((bucket + 0.5) * _GROWTH)
-        return math.nan
+        if not self.total:
+            return math.nan
+        bucket = int(np.searchsorted(np.cumsum(self._counts), max(share * self.total, 1)))
+        return _SMALLEST * math.exp((bucket + 0.5) * _GROWTH)
+
+    def _extend(self, least: float, most: float, count: int) -> None:
+        if not most <= self.maximum:
+            self.maximum = most
+        if not least >= self.minimum:
+            self.minimum = least
+        self.total += count
+
+
+def _bucket(seconds: float) -> int:
+    return int(math.log(seconds / _SMALLEST) / _GROWTH)
 
 
 class _Gap:
@@ -132,11 +154,14 @@ class Outbound:
 
 
 class Inbound:
-    """Counters of a topic at its receiver, since the session object was made; names as in `stats.TopicStats`."""
+    """Counters of a topic at its receiver, since the session object was made; names as in `stats.TopicStats`.
+
+    The times of arrivals are collected and counted together: call `settle` before reading what depends on them.
+    """
 
     __slots__ = (
-        "_arrival", "_delay", "_delay_in_order", "bytes_delivered", "delay", "delay_error", "delivered", "duplicate",
-        "expired", "jitter", "jitter_in_order", "late", "lost", "period", "superseded",
+        "_arrival", "_arrivals", "_delay", "_delay_in_order", "bytes_delivered", "delay", "delay_error", "delivered",
+        "duplicate", "expired", "jitter", "jitter_in_order", "late", "lost", "period", "superseded",
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -148,27 +173,35 @@ class Inbound:
         self.period = Histogram()
         self.jitter = Mean()
         self.jitter_in_order = Mean()
-        self._arrival = math.nan
-        self._delay = math.nan
-        self._delay_in_order = math.nan
+        self._arrivals = array("d")
+        """Of each: time, delay, error of the delay, whether in order."""
+        self._arrival = self._delay = self._delay_in_order = _NONE
+        """The last of each that was counted."""
 
     def arrived(self, delay: float, error: float, in_order: bool, now: float) -> None:
         """Take the times of one authentic message; ``error`` is inf while the clock offset is unknown."""
-        if self._arrival == self._arrival:
-            self.period.add(now - self._arrival)
-        self._arrival = now
-        if error == math.inf:
+        self._arrivals.extend((now, delay, error, in_order))
+        if len(self._arrivals) >= 4 * _COLLECT:
+            self.settle()
+
+    def settle(self) -> None:
+        """Count what arrived since the last call."""
+        if not self._arrivals:
             return
-        self.delay.add(delay)
-        if not error <= self.delay_error:
-            self.delay_error = error
-        if self._delay == self._delay:
-            self.jitter.add(abs(delay - self._delay))
-        self._delay = delay
-        if in_order:
-            if self._delay_in_order == self._delay_in_order:
-                self.jitter_in_order.add(abs(delay - self._delay_in_order))
-            self._delay_in_order = delay
+        times, delays, errors, in_order = np.array(self._arrivals).reshape(-1, 4).T
+        self._arrivals = array("d")
+        times = np.append(self._arrival, times)
+        self.period.add_all(np.diff(times))
+        self._arrival = times[-1:]
+        known = errors < math.inf
+        if not known.any():
+            return
+        worst = float(errors[known].max())
+        if not worst <= self.delay_error:
+            self.delay_error = worst
+        self.delay.add_all(delays[known])
+        self._delay = self.jitter.add_steps(self._delay, delays[known])
+        self._delay_in_order = self.jitter_in_order.add_steps(self._delay_in_order, delays[known & (in_order > 0)])
 
 
 class Mean:
@@ -180,10 +213,13 @@ class Mean:
         self._sum = 0.0
         self._count = 0
 
-    def add(self, value: float) -> None:
-        """Take one value."""
-        self._sum += value
-        self._count += 1
+    def add_steps(self, last: Values, values: Values) -> Values:
+        """Take how far each value is from the one before, the first from ``last``; returns the last."""
+        values = np.append(last, values)
+        steps = np.abs(np.diff(values))
+        self._sum += float(steps.sum())
+        self._count += len(steps)
+        return values[-1:]
 
     @property
     def value(self) -> float:

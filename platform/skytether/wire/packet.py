@@ -25,6 +25,10 @@ packet number is believed only within a plausible window (``arrivals``).
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
 
 VERSION = 1
 
@@ -35,13 +39,15 @@ WELCOME = VERSION << 4 | 2
 HEADER = struct.Struct(">BQBHIHIHBBIH")
 COMMON = struct.Struct(">BQBHIHI")
 SHARD = struct.Struct(">HBBIH")
+KEYS = struct.Struct(">BQB")
+"""What names the keys: type, session id, epoch."""
+BLOCK = struct.Struct(">BQBHIHIH")
+"""What packets of the same block of the same message agree in."""
 _SESSION = struct.Struct(">BQ")
 
 HEADER_SIZE = HEADER.size
 COMMON_SIZE = COMMON.size
-BLOCK_END = COMMON_SIZE + 2
-"""Packets that agree up to here belong to the same block of the same message."""
-INDEX_AT = 24
+INDEX_AT = BLOCK.size
 PATH_AT = 25
 NUMBER_AT = 26
 TIME_AT = 30
@@ -49,6 +55,8 @@ TIME_AT = 30
 TICK = 2.0**-14
 """Seconds of one unit of the time of sending: 61 microseconds. It wraps after 4 s."""
 TICKS = 2**16
+
+Packets = npt.NDArray[np.void]
 
 Fields = tuple[int, int, int, int, int, int, int, int, int, int, int]
 """type, session id, epoch, message number, topic index, sealed length, block, shard, path, packet number, time."""
@@ -82,6 +90,26 @@ def pull_header(data: memoryview | bytes) -> Fields | None:
         return None
     kind, session_id, epoch, high, low, topic, length, block, index, path, packet, time = HEADER.unpack_from(data)
     return kind, session_id, epoch, high << 32 | low, topic, length, block, index, path, packet, time
+
+
+@lru_cache(maxsize=64)
+def _layout(size: int) -> np.dtype[np.void]:
+    keys, block, shard = f"V{KEYS.size}", f"V{BLOCK.size}", (np.uint8, (size - HEADER_SIZE,))
+    fields = {
+        "keys": (keys, 0), "block": (block, 0), "index": (np.uint8, INDEX_AT), "path": (np.uint8, PATH_AT),
+        "number": (">u4", NUMBER_AT), "time": (">u2", TIME_AT), "shard": (shard, HEADER_SIZE),
+    }  # fmt: skip
+    formats, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size})
+
+
+def pull_packets(data: memoryview | bytes, count: int, size: int) -> Packets:
+    """So many packets of the same size, one after the other, as an array that shares their memory.
+
+    Fields: ``keys`` and ``block`` (bytes, as of `KEYS` and `BLOCK`), ``index``, ``path``, ``number``, ``time`` and
+    ``shard`` (of each packet a row of bytes).
+    """
+    return np.frombuffer(data, _layout(size), count)
 
 
 def peek_session_id(data: memoryview | bytes) -> int | None:

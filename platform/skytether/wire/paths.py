@@ -180,7 +180,7 @@ class Paths:
 
     def tell(self, now: float) -> None:
         """Tell the peer what arrived, by the paths on which that is much."""
-        for path in self:
+        for path in self._paths.values():
             if path.much_arrived:
                 self.ping_soon(path, now)
 
@@ -257,7 +257,7 @@ class Paths:
         due = math.inf
         if not self._up:
             return due
-        for path in self:
+        for path in self._paths.values():
             if path.address is not None:
                 due = min(due, path.ping_at, path.mtu.due)
         if len(self._paths) > 1:

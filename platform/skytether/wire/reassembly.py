@@ -15,7 +15,6 @@ from collections.abc import Callable
 import numpy as np
 
 from .fragment import MAX_SHARDS, Bytes, Shape, decode
-from .packet import HEADER_SIZE, INDEX_AT
 
 ENTRY_COST = 1024
 """Bytes of book-keeping charged for an incomplete message, on top of its shards."""
@@ -51,7 +50,7 @@ class _Block:
         self.count += 1
         return 1
 
-    def add_rows(self, indices: Bytes, shards: Bytes) -> int:
+    def add_all(self, indices: Bytes, shards: Bytes) -> int:
         if self.data is not None:
             return 0
         seen = np.frombuffer(self.seen, np.uint8)
@@ -190,11 +189,11 @@ class Reassembly:
         before = target.count
         return self._added(entry, target, before, target.add(index, shard))
 
-    def add_rows(self, entry: Entry, block: int, packets: Bytes) -> memoryview | None:
-        """The same for several packets of one block, as rows with their headers."""
+    def add_all(self, entry: Entry, block: int, indices: Bytes, shards: Bytes) -> memoryview | None:
+        """The same for several shards of one block, as rows; keeps both arrays."""
         target = self._block(entry, block)
         before = target.count
-        return self._added(entry, target, before, target.add_rows(packets[:, INDEX_AT], packets[:, HEADER_SIZE:]))
+        return self._added(entry, target, before, target.add_all(indices, shards))
 
     def expire(self, topic: int, now: float) -> None:
         """Drop a topic's messages that are too old."""

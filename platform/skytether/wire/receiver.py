@@ -14,21 +14,20 @@ import numpy as np
 
 from .config import Config
 from .epoch import CONTROL, Epoch
-from .fragment import Bytes
 from .handshake import MAX_HANDSHAKE
 from .packet import (
-    BLOCK_END,
+    BLOCK,
     COMMON_SIZE,
     DATA,
     HEADER,
     HEADER_SIZE,
     HELLO,
-    NUMBER_AT,
+    KEYS,
     PATH_AT,
-    TIME_AT,
     VERSION,
     WELCOME,
-    pull_header,
+    Packets,
+    pull_packets,
 )
 from .path import Path
 from .reassembly import Entry, Reassembly
@@ -114,17 +113,20 @@ class Receiver:
             self._packet(data, address, by, known, now)
             return
         whole = total // segment
-        first = pull_header(data)
-        if whole < MIN_RUN or first is None or segment <= HEADER_SIZE or first[5] == segment - HEADER_SIZE:
+        batch = self._batch(data, whole, segment, by)
+        if batch is None:
             for start in range(0, total, segment):
                 self._packet(data[start : start + segment], address, by, known, now)
             return
-        rows = np.frombuffer(data, np.uint8, whole * segment).reshape(whole, segment)
-        change = (rows[1:, :BLOCK_END] != rows[:-1, :BLOCK_END]).any(axis=1)
-        for start, end in pairwise([0, *(np.flatnonzero(change) + 1).tolist(), whole]):
-            if end - start < MIN_RUN or not self._run(rows[start:end], address, by, known, now):
+        if known is not None:
+            numbers, times = batch["number"].astype(np.uint32), batch["time"].astype(np.uint16)
+            known.arrived_all(numbers.tobytes(), times.tobytes(), segment)
+        block = batch["block"]
+        change = np.flatnonzero(block[1:] != block[:-1]) + 1
+        for start, end in pairwise((0, *change.tolist(), whole)):
+            if end - start < MIN_RUN or not self._run(batch[start:end], address, by, now):
                 for i in range(start, end):
-                    self._packet(data[i * segment : (i + 1) * segment], address, by, known, now)
+                    self._packet(data[i * segment : (i + 1) * segment], address, by, None, now)
         if total > whole * segment:
             self._packet(data[whole * segment :], address, by, known, now)
 
@@ -133,7 +135,19 @@ class Receiver:
         self.messages.expire_all(now)
         self._handshakes.expire_all(now)
 
+    def _batch(self, data: memoryview, whole: int, segment: int, by: int) -> Packets | None:
+        """A batch's packets of that size, if all are of this session's messages under the same keys by one path."""
+        if whole < MIN_RUN or segment <= HEADER_SIZE:
+            return None
+        kind, session_id, epoch_id = KEYS.unpack_from(data)
+        if kind != DATA or session_id != self._session_id or self._find_epoch(epoch_id) is None:
+            return None
+        batch = pull_packets(data, whole, segment)
+        keys = batch["keys"]
+        return None if (keys != keys[0]).any() or (batch["path"] != by).any() else batch
+
     def _packet(self, data: memoryview, address: Hashable, by: int, path: Path | None, now: float) -> None:
+        """One packet; ``path`` is None if there is none or it knows of the packet already."""
         size = len(data) - HEADER_SIZE
         if size <= 0:
             self.rejected["short"] += 1
@@ -166,24 +180,18 @@ class Receiver:
             else:
                 self._open(epoch, number, topic, data[HEADER_SIZE:], data[:COMMON_SIZE], by, address, now)
 
-    def _run(self, rows: Bytes, address: Hashable, by: int, path: Path | None, now: float) -> bool:
+    def _run(self, run: Packets, address: Hashable, by: int, now: float) -> bool:
         """Several packets of one block of a large message; False if they have to be looked at one by one."""
-        fields = pull_header(rows[0].data)
-        if fields is None or fields[0] != DATA or fields[1] != self._session_id:
-            return False
-        _, _, epoch_id, number, topic, length, block, _, _, _, _ = fields
+        head = run["block"][0].tobytes()
+        _, _, epoch_id, high, low, topic, length, block = BLOCK.unpack(head)
         epoch = self._find_epoch(epoch_id)
-        size = rows.shape[1] - HEADER_SIZE
-        if epoch is None or length == size or (rows[:, PATH_AT] != by).any():
+        size = run["shard"].shape[1]
+        if epoch is None or length == size:
             return False
-        if path is not None:
-            numbers = np.ascontiguousarray(rows[:, NUMBER_AT:TIME_AT]).view(">u4").astype(np.uint32)
-            times = np.ascontiguousarray(rows[:, TIME_AT:HEADER_SIZE]).view(">u2").astype(np.uint16)
-            path.arrived_all(numbers.tobytes(), times.tobytes(), rows.shape[1])
-        common = rows[0, :COMMON_SIZE].tobytes()
-        entry = self._entry(epoch, number, topic, length, block, common, size, len(rows), now)
+        number, common = high << 32 | low, head[:COMMON_SIZE]
+        entry = self._entry(epoch, number, topic, length, block, common, size, len(run), now)
         if entry is not None:
-            sealed = self.messages.add_rows(entry, block, rows.copy())
+            sealed = self.messages.add_all(entry, block, run["index"].copy(), run["shard"].copy())
             if sealed is not None:
                 self._open(epoch, number, topic, sealed, common, by, address, now)
         return True

@@ -11,7 +11,7 @@ import heapq
 import math
 import struct
 from collections import deque
-from collections.abc import Hashable, Iterable
+from collections.abc import Container, Hashable, Iterable
 from functools import partial
 
 from .compression import FLAG, Compressed, original_size
@@ -144,11 +144,14 @@ class Sender:
             lane = self._lanes[path.id] = Lane(path, self._config.queue_limit)
         return lane
 
-    def next_timer(self) -> float:
-        """When `transmit` will have something to send; 0 for at once, inf for never."""
-        return min(
-            [lane.next_timer() for lane in self._lanes.values() if lane.path.address is not None], default=math.inf
-        )
+    def next_timer(self, full: Container[int] = ()) -> float:
+        """When `transmit` will have something to send by paths not ``full``; 0 for at once, inf for never."""
+        due = math.inf
+        for lane in self._lanes.values():
+            path = lane.path
+            if path.address is not None and path.id not in full:
+                due = min(due, lane.next_timer())
+        return due
 
     def transmit(self, path: Path, now: float) -> list[Transmit]:
         """What may be sent now, at most a burst."""
@@ -157,13 +160,15 @@ class Sender:
             return []
         lane = self._lane(path)
         queue, flights, copies = lane.queue, lane.flights, lane.copies
+        lane.wake = math.inf
+        if not (queue or flights or lane.urgent or (copies and copies[0].due <= now)):
+            return []
         while copies and copies[0].due <= now:
             copy = heapq.heappop(copies)
             queue.put_other(copy.topic.priority, copy)
         pacer = path.pacer
         left = min(pacer.budget(now), self._config.burst)
         batches = Batches(path.id, address)
-        lane.wake = math.inf
         for packet in lane.urgent:
             batches.add(packet)
             left -= len(packet)

@@ -263,12 +263,15 @@ class Session:
         """The oldest event not yet taken."""
         return self._events.popleft() if self._events else None
 
-    def next_timer(self) -> float | None:
-        """When to call `handle_timer` and `transmit`, if nothing happens before; None: not by itself."""
+    def next_timer(self, full: Container[int] = ()) -> float | None:
+        """When to call `handle_timer` and `transmit`, if nothing happens before; None: not by itself.
+
+        What waits for a path that is ``full`` waits for that, not for a time.
+        """
         if self._closed:
             return None
         due = min(
-            self._sender.next_timer(), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
+            self._sender.next_timer(full), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
             self._check_at, self._streams.due,
         )  # fmt: skip
         return due if due < math.inf else None

@@ -50,6 +50,8 @@ class Streams:
     @property
     def due(self) -> float:
         """When to call `handle_timer`."""
+        if not self._busy and not self._owing:
+            return math.inf
         due = min((outbox.due for outbox in self._busy), default=math.inf)
         return min(due, min((inbox.due for inbox in self._owing), default=math.inf))
 
