@@ -95,6 +95,17 @@ def test_publish_from_many_threads_loses_and_mixes_nothing(ends):
     assert topic_stats(robot, "force").offered == 1600
 
 
+def test_no_message_of_a_burst_is_left_behind(ends):
+    service, robot = ends.pair()
+    sent = []
+    for size in (1, 2, 3, 50, 1, 200) * 5:  # what comes close together is gathered; the last one waits for no other
+        for _ in range(size):
+            sent.append(("force", len(sent).to_bytes(4, "big")))
+            robot.publish(*sent[-1])
+        service.graph.wait(lambda graph: len(graph.messages) == len(sent), 30)
+    assert service.graph.messages == sent
+
+
 def test_the_publishers_buffer_may_be_used_again_at_once(ends):
     service, robot = ends.pair()
     buffer = bytearray(b"before")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 
 import pytest
+from typer.testing import CliRunner
 
+from skytether.cli.lab import app as cli
 from skytether.lab.bench import conditions, traffic
 from skytether.lab.bench.bridge import BenchError, make_plan
 from skytether.lab.bench.process import Order, publish
@@ -101,6 +104,14 @@ def test_an_unknown_name_lists_the_known() -> None:
         make_plan("table2", emulator="netem")
     with pytest.raises(ValueError, match="suite 'saturated' has its own link"):
         make_plan("saturated", condition=["burst"])
+
+
+def test_help_names_everything_that_may_be_chosen_and_every_field() -> None:
+    shown = CliRunner().invoke(cli, ["bench", "bridge", "--help"], env={"COLUMNS": "200"}).output
+    words = set(shown.replace(",", " ").replace(".", " ").replace(":", " ").replace(";", " ").replace(")", " ").split())
+    sweep = [c.name for c in conditions.find(["sweep"])]
+    fields = [field.name for field in dataclasses.fields(Row)]
+    assert words >= {*SUITES, *NAMES, *conditions.NAMES, *sweep, *fields}
 
 
 def test_tcp_is_left_out_in_user_space_and_said_so() -> None:

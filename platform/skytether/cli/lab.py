@@ -152,9 +152,30 @@ def bridge(
     json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each topic.")] = False,
     output: Annotated[Path | None, typer.Option(help="Folder for the report, its plots and rows.json.")] = None,
 ) -> None:
-    """The bridge and other transports, with the same traffic on the same bad links.
+    """The bridge and other transports: the same traffic on the same bad links.
 
-    Delays are one way, from the call that sends to the call that delivers, between processes on one clock.
+    Delays are one way, from the call that sends to the call that delivers,
+    between processes on one clock. Processor time is that of each end's
+    whole process, which makes and checks the messages too: the same work
+    for every transport.
+
+    Suites: table2 (thesis Table 2 traffic over emulated links), fig26 (loss
+    over size and rate on loopback, thesis figure 26), throughput (of 64 kB
+    messages, and of messages of 100 B), saturated (velocity commands beside
+    a camera that fills 5 Mbit/s), latency (on loopback).
+
+    Links of table2: ideal, 50ms-1%, 50ms-5%, commercial, private, burst;
+    commercial-ordered and private-ordered, whose jitter never reorders;
+    sweep (50 ms with 0 to 30 % loss, or one of them: loss-0%, loss-1%,
+    loss-2%, loss-5%, loss-10%, loss-15%, loss-20%, loss-25%, loss-30%).
+
+    Transports: skytether, udp, tcp, websocket-cbor, zenoh-tcp, zenoh-2tcp,
+    zenoh-quic, zenoh-udp, zenoh-mixed.
+
+    Each row of --json has: transport, condition, topic, sent, delivered,
+    delay_p50_ms, delay_p95_ms, delay_p99_ms, delay_max_ms, overhead (bytes
+    on the link beyond payload, over payload), cpu_s, cpu_robot_s,
+    cpu_service_s, congestion, emulator, emulator_late_ms, size, seconds.
     """
     from skytether.lab.bench.bridge import BenchError, make_plan, run
     from skytether.lab.bench.report import console_table, write_report
