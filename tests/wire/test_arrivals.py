@@ -236,7 +236,7 @@ def test_times_wrap_and_any_times_are_borne():
         assert len(flood._times) <= COLLECT
 
 
-@pytest.mark.parametrize(("pause", "queue"), [(0.015, False), (0.2, True)])
+@pytest.mark.parametrize(("pause", "queue"), [(0.045, False), (0.3, True)])
 def test_what_waits_for_a_busy_receiver_is_no_queue_unless_it_cannot_keep_up(pause, queue):
     path = Path(0, Config(), 0.0)
     for number in range(2000):

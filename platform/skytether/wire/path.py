@@ -34,7 +34,7 @@ BURST_TIME = 0.03
 """Seconds in which it arrives, beyond a round trip until the peer has told so."""
 FAMILIAR = 500
 """Packets from which a path is known well."""
-OWN_DELAY = 0.02
+OWN_DELAY = 0.05
 """Most seconds for which packets may wait for this end without that counting as a queue on the path: what waits longer
 fills the system's buffer, so the peer has to slow down."""
 
