@@ -124,3 +124,11 @@ class Ended:
 def test_the_systems_battery_is_known_or_not():
     found = system_battery()
     assert found is None or 0 <= found[0] <= 1
+
+
+def test_a_move_by_the_orchestrator_is_not_contradicted(rig, orchestrator):
+    rig.look(5)
+    here = orchestrator._answer("get", "i1", "i1").model_copy(update={"placement": Placement(site="edge")})
+    rig.tasks.placed(here)
+    rig.tasks.placed(here.model_copy(update={"placement": Placement(site="cloud")}))
+    assert rig.tasks.decision.site == "cloud"

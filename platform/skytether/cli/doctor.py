@@ -69,6 +69,8 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     from .robot_config import load_config, load_token
 
     settings = load_config(config) if config is not None else None
+    if settings is not None and config is not None and settings.ca_file is not None:
+        ca_file = ca_file or config.parent / settings.ca_file
     address = url or (settings.orchestrator if settings else None)
     yield examine.extras(["ros2"] if settings and settings.ros2 else [])
     if settings is not None:
@@ -84,8 +86,9 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
                 given = None
         if given:
             yield examine.token(address, ca_file, given, settings.service if settings else None)
-    where = _address(echo) if echo else _of(address)
-    if where is not None:
+    echoes = [_address(echo)] if echo else [w for w in (_of(address),) if w is not None]
+    echoes += settings.task.addresses.values() if settings and not echo else ()
+    for where in echoes:
         yield from examine.network(*where)
     if settings is not None and settings.ros1 is not None:
         yield from _ros1(

@@ -13,7 +13,9 @@ from pydantic import Field, field_validator, model_validator
 from skytether.api.manifest import Name, Strict
 from skytether.messages import type_of
 from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.status import DEFAULT_PORT
 from skytether.robot.supervisor import Limits
+from skytether.robot.task_manager import Mode, Policy
 from skytether.ros.names import Generation, check_name
 
 from .bridge_config import LocalNetwork
@@ -21,6 +23,10 @@ from .config_file import ConfigError, Endpoint, read_config
 from .ros2_config import Ros2Graph
 
 DEFAULT_MASTER = "http://localhost:11311"
+
+
+Weight = Annotated[float, Field(ge=0, le=1e6)]
+_POLICY = Policy()
 
 
 class FallbackConfig(Strict):
@@ -120,6 +126,37 @@ class Ros2Config(GraphConfig, Ros2Graph):
         return self
 
 
+class TaskConfig(Strict):
+    """Local or offloaded, and to which site: weights and hysteresis of ``skytether.robot.task_manager.Policy``."""
+
+    mode: Literal["auto", "offload", "local"] = "auto"
+    """``offload``: the service is asked for, always; ``local``: never; ``auto``: the costs decide."""
+    echoes: dict[Name, Annotated[str, Field(pattern=r"^.+:\d{1,5}$", description="HOST:PORT")]] = {}
+    """``skytether echo`` of sites, by site; the others are probed through the orchestrator."""
+    probe_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0
+    """Between two probes of each site."""
+    delay: Weight = _POLICY.delay
+    loss: Weight = _POLICY.loss
+    energy: Weight = _POLICY.energy
+    processor: Weight = _POLICY.processor
+    service: Weight = _POLICY.service
+    radio: Weight = _POLICY.radio
+    local_cpu: Weight = _POLICY.local_cpu
+    margin: Weight = _POLICY.margin
+    hold_s: Weight = _POLICY.hold_s
+    bad_s: Weight = _POLICY.bad_s
+
+    @property
+    def addresses(self) -> dict[str, tuple[str, int]]:
+        """The echoes, taken apart."""
+        parted = ((site, echo.rpartition(":")) for site, echo in self.echoes.items())
+        return {site: (host.strip("[]"), int(port)) for site, (host, _, port) in parted}
+
+    def policy(self) -> Policy:
+        """For the task manager."""
+        return Policy(**{**self.model_dump(exclude={"echoes", "probe_s"}), "mode": Mode(self.mode)})
+
+
 class RobotConfig(Strict):
     """The whole file."""
 
@@ -141,6 +178,11 @@ class RobotConfig(Strict):
     bind: Endpoint = Endpoint(host="0.0.0.0")  # noqa: S104 - a robot has one network or several
     paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
     """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
+    ca_file: Path | None = None
+    """PEM file of the certificate's authority, relative to this file's folder; null: the system's."""
+    task: TaskConfig = TaskConfig()
+    status_port: Annotated[int, Field(ge=0, le=65_535)] | None = DEFAULT_PORT
+    """Of ``/status`` and ``/metrics`` on loopback; 0: any free one; null: there are none."""
     safety: SafetyConfig | None = None
     """The gate's part (``skytether robot gate``); with it, velocities go to the gate and not to the wheels."""
     ros1: Ros1Config | None = None

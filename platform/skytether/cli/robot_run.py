@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -54,10 +55,11 @@ def run(
 
         with _node(settings, settings.ros1, threading.Event()) as node:
             raise typer.Exit(0 if check_robot(settings, ros1_config(settings, settings.ros1), node, token) else 1)
-    _run(settings, settings.ros1, token, seconds)
+    agent = agent_config(settings, config.parent, token)
+    _run(settings, settings.ros1, agent, seconds)
 
 
-def _run(settings: RobotConfig, ros1: Ros1Config, token: str, seconds: float | None) -> None:
+def _run(settings: RobotConfig, ros1: Ros1Config, config: AgentConfig, seconds: float | None) -> None:
     from skytether.robot.agent import Agent
     from skytether.robot.fallback import FallbackError
     from skytether.robot.ros1 import Ros1Robot
@@ -66,7 +68,7 @@ def _run(settings: RobotConfig, ros1: Ros1Config, token: str, seconds: float | N
     with _node(settings, ros1, ended) as node:
         robot = Ros1Robot(ros1_config(settings, ros1), node)
         try:
-            with Agent(agent_config(settings, token), robot.base, graph=robot) as agent:
+            with Agent(config, robot.base, graph=robot) as agent:
                 _watch(agent.status, ended, seconds)
         except FallbackError as error:
             fail(str(error), 2)
@@ -117,12 +119,22 @@ def _sentence(status: AgentStatus) -> str:
     return f"driving: {driver.source} ({reason}); {instance}, {session}{trouble}"
 
 
-def agent_config(settings: RobotConfig, token: str) -> AgentConfig:
-    """What the agent needs of the configuration."""
+def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig:
+    """What the agent needs of the configuration.
+
+    Args:
+        settings: The file.
+        folder: That its paths are relative to.
+        token: The robot's, as it is now.
+    """
     from skytether.bridge.interfaces import LocalPath, Wanted
     from skytether.robot.agent import AgentConfig
     from skytether.robot.supervisor import Limits
+    from skytether.robot.tasks import TaskConfig
 
+    from .robot_config import load_token
+
+    task = settings.task
     paths: Wanted = (
         "auto"
         if settings.paths == "auto"
@@ -141,6 +153,10 @@ def agent_config(settings: RobotConfig, token: str) -> AgentConfig:
         rate_hz=settings.rate_hz,
         bind=(settings.bind.host, settings.bind.port),
         paths=paths,
+        ca_file=str(folder / settings.ca_file) if settings.ca_file else os.environ.get("SKYTETHER_CA_FILE"),
+        task=TaskConfig(task.policy(), task.addresses, task.probe_s),
+        fresh_token=lambda: load_token(settings, folder),
+        status_port=settings.status_port,
     )
 
 

@@ -17,6 +17,8 @@ import uvicorn
 from alembic.util import CommandError
 from sqlalchemy.exc import SQLAlchemyError
 
+from skytether.bridge.echo import EchoServer
+
 from . import logs
 from .app import create_app
 from .core import Orchestrator
@@ -74,12 +76,30 @@ def _serve(core: Orchestrator, listener: socket.socket) -> None:
     try:
         _start(core)
         try:
-            server.run(sockets=[listener])
+            with _echo(core, listener):
+                server.run(sockets=[listener])
         finally:
             core.stop()
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _echo(core: Orchestrator, listener: socket.socket) -> Iterator[None]:
+    """Answer UDP echoes at the same address and number; where that is taken, do without."""
+    host, port = listener.getsockname()[:2]
+    if not core.settings.echo:
+        yield
+        return
+    try:
+        server = EchoServer(host, port)
+    except OSError as error:
+        log.warning("no UDP echo on %s port %d: %s", host, port, error.strerror)
+        yield
+        return
+    with server:
+        yield
 
 
 def _start(core: Orchestrator) -> None:

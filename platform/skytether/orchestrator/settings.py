@@ -140,6 +140,8 @@ class Settings(Group):
     """At shutdown: true ends all instances; false leaves them running, to be adopted at the next start."""
     open_metrics: bool = False
     """True: `/metrics` needs no token."""
+    echo: bool = True
+    """Answer UDP echoes at the same address and port, for `skytether doctor`; never more than was asked."""
     proxies: tuple[str, ...] = ()
     """Addresses or networks of proxies in front, whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed."""
     tls: Tls = Tls()

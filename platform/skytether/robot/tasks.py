@@ -114,7 +114,8 @@ class Tasks:
         self._windows: dict[str, Window] = {}
         self._echoes: dict[str, EchoClient] = {}
         self._refused: dict[str, tuple[str, float]] = {}
-        self._instance = ""
+        self._seen = ("", "")
+        """The instance and its site, as last heard."""
         self._here: PathQuality = PathQuality()
         self._lock = threading.Lock()
         self._decision = task_manager.start(config.policy, clock())
@@ -145,8 +146,10 @@ class Tasks:
             return
         site = instance.placement.site
         with self._lock:
-            if instance.id != self._instance:
-                self._instance = instance.id
+            # Heard again, it is no news: where another site was decided on meanwhile, that stands. Heard from another
+            # site, the orchestrator has moved it for its own reasons, and is not contradicted before hysteresis allows.
+            if (instance.id, site) != self._seen:
+                self._seen = (instance.id, site)
                 until = self._clock() + _REFUSED_S
                 for refusal in instance.placement.refused:
                     self._refused[refusal.site] = (f"refused by the orchestrator: {refusal.detail}", until)

@@ -1,5 +1,6 @@
 """``skytether robot run`` on a real master, with a real orchestrator and a service."""
 
+import json
 import subprocess
 import threading
 import time
@@ -114,6 +115,14 @@ def test_a_laser_of_another_type_drives_nobody_and_the_check_says_so_before(grap
         assert checked.returncode == 1, found + said
         assert "!!" in found
         assert "1 to mend" in said
+        doctor = graph.skytether("doctor", str(config), "--json", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        found, said = (text.decode() for text in doctor.communicate(timeout=60))
+        assert doctor.returncode == 1, found + said
+        findings = {finding["check"]: finding for finding in json.loads(found)}
+        assert "publishes std_msgs/Bool with MD5" in findings["types"]["says"]
+        assert {check: f["state"] for check, f in findings.items() if check != "types"} == dict.fromkeys(
+            ("extras", "fallback", "orchestrator", "clock", "token", "udp", "mtu", "nat", "ros master"), "ok"
+        )
         process = graph.skytether("robot", "run", str(config), "--seconds", "5", stderr=subprocess.PIPE)
         said = process.stderr.read().decode()
         assert process.wait(30) == 0
