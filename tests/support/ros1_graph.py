@@ -60,7 +60,7 @@ class Ros1Graph:
     def start_master(self) -> Ros1Graph:
         """Start it; also after `kill_master`, at the same port."""
         self._master = self.start("rosmaster", "--core", "-p", str(self.port))
-        wait_for(self._answers, "the ROS master")
+        wait_for(self.answers, "the ROS master")
         return self
 
     def kill_master(self) -> None:
@@ -68,7 +68,7 @@ class Ros1Graph:
         self._master.kill()
         self._master.wait()
 
-    def _answers(self) -> bool:
+    def answers(self) -> bool:
         def ask() -> bool:
             try:
                 with ServerProxy(self.uri) as proxy:

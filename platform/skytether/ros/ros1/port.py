@@ -173,6 +173,11 @@ class Ros1Port:
         for server in servers.values():
             self._node.unserve(server)
 
+    def subscribers(self, topic: str) -> list[str]:
+        """Names of the nodes that listen to a topic of the bridge which is published here."""
+        publication = self._publications.get(topic)
+        return publication.subscribers if publication else []
+
     # --- topics ----------------------------------------------------------------------------------------------------
 
     def _listen(self, topic: Topic) -> None:
