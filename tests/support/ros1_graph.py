@@ -142,6 +142,38 @@ class Ros1Graph:
                     pipe.close()
 
 
+_PACKAGE = """<package format="2"><name>{name}</name><version>1.0.0</version><description>-</description>
+<maintainer email="a@b.c">-</maintainer><license>BSD</license>{more}</package>"""
+_PLUGINS = """<library path="lib/libimage_proc">
+<class name="image_proc/debayer" type="image_proc::DebayerNodelet" base_class_type="nodelet::Nodelet"/>
+<class name="image_proc/rectify" type="image_proc::RectifyNodelet" base_class_type="nodelet::Nodelet"/>
+</library>"""
+
+
+def debian_packages(folder: Path) -> dict[str, str]:
+    """Debian has the programs of topic_tools and image_proc, but not what roslaunch and pluginlib find them by.
+
+    Args:
+        folder: Where to put that.
+
+    Returns:
+        Variables that name it.
+    """
+    share, lib = folder / "share", folder / "lib"
+    lib.mkdir(parents=True)
+    exported = '<export><nodelet plugin="${prefix}/nodelet_plugins.xml"/></export>'
+    depends = "<depend>nodelet</depend>" + exported
+    for name, more in (("nodelet", ""), ("topic_tools", ""), ("image_proc", depends)):
+        (share / name).mkdir(parents=True)
+        (share / name / "package.xml").write_text(_PACKAGE.format(name=name, more=more))
+    (share / "image_proc" / "nodelet_plugins.xml").write_text(_PLUGINS)
+    for name, program in (("topic_tools", "relay"), ("topic_tools", "throttle"), ("image_proc", "image_proc")):
+        (share / name / program).symlink_to(f"/usr/lib/{name}/{program}")
+    (library,) = Path("/usr/lib").glob("*/libimage_proc.so.0d")
+    (lib / "libimage_proc.so").symlink_to(library)
+    return {"ROS_PACKAGE_PATH": f"{share}:/usr/share", "CMAKE_PREFIX_PATH": str(folder)}
+
+
 def _free_port() -> int:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from ros1_graph import Ros1Graph
+from ros1_graph import Ros1Graph, debian_packages
 from ros1_pair import Pair
 
 from skytether.api.client import Client
@@ -54,7 +54,7 @@ def orchestrator(tmp_path):
         EmbeddedOrchestrator(tmp_path / "orchestrator") as orchestrator,
         Client(orchestrator.url, orchestrator.operator_token) as client,
     ):
-        options = {"python_path": folders}
+        options = {"python_path": folders, "environment": debian_packages(tmp_path / "packages")}
         client.create_site(SiteCreate(name="here", tier="edge", runtime="process", options=options))
         client.delete_site("local")
         orchestrator.client = client
