@@ -23,7 +23,8 @@ from .port import Port
 _log = logging.getLogger(__name__)
 
 _TURN = 8
-"""Batches (of up to 64 kB) taken from the socket before something is sent again."""
+"""Batches (of up to 64 kB) taken from the socket before something is sent again, and bursts sent before the socket is
+looked at again: what the peer says of those before decides how the next are sent."""
 
 
 class Driver:
@@ -176,7 +177,7 @@ class Driver:
         While its buffer is full the session keeps the rest, so that what waits still waits by priority and age.
         """
         session, full = self._session, self._unsent
-        while True:
+        for _ in range(_TURN):
             now = time.monotonic()
             batches = session.transmit(now, full)
             for batch in batches:
@@ -187,7 +188,8 @@ class Driver:
                     full[path] = deque((rest,))
             due = session.next_timer(full)
             if not batches or due is None or due > now:
-                return due
+                break
+        return due
 
     def _send(self, path: int, batch: Transmit) -> Transmit | None:
         """Hand a batch to a path's socket; returns what that does not take yet."""

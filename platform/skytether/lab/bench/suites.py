@@ -118,7 +118,7 @@ def _throughput(setup: Setup, say: Progress, failed: Progress) -> Iterator[Row]:
             flows = traffic.stream(size, hz)
             try:
                 with setup.pair(name, flows, f"{size} B, {offered}", None, UNLIMITED) as pair:
-                    yield from pair.measure(setup.seconds, warm_up=0.5)
+                    yield from pair.measure(setup.seconds, warm_up=2.0)
             except BenchError as error:
                 failed(str(error))
 
