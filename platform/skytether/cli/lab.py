@@ -60,17 +60,26 @@ def handover(
 @bench.command("start")
 def start(
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Starts to measure.")] = 20,
+    runtime: Annotated[
+        list[str] | None, typer.Option(help="process or docker; may be repeated. Default: process.")
+    ] = None,
+    prefix: Annotated[str, typer.Option(help="Of the images' names.")] = "skytether/",
     json: Annotated[bool, typer.Option("--json", help="Print rows `runtime, standby, p50_s, p99_s, n`.")] = False,
 ) -> None:
-    """Time from a robot's request over REST to the first velocity command that it accepts."""
+    """Time from a robot's request over REST to the first velocity command that it accepts.
+
+    With docker, the images must be there (`make images`), and `docker run` of the same image is timed in turn, until
+    its service listens.
+    """
     from rich.table import Table
 
-    from skytether.lab.bench.start import BenchError, bench_start
+    from skytether.lab.bench.pair import BenchError
+    from skytether.lab.bench.start import bench_start
     from skytether.lab.embedded import EmbeddedError
 
     try:
         with console.status("starting ...") as line:
-            rows = bench_start(n, lambda i, s: line.update(f"start {i + 1} of {n}: {s:.3f} s"))
+            rows = bench_start(n, runtime or ["process"], prefix, lambda row, s: line.update(f"{row}: {s:.3f} s"))
     except (BenchError, EmbeddedError) as error:
         fail(str(error))
     if json:
@@ -98,7 +107,7 @@ def failover(
     from rich.table import Table
 
     from skytether.lab.bench.failover import RATES_HZ, bench_failover
-    from skytether.lab.bench.start import BenchError
+    from skytether.lab.bench.pair import BenchError
     from skytether.robot import driver
 
     logging.getLogger(driver.__name__).setLevel(logging.ERROR)  # hand-overs are what is measured here

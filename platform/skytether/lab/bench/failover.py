@@ -37,7 +37,7 @@ from skytether.robot.command import Source
 from skytether.robot.supervisor import Limits
 from skytether.wire.topic import Role
 
-from .start import BenchError
+from .pair import BenchError
 
 RATES_HZ = (100.0, 50.0, 20.0, 10.0, 5.0)
 _FAST_HZ = 100.0

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
+from skytether.lab.bench.containers import docker_run, docker_site
+from skytether.lab.bench.pair import BenchError
 from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
@@ -20,16 +22,12 @@ _LIMIT_S = 20.0
 _LOOK_S = 0.005
 
 
-class BenchError(Exception):
-    """Nothing could be measured; the text says why."""
-
-
 @dataclass(frozen=True, slots=True)
 class StartRow:
     """One line of the table.
 
     Attributes:
-        runtime: Kind of the site.
+        runtime: Kind of the site; ``docker run``: none, until the service listens.
         standby: Instances kept warm.
         p50_s: Median time from request to first command [s].
         p99_s: 99th percentile (the largest, when there are fewer than 100) [s].
@@ -47,28 +45,62 @@ class StartRow:
         return asdict(self)
 
 
-def bench_start(n: int, on_start: Callable[[int, float], None] = lambda *_: None) -> list[StartRow]:
-    """Start ``n`` instances of virtual-trail one after the other on an orchestrator of our own.
+def bench_start(
+    n: int,
+    runtimes: Sequence[str] = ("process",),
+    prefix: str = "skytether/",
+    on_start: Callable[[str, float], None] = lambda *_: None,
+) -> list[StartRow]:
+    """Start ``n`` instances of virtual-trail one after the other, on orchestrators of our own.
+
+    Args:
+        n: Starts of each kind.
+        runtimes: ``process``, ``docker``. Beside the latter, in turn with it, ``docker run`` of the same image is timed
+            until its service listens: no robot, no orchestrator, no limits.
+        prefix: Of the images' names.
+        on_start: Called with the row and the time of each start [s].
 
     Raises:
-        BenchError: An instance did not drive in time.
+        BenchError: An instance did not drive in time, or there is no such runtime.
     """
-    seconds = []
-    for i, took in enumerate(_starts(n)):
-        seconds.append(took)
-        on_start(i, took)
-    p50, p99 = np.percentile(seconds, [50, 99], method="inverted_cdf")
-    return [StartRow("process", 0, round(float(p50), 4), round(float(p99), 4), n)]
+    rows = []
+    for runtime in runtimes:
+        if runtime not in _STARTS:
+            raise BenchError(f"there is no runtime '{runtime}' to measure; there are {', '.join(_STARTS)}")
+        seconds: dict[str, list[float]] = {}
+        for row, took in _STARTS[runtime](n, prefix):
+            seconds.setdefault(row, []).append(took)
+            on_start(row, took)
+        for row, all_of_it in seconds.items():
+            p50, p99 = np.percentile(all_of_it, [50, 99], method="inverted_cdf")
+            rows.append(StartRow(row, 0, round(float(p50), 4), round(float(p99), 4), n))
+    return rows
 
 
-def _starts(n: int) -> Iterator[float]:
+def _process(n: int, prefix: str) -> Iterator[tuple[str, float]]:  # noqa: ARG001 (processes have no image)
     with EmbeddedOrchestrator() as orchestrator:
-        with Client(orchestrator.url, orchestrator.operator_token) as operator:
-            token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
-        config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=("127.0.0.1", 0))
-        for _ in range(n):
-            with Agent(config, WalkerBase(World(Trail(), seed=1))) as agent:
-                yield _first_command(agent)
+        for took in _starts(orchestrator, n):
+            yield "process", took
+
+
+def _docker(n: int, prefix: str) -> Iterator[tuple[str, float]]:
+    with EmbeddedOrchestrator() as orchestrator, docker_site(orchestrator, prefix) as service:
+        for took in _starts(orchestrator, n):
+            yield "docker", took
+            yield "docker run", docker_run(service)
+
+
+_STARTS = {"process": _process, "docker": _docker}
+
+
+def _starts(orchestrator: EmbeddedOrchestrator, n: int) -> Iterator[float]:
+    with Client(orchestrator.url, orchestrator.operator_token) as operator:
+        token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
+    config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=("127.0.0.1", 0))
+    for _ in range(n):
+        with Agent(config, WalkerBase(World(Trail(), seed=1))) as agent:
+            took = _first_command(agent)
+        yield took
 
 
 def _first_command(agent: Agent) -> float:

@@ -8,8 +8,9 @@ the machine and the right to configure it, and ends.
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 
-from docker.errors import NotFound
+from docker.errors import APIError, NotFound
 
 from ..base import RuntimeFailure
 from .engine import Engine, status_of
@@ -17,6 +18,7 @@ from .images import ensure_image
 from .options import DockerOptions
 
 _OURS = "skytether.io/network"
+_GUARD = "skytether.io/guard"
 _GUARD_TIMEOUT_S = 30
 
 
@@ -105,10 +107,13 @@ def run_guard(engine: Engine, image: str, script: str) -> tuple[str, int]:
             "CapAdd": ["NET_ADMIN"],
             "SecurityOpt": ["no-new-privileges"],
         },
-        "Labels": {"app.kubernetes.io/managed-by": "skytether"},
+        "Labels": {_GUARD: "", "app.kubernetes.io/managed-by": "skytether"},
     }
     with engine.asked():
         api = engine.api()
+        for left in api.containers(all=True, filters={"label": [_GUARD], "status": ["exited", "created"]}):
+            with suppress(APIError):  # another orchestrator's, which is just removing it
+                api.remove_container(left["Id"])
         made = api.create_container_from_config(body)["Id"]
         try:
             api.start(made)

@@ -51,6 +51,7 @@ class DockerRuntime(Runtime):
         """Containers that were asked to end."""
         self._network_lock = threading.Lock()
         self._network_ready = False
+        self._early: threading.Thread | None = None
         self._follower = Follower(self._engine, self._owner, self._on_connect)
         self._follower.start()
 
@@ -61,7 +62,8 @@ class DockerRuntime(Runtime):
 
     def _on_connect(self) -> None:
         self._network_ready = False  # the engine's machine may have been started anew, without our filter
-        threading.Thread(target=self._prepare_early, name="docker-network", daemon=True).start()
+        self._early = threading.Thread(target=self._prepare_early, name="docker-network", daemon=True)
+        self._early.start()
 
     def _prepare_early(self) -> None:
         with suppress(RuntimeFailure):  # the first start will say it
@@ -161,6 +163,8 @@ class DockerRuntime(Runtime):
             for job in self._jobs.values():
                 job.cancel()
         self._follower.close()
+        if self._early is not None:
+            self._early.join(self._options.timeout_s)  # or it leaves its container behind
         self._engine.drop()
 
 
