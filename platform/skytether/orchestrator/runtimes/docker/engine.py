@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import shutil
+import socket
 import subprocess
 import tempfile
 import threading
@@ -29,6 +30,8 @@ _POOL = 32
 """Connections that are kept: as many calls may be under way at once."""
 _OLDEST = "1.41"
 """Version of the engine's interface with which its newest is asked for: Docker 20.10's."""
+_PROBE_S = 5.0
+"""An engine that is stopped lets its queue of connections fill up; then even this takes time."""
 _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 
@@ -54,6 +57,11 @@ class Engine:
         """
         timeout = timeout_s or self._options.timeout_s
         with self._lock:
+            with self.asked():
+                if self._tunnel is not None:
+                    _probe(str(self._tunnel.open()))
+                elif self._options.local:
+                    _probe(self._options.address.path)
             if timeout not in self._clients:
                 with self.asked():
                     self._clients[timeout] = self._connect(timeout)
@@ -102,6 +110,17 @@ class Engine:
             ) from error
 
 
+def _probe(path: str) -> None:
+    """See whether anybody listens on a socket: the SDK leaves one open that does not connect.
+
+    Raises:
+        OSError: Nobody does.
+    """
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(_PROBE_S)
+        probe.connect(path)
+
+
 def _plain(client: APIClient) -> APIClient:
     """Without what the environment says of proxies and authorities: it is meant for the Internet, not for an engine."""
     client.trust_env = False
@@ -141,7 +160,7 @@ class Tunnel:
         self._folder: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
-    def command(self, socket: Path) -> list[str]:
+    def command(self, here: Path) -> list[str]:
         """What is run."""
         address, ssh = self._options.address, self._options.ssh
         settings = {
@@ -162,7 +181,7 @@ class Tunnel:
             command += ["-p", str(address.port)]
         host = f"{address.username}@{address.hostname}" if address.username else str(address.hostname)
         remote = address.path if address.path not in ("", "/") else LOCAL_SOCKET
-        return [*command, "-L", f"{socket}:{remote}", host, "cat"]
+        return [*command, "-L", f"{here}:{remote}", host, "cat"]
 
     def open(self) -> Path:
         """Where the engine is now; the client is started unless it runs.
@@ -177,19 +196,19 @@ class Tunnel:
             raise OSError("the program 'ssh' is missing: install openssh-client")
         # A short path: a socket's has 107 bytes at most, and a state folder's may be longer.
         self._folder = Path(tempfile.mkdtemp(prefix="skytether-"))
-        socket, said = self._folder / "engine.sock", self._folder / "said"
+        here, said = self._folder / "engine.sock", self._folder / "said"
         with said.open("wb") as file:
             self._process = subprocess.Popen(
-                self.command(socket), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=file
+                self.command(here), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=file
             )
         deadline = time.monotonic() + _SSH_TIMEOUT
-        while not socket.exists():
+        while not here.exists():
             if self._process.poll() is not None or time.monotonic() > deadline:
                 lines = [line for line in said.read_text(errors="replace").splitlines() if line.strip()]
                 self.close()
                 raise OSError(f"ssh: {lines[-1].strip() if lines else 'no connection'}")
             time.sleep(0.01)
-        return socket
+        return here
 
     def close(self) -> None:
         """End the client."""
