@@ -5,8 +5,10 @@ import threading
 import time
 
 import pytest
+from ros2_graph import Router, Stage
 
 from skytether.bridge.calls import CallError
+from skytether.lab.bench.transports.certificate import write_certificate
 from skytether.messages import hash_of
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName, Ros2Dds
 from skytether.ros.ros2.node import Ros2Error, Ros2Node
@@ -337,3 +339,24 @@ def test_a_configuration_that_cannot_be_used_is_named(stage, tmp_path):
 
 def test_hashes_in_these_tests_are_those_of_the_codec():
     assert (hash_of(STRING, "cdr"), hash_of(ADD, "cdr"), hash_of(OWN, "cdr")) == (RIHS_STRING, RIHS_ADD, "")
+
+
+def test_certificates_come_from_a_configuration_file_of_zenoh(tmp_path):
+    authority, certificate, key = write_certificate("127.0.0.1", tmp_path)
+    router = Router(
+        **{"transport/link/tls/listen_certificate": str(certificate), "transport/link/tls/listen_private_key": str(key)}
+    )
+    router.protocol = "tls"
+    stage = Stage(router, 0)
+    file = tmp_path / "zenoh.json5"
+    file.write_text(f"{{transport: {{link: {{tls: {{root_ca_certificate: '{authority}'}}}}}}}}")
+    try:
+        router.start()
+        stranger = stage.ours()
+        stage.until(lambda: stage.said, "an unknown authority was not refused")
+        assert "is not there" in stage.said[0]
+        assert stage.ours(config_file=file).wait_until_joined(30)
+        assert not stranger.wait_until_joined(0)
+    finally:
+        stage.close()
+        router.stop()
