@@ -256,7 +256,7 @@ def test_warm_leaves_nothing_to_compile() -> None:
 
     for encoding in ENCODINGS:
         warm(all_types(), encoding)
-        store = codec._store(encoding)
+        store = codec.typestore(encoding)
         before = set(store.cache)
         for cls in all_types():
             decode(cls, encode(cls(), encoding), encoding)

@@ -23,7 +23,7 @@ from skytether.wire.events import Connected, Event, Refused
 from skytether.wire.topic import Role, Topic
 
 from .bridge_config import BridgeConfig, LinkConfig, Source
-from .ros2_config import make_node
+from .ros2_config import join_graph
 
 if TYPE_CHECKING:
     from skytether.ros.ros2.node import Ros2Node
@@ -140,7 +140,7 @@ def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack, folder: Pat
     """
     node = None
     if settings.ros2 is not None:
-        node = stack.enter_context(make_node(settings.ros2, folder, settings.ros2.namespace))
+        node = stack.enter_context(join_graph(settings.ros2, folder, settings.ros2.namespace))
     peer = (settings.peer.host, settings.peer.port) if settings.peer else None
     ends: list[End] = []
     for role in settings.roles:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -35,6 +37,8 @@ class Ros2Graph(Strict):
     """The ``namespace`` that zenoh-bridge-ros2dds is configured with; of ``ros2dds``."""
     node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
     """Name of our node in the graph."""
+    parameters: dict[str, dict[str, Any]] = {}
+    """Values that nodes of the graph get whenever they show up, by the node's full name and the parameter's."""
 
     @field_validator("bridge_namespace")
     @classmethod
@@ -42,8 +46,9 @@ class Ros2Graph(Strict):
         return check_name(name, 2)
 
 
-def make_node(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Ros2Node:
-    """The node that a configuration asks for, not started.
+@contextmanager
+def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Iterator[Ros2Node]:
+    """The node that a configuration asks for, for as long as the context lasts; it sets the parameters of others.
 
     Args:
         settings: Where and how.
@@ -51,7 +56,7 @@ def make_node(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Ros2No
         namespace: Of the node in the graph.
 
     Raises:
-        ConfigError: The extra is not installed, or Zenoh does not take a setting.
+        ConfigError: The extra is not installed, Zenoh does not take a setting, or a value can be no parameter.
     """
     try:
         import zenoh  # noqa: F401 - told apart from an ImportError of our own
@@ -59,6 +64,7 @@ def make_node(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Ros2No
         raise ConfigError(_EXTRA) from error
     from skytether.ros.ros2.dialect import Dialect, NodeName, RmwZenoh, Ros2Dds
     from skytether.ros.ros2.node import Ros2Error, Ros2Node
+    from skytether.ros.ros2.parameters import Parameters
 
     dialect: Dialect
     if settings.dialect == "rmw_zenoh":
@@ -68,6 +74,9 @@ def make_node(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Ros2No
     file = None if settings.zenoh_config is None else folder / settings.zenoh_config
     name = NodeName(namespace, settings.node)
     try:
-        return Ros2Node(dialect, router=settings.router, config_file=file, name=name)
-    except Ros2Error as error:
+        node = Ros2Node(dialect, router=settings.router, config_file=file, name=name)
+        parameters = Parameters(node, settings.parameters)
+    except (Ros2Error, ValueError) as error:
         raise ConfigError(f"ros2: {error}") from error
+    with node, parameters:
+        yield node

@@ -37,6 +37,7 @@ from .geometry import (
     yaw_of,
 )
 from .nav import MapMetaData, OccupancyGrid, Odometry, Path, TFMessage
+from .plain import decode_plain, encode_plain
 from .sensor import CompressedImage, Imu, JointState, Joy, LaserScan, PointCloud2, PointField, Range
 from .srv import (
     GetMap,
@@ -109,8 +110,10 @@ __all__ = [
     "WrenchStamped",
     "all_types",
     "decode",
+    "decode_plain",
     "definition_of",
     "encode",
+    "encode_plain",
     "hash_of",
     "quaternion_from_yaw",
     "transcode",

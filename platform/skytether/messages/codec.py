@@ -25,7 +25,7 @@ from .std import Header, Time
 Encoding = Literal["cdr", "ros1"]
 M = TypeVar("M", bound=Message)
 
-_BAD_BYTES = (SerdeError, struct.error, ValueError, IndexError, OverflowError, TypeError)
+BAD_BYTES = (SerdeError, struct.error, ValueError, IndexError, OverflowError, TypeError)
 _BAD_VALUES = (SerdeError, struct.error, ValueError, IndexError, OverflowError, TypeError, AttributeError)
 
 
@@ -44,7 +44,7 @@ def encode(message: Message, encoding: Encoding = "cdr") -> bytes:
         EncodeError: A field holds the wrong kind of value, or a number that does not fit.
         ValueError: There is no such encoding.
     """
-    store = _store(encoding)
+    store = typestore(encoding)
     write = store.serialize_cdr if encoding == "cdr" else store.serialize_ros1
     try:
         return bytes(write(message, message.TYPE))
@@ -67,11 +67,11 @@ def decode(what: type[Message] | str, data: bytes | memoryview, encoding: Encodi
     name = what if isinstance(what, str) else what.TYPE
     if isinstance(what, str):
         type_of(what)
-    store = _store(encoding)
+    store = typestore(encoding)
     read = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
     try:
         message = read(memoryview(data), name)
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise DecodeError(f"{len(data)} bytes are no {name} in {encoding}: {error}") from error
     return message  # type: ignore[return-value]
 
@@ -91,7 +91,7 @@ def transcode(typename: str, data: bytes | memoryview, source: Encoding, target:
         if typename in _types_with_class():
             return encode(decode(typename, data, source), target)
         # The same layout but for the sequence numbers of headers, which `rosbags` drops, and makes zero.
-        store = _store("cdr")
+        store = typestore("cdr")
         return bytes((store.ros1_to_cdr if source == "ros1" else store.cdr_to_ros1)(memoryview(data), typename))
     except DecodeError:
         raise
@@ -109,7 +109,7 @@ def _same_fields(typename: str, above: frozenset[str]) -> bool:
     """Whether a type has the same fields in both generations (but for upper case), all the way down."""
     if typename in _types_with_class():
         return True
-    both = [_store(e).fielddefs.get(typename) for e in ("ros1", "cdr")]
+    both = [typestore(e).fielddefs.get(typename) for e in ("ros1", "cdr")]
     if both[0] is None or both[1] is None or typename in above:
         return False
     ros1, ros2 = ([(name.lower(), kind) for name, kind in d[1]] for d in both if d is not None)
@@ -147,7 +147,7 @@ def hash_of(typename: str, encoding: Encoding) -> str:
 
     Of services the name without ``_Request`` or ``_Response`` has a hash, in ROS 2 only.
     """
-    store = _store(encoding) if encoding == "ros1" else _hashing_store()
+    store = typestore(encoding) if encoding == "ros1" else _hashing_store()
     if typename not in store.fielddefs:
         return ""
     if encoding == "cdr":
@@ -161,13 +161,13 @@ def definition_of(typename: str, encoding: Encoding) -> str:
     if "/msg/" not in typename:
         return ""
     try:
-        return _store(encoding).generate_msgdef(typename, ros_version=1 if encoding == "ros1" else 2)[0]
+        return typestore(encoding).generate_msgdef(typename, ros_version=1 if encoding == "ros1" else 2)[0]
     except TypesysError:
         return ""
 
 
 @cache
-def _store(encoding: Encoding) -> Typestore:
+def typestore(encoding: Encoding) -> Typestore:
     """Load the definitions of one ROS generation and put our classes in."""
     if encoding == "cdr":
         store = get_typestore(Stores.ROS2_JAZZY)
@@ -189,7 +189,7 @@ def _store(encoding: Encoding) -> Typestore:
 @cache
 def _hashing_store() -> Typestore:
     """Definitions of ROS 2 as they are hashed."""
-    store = copy.copy(_store("cdr"))
+    store = copy.copy(typestore("cdr"))
     store.fielddefs = {name: without_char(definition) for name, definition in store.fielddefs.items()}
     return store
 

@@ -43,6 +43,10 @@ class Graph:
         self._known[token] = parsed[1]
         return parsed[1]
 
+    def known(self) -> dict[str, Endpoint]:
+        """All of them by their tokens; another life of the same endpoint has another token."""
+        return dict(self._known)
+
     def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
         """Those of a name and a kind, or all of them, in the order of their names."""
         found = (e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind))

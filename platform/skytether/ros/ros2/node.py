@@ -38,6 +38,7 @@ MAX_CHANGES = 100_000
 MAX_SAID = 1000
 """Troubles that are remembered, so that each is told once."""
 _POLL_S = 0.5
+_LOOK_S = 2.0
 _RETRY_S = (0.25, 0.5, 1.0, 2.0)
 _H = TypeVar("_H", bound=Handle)
 
@@ -81,7 +82,7 @@ class Ros2Node:
         self._joined = threading.Event()
         self._handles: list[Handle] = []
         self._changes: deque[tuple[str, bool]] = deque(maxlen=MAX_CHANGES)
-        self._endpoints: list[Endpoint] = []
+        self._known: dict[str, Endpoint] = {}
         self._said: dict[str, str] = {}
         self._outbox: queue.Queue[Callable[[], object] | None] = queue.Queue(MAX_OUTBOX)
         self._working = threading.Semaphore(MAX_WORKING)
@@ -137,12 +138,16 @@ class Ros2Node:
         return self._add(Client(self, endpoint))
 
     def wait_until_joined(self, timeout: float) -> bool:
-        """Whether the router was reached, and everything declared, within so many seconds."""
+        """Whether the router was reached, the graph known and everything declared within so many seconds."""
         return self._joined.wait(timeout)
 
     def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
         """What others have on the graph now."""
-        return [e for e in self._endpoints if name in (None, e.name) and kind in (None, e.kind)]
+        return [e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind)]
+
+    def lives(self, name: str, kind: Kind) -> set[str]:
+        """Something for each endpoint of a name and kind that is another after it was away."""
+        return {token for token, e in self._known.items() if (e.name, e.kind) == (name, kind)}
 
     @property
     def troubles(self) -> tuple[str, ...]:
@@ -233,6 +238,9 @@ class Ros2Node:
         live = session.liveliness()
         token = live.declare_token(self.dialect.node_token(ours, self._name))
         watch = live.declare_subscriber(self.dialect.watched, self._on_token, history=True)
+        # The same again, but known to be complete: who waits until we have joined knows the whole graph.
+        present = live.get(self.dialect.watched, timeout=_LOOK_S)
+        self._changes.extend((str(reply.ok.key_expr), True) for reply in present if reply.ok is not None)
         try:
             while not self._closing.is_set():
                 self._look_at_router(session)
@@ -268,7 +276,7 @@ class Ros2Node:
         while self._changes:
             changed |= graph.update(*self._changes.popleft()) is not None
         if changed:
-            self._endpoints = graph.endpoints()
+            self._known = graph.known()
         return changed
 
     def _review(self, handle: Handle, graph: Graph) -> bool:
