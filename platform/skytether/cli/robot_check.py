@@ -47,7 +47,7 @@ class Finding:
 
 def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> list[Finding]:
     """Everything that a run will need, one by one."""
-    manifest, findings = _orchestrator(settings, token)
+    manifest, findings = look_at_orchestrator(settings, token)
     findings.append(_master(node))
     if manifest is not None and findings[-1].good:
         specs = manifest.spec.topics
@@ -58,7 +58,11 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
 
 def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> bool:
     """Look, and print a table. True if nothing is wrong."""
-    findings = look(settings, graph, node, token)
+    return show(look(settings, graph, node, token))
+
+
+def show(findings: Sequence[Finding]) -> bool:
+    """Print a table. True if nothing is wrong."""
     table = Table(box=None, pad_edge=False)
     for head in ("", "what", "in the graph", "type", "found"):
         table.add_column(head, overflow="fold")
@@ -70,7 +74,8 @@ def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token
     return not wrong
 
 
-def _orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
+def look_at_orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
+    """Whether it has the service, and what that takes and gives."""
     try:
         with Client(settings.orchestrator, token) as client:
             manifest = client.get_service(settings.service)
@@ -93,7 +98,7 @@ def _topics(settings: RobotConfig, names: Names, node: Node, specs: Sequence[Top
     taken = [row for row in rows if row.direction == "in"]
     for row in taken:
         node.subscribe(names.of(row.name), row.type, hash_of(row.type, "ros1"), Listener(lambda *_: None))
-    found = [_unknown(name) for name in names.unused(settings.ros1.readings if settings.ros1 else ())]
+    found = [unknown(name) for name in names.unused(settings.ros1.readings if settings.ros1 else ())]
     published = node.master.published()
     deadline = time.monotonic() + _LOOK_S
     awaited = {names.of(row.name) for row in taken} & set(published)
@@ -142,5 +147,6 @@ def _wheels(graph: Ros1RobotConfig, node: Node) -> Finding:
     return Finding("wheels", name, "geometry_msgs/Twist", says)
 
 
-def _unknown(name: str) -> Finding:
+def unknown(name: str) -> Finding:
+    """A remapping of nothing that there is."""
     return Finding(f"remap.{name}", "", "", "the service has no such topic, call or action", good=False)

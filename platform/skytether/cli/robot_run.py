@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skytether.robot.snapshot import AgentStatus
     from skytether.ros.ros1.node import Node
 
-    from .robot_config import RobotConfig, Ros1Config
+    from .robot_config import RobotConfig, Ros1Config, Ros2Config
 
 _STATUS_S = 0.5
 """Between looks at the agent, to say what changed."""
@@ -28,7 +28,7 @@ _STATUS_S = 0.5
 
 def run(
     config: Annotated[
-        Path, typer.Argument(help="YAML of the robot: robot, orchestrator, token_file, service, ros1, ...")
+        Path, typer.Argument(help="YAML of the robot: robot, orchestrator, token_file, service, ros1 or ros2, ...")
     ],
     check: Annotated[
         bool, typer.Option("--check", help="Only look whether everything is there, topic by topic; status 1 if not.")
@@ -48,6 +48,12 @@ def run(
         token = load_token(settings, config.parent)
     except ConfigError as error:
         fail(str(error), 2)
+    if settings.ros2 is not None:
+        try:
+            _run_ros2(settings, settings.ros2, config.parent, token, seconds, check=check)
+        except ConfigError as error:
+            fail(str(error), 2)
+        return
     if settings.ros1 is None:
         fail(f"{config}: ros1: is missing", 2)
     if check:
@@ -74,6 +80,32 @@ def _run(settings: RobotConfig, ros1: Ros1Config, config: AgentConfig, seconds: 
             fail(str(error), 2)
         finally:
             robot.close()
+
+
+def _run_ros2(
+    settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str, seconds: float | None, *, check: bool
+) -> None:
+    """A robot that is a ROS 2 graph.
+
+    Raises:
+        ConfigError: The graph cannot be joined as it is configured.
+    """
+    from skytether.robot.agent import Agent
+    from skytether.robot.fallback import FallbackError
+
+    from .ros2_config import need_extra
+
+    need_extra()
+    from .robot_ros2 import check_ros2, join_ros2
+
+    if check:
+        raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
+    with join_ros2(settings, ros2, folder) as robot:
+        try:
+            with Agent(agent_config(settings, token), robot.base, graph=robot) as agent:
+                _watch(agent.status, threading.Event(), seconds)
+        except FallbackError as error:
+            fail(str(error), 2)
 
 
 @contextmanager

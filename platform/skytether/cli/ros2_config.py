@@ -46,6 +46,18 @@ class Ros2Graph(Strict):
         return check_name(name, 2)
 
 
+def need_extra() -> None:
+    """See that the extra is installed.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    try:
+        import zenoh  # noqa: F401 - told apart from an ImportError of our own
+    except ModuleNotFoundError as error:
+        raise ConfigError(_EXTRA) from error
+
+
 @contextmanager
 def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Iterator[Ros2Node]:
     """The node that a configuration asks for, for as long as the context lasts; it sets the parameters of others.
@@ -58,10 +70,7 @@ def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Itera
     Raises:
         ConfigError: The extra is not installed, Zenoh does not take a setting, or a value can be no parameter.
     """
-    try:
-        import zenoh  # noqa: F401 - told apart from an ImportError of our own
-    except ModuleNotFoundError as error:
-        raise ConfigError(_EXTRA) from error
+    need_extra()
     from skytether.ros.ros2.dialect import Dialect, NodeName, RmwZenoh, Ros2Dds
     from skytether.ros.ros2.node import Ros2Error, Ros2Node
     from skytether.ros.ros2.parameters import Parameters
