@@ -115,13 +115,15 @@ def _ros2_port(
         ValueError: A topic cannot be in it.
     """
     from skytether.ros.ros2.port import Ros2Port
+    from skytether.ros.translate import Translated
 
     assert settings.ros2 is not None  # noqa: S101 - the caller has a node of it
     home = settings.ros2.namespace
     names = Names(settings.topics, home, home, settings.ros2.remap, ros=2)
     for unused in names.unused():
         raise ValueError(f"ros2.remap.{unused}: there is no such topic or call")
-    return Ros2Port(node, topics, role, name_of=names.of, on_event=on_event)
+    port = Ros2Port(node, topics, role, name_of=names.of, on_event=on_event)
+    return Translated(port, port.encoding, topics) if role is Role.SERVICE else port
 
 
 def start_ends(settings: BridgeConfig, key: bytes, stack: ExitStack, folder: Path) -> list[End]:

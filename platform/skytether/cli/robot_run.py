@@ -102,7 +102,7 @@ def _run_ros2(
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
     with join_ros2(settings, ros2, folder) as robot:
         try:
-            with Agent(agent_config(settings, token), robot.base, graph=robot) as agent:
+            with Agent(agent_config(settings, folder, token), robot.base, graph=robot) as agent:
                 _watch(agent.status, threading.Event(), seconds)
         except FallbackError as error:
             fail(str(error), 2)

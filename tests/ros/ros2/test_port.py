@@ -9,6 +9,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, CallError, GraphPort, LocalGraph, SessionSpec, topics_from_api
 from skytether.messages import Twist, Vector3, encode, hash_of
 from skytether.ros.ros2.port import Ros2Port
+from skytether.ros.translate import Translated
 from skytether.wire.events import Connected, MessageReceived
 from skytether.wire.topic import Direction, Role, Topic
 
@@ -115,7 +116,7 @@ def test_a_ros1_robot_and_a_ros2_service(stage, ends):
     heard = planner.subscribe("/status", DDS_STRING, RIHS_STRING)
     drive = planner.publisher("/cmd_vel", DDS_TWIST, RIHS_TWIST)
     reset = planner.client("/reset", DDS_TRIGGER, RIHS_TRIGGER)
-    port = Ros2Port(stage.ours(), table, Role.SERVICE)
+    port = Translated(Ros2Port(stage.ours(), table, Role.SERVICE), "cdr", table, say=stage.said.append)
     listening = ends.start(Role.SERVICE, table, port)
 
     theirs = tuple(
@@ -179,7 +180,7 @@ class FakeBridge:
 
 def test_what_comes_before_the_robot_waits_until_it_tells_its_encoding(stage):
     (row,) = rows({**STATUS, "direction": "out"})
-    bridge, port = FakeBridge(), Ros2Port(stage.ours(), [row], Role.SERVICE)
+    bridge, port = FakeBridge(), Translated(Ros2Port(stage.ours(), [row], Role.SERVICE), "cdr", [row])
     port.attach(bridge)
     rmw = stage.rmw("service")
     publish = rmw.publisher("/status", DDS_STRING, RIHS_STRING, depth=1)

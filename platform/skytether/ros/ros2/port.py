@@ -1,12 +1,11 @@
 """A ROS 2 graph as a port of a bridge: topics and calls of its table as publishers, subscriptions and services.
 
-What the peer has in ROS 1 bytes is turned into CDR and back, for the types that both know (`skytether.ros.convert`).
+What a peer has in ROS 1 bytes is turned into CDR and back by a `skytether.ros.translate.Translated` around it.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections import deque
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -14,8 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
-from skytether.messages import DecodeError, Encoding, hash_of
-from skytether.ros.convert import Convert, NoConversionError, converter
+from skytether.messages import Encoding, hash_of
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.table import ANY
 from skytether.wire.topic import Role, Topic
@@ -27,8 +25,6 @@ from .node import Ros2Node
 from .qos import SERVICE, qos_of
 
 _RIHS = "RIHS01_"
-MAX_EARLY = 100
-"""Messages of a topic that wait for the first session."""
 
 
 @runtime_checkable
@@ -50,15 +46,11 @@ class _Way:
 
     Attributes:
         handle: What we are on the graph for it.
-        convert: From the sender's bytes to the taker's; None: they are the same.
         refusal: Why nothing goes this way; empty if it does.
-        early: Messages of a reliable topic that wait until the peer told what it takes; None: it is known.
     """
 
     handle: Handle | None = None
-    convert: Convert | None = None
     refusal: str = ""
-    early: deque[bytes] | None = None
 
 
 class Ros2Port:
@@ -99,7 +91,7 @@ class Ros2Port:
         self._takes_any = ANY in rows
         self._rows = {n: t for n, t in rows.items() if n != ANY}
         self._call_rows = {name: (rows[name + REQUEST], rows[name + RESPONSE]) for name in self._calls}
-        self._ways = {name: self._way(row) for name, row in self._rows.items()}
+        self._ways = {name: _Way() for name in self._rows}
         self._endpoints = {row.name: self._endpoint(row) for row in self._plain_rows()}
         self._services = {name: self._service(name) for name in self._calls}
         self._skip = skip
@@ -130,11 +122,8 @@ class Ros2Port:
     def deliver(self, message: MessageReceived) -> None:
         """Port: publish what came from the peer."""
         way = self._ways.get(message.topic)
-        if way is None or not isinstance(way.handle, Publication) or way.refusal:
-            return
-        payload = self._converted(message.topic, way, message.payload)
-        if payload is not None:
-            way.handle.put(payload)
+        if way is not None and isinstance(way.handle, Publication):
+            way.handle.put(message.payload)
 
     def notify(self, event: Event) -> None:
         """Port: see what was agreed with the peer."""
@@ -175,65 +164,29 @@ class Ros2Port:
         if endpoint.kind is Kind.PUBLISHER:
             way.handle = self._node.publish(endpoint, waits=row.reliable)
         else:
-            way.handle = self._node.subscribe(endpoint, partial(self._send, row.name, way))
+            way.handle = self._node.subscribe(endpoint, partial(self._send, row.name))
 
-    def _way(self, row: Topic) -> _Way:
-        # The robot says what the bytes are, so its own end knows from the start.
-        waits = row.reliable and self._role is Role.SERVICE
-        return _Way(early=deque(maxlen=1 if row.latched else min(row.depth, MAX_EARLY)) if waits else None)
-
-    def _send(self, topic: str, way: _Way, payload: bytes) -> None:
+    def _send(self, topic: str, payload: bytes) -> None:
         """In a thread of Zenoh's: a message from the graph."""
-        early = way.early
-        if early is not None:
-            early.append(payload)
-            return
-        converted = None if way.refusal else self._converted(topic, way, payload)
-        if converted is None or self._publisher is None:
+        if self._publisher is None:
             return
         try:
-            self._publisher.publish(topic, converted)
+            self._publisher.publish(topic, payload)
         except ValueError as error:  # too large
             self._node.report(f"size {topic}", str(error))
 
-    def _converted(self, topic: str, way: _Way, payload: bytes | memoryview) -> bytes | memoryview | None:
-        """A message as the other side wants it; None, told once a topic, if it cannot be read."""
-        if way.convert is None:
-            return payload
-        try:
-            return way.convert(payload)
-        except DecodeError as error:
-            self._node.report(f"convert {topic}", f"{topic}: a message was dropped, more may have been: {error}")
-            return None
-
     def _agree(self, topic: Topic) -> None:
-        """A topic as it was agreed with the peer: the robot says what the bytes are."""
-        if topic.name in self._skip:
+        """A topic that was agreed with the peer: a row for any takes what it names."""
+        if topic.name in self._skip or topic.name in self._rows or not self._takes_any:
             return
-        if topic.name not in self._rows:
-            if not self._takes_any:
-                return
-            try:
-                self._rows[topic.name], self._ways[topic.name] = topic, _Way()
-                self._endpoints[topic.name] = self._endpoint(topic)
-            except ValueError as error:
-                self._ways[topic.name].refusal = str(error)
-                self._node.report(f"name {topic.name}", str(error))
-                return
-            self._join_topic(topic)
-        way = self._ways[topic.name]
-        theirs: Encoding = "ros1" if topic.encoding == "ros1" else "cdr"
-        comes_in = topic.direction.sender is not self._role
-        source, target = (theirs, self.encoding) if comes_in else (self.encoding, theirs)
-        way.convert, way.refusal = None, ""
+        self._rows[topic.name], self._ways[topic.name] = topic, _Way()
         try:
-            way.convert = converter(topic.type, source, target)
-        except NoConversionError as error:
-            way.refusal = f"{topic.name}: {error}"
-            self._node.report(f"type {topic.name}", way.refusal)
-        early, way.early = way.early, None
-        for payload in early or ():
-            self._send(topic.name, way, payload)
+            self._endpoints[topic.name] = self._endpoint(topic)
+        except ValueError as error:
+            self._ways[topic.name].refusal = str(error)
+            self._node.report(f"name {topic.name}", str(error))
+            return
+        self._join_topic(topic)
 
     # --- calls -------------------------------------------------------------------------------------------------------
 
@@ -247,24 +200,12 @@ class Ros2Port:
     def _ask_peer(self, bridge: Caller, name: str, request: bytes) -> bytes:
         """In a worker's thread of the node: a call from our graph is answered by the peer's."""
         timeout = self._call_rows[name][0].lifespan
-        return self._exchange(name, request, lambda converted: bridge.call(name, converted, timeout))
+        return _told(lambda: bridge.call(name, request, timeout))
 
     def _ask_graph(self, client: Client, name: str, request: bytes) -> bytes:
         """In a worker's thread of the bridge: a call from the peer is answered by our graph."""
         timeout = self._call_rows[name][0].lifespan
-        return self._exchange(name, request, lambda converted: client.call(converted, timeout))
-
-    def _exchange(self, name: str, request: bytes, ask: Callable[[bytes], bytes]) -> bytes:
-        there, back = self._ways[name + REQUEST], self._ways[name + RESPONSE]
-        if there.refusal or back.refusal:
-            raise CallError(there.refusal or back.refusal)
-        try:
-            response = ask(there.convert(request) if there.convert else request)
-            return back.convert(response) if back.convert else response
-        except DecodeError as error:
-            raise CallError(f"{name}: {error}") from error
-        except ValueError as error:  # too large
-            raise CallError(str(error)) from error
+        return _told(lambda: client.call(request, timeout))
 
     # --- names -------------------------------------------------------------------------------------------------------
 
@@ -284,3 +225,11 @@ class Ros2Port:
     @staticmethod
     def _hash(row: Topic) -> str:
         return row.type_hash if row.type_hash.startswith(_RIHS) else hash_of(row.type, "cdr")
+
+
+def _told(ask: Callable[[], bytes]) -> bytes:
+    """What was asked; a request that is too large is a failure of the call."""
+    try:
+        return ask()
+    except ValueError as error:
+        raise CallError(str(error)) from error
