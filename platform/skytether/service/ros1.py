@@ -32,6 +32,7 @@ from skytether.ros.notes import Notes
 from skytether.ros.ros1.master import MasterError
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.port import CLOCK, Ros1Port
+from skytether.ros.translate import Translated
 from skytether.wire.events import Connected, Disconnected, Event
 from skytether.wire.topic import Role
 
@@ -93,7 +94,7 @@ def _serve(grant: Grant, launch: str, environ: Mapping[str, str]) -> int:
         _wait_for_core(node, guard)
         _set_params(node, {namespace_of(grant.service) + "/" + name: value for name, value in grant.params.items()})
         joined = _Joined(Ros1Port(node, Role.SERVICE, names, table, on_notes=lambda told: joined.notes.put(told)))
-        bridge = Bridge(spec, joined, bind=(grant.bind_host, grant.bind_port))
+        bridge = Bridge(spec, Translated(joined, "ros1", table), bind=(grant.bind_host, grant.bind_port))
         try:
             bridge.start()
         except BridgeError as error:
