@@ -94,6 +94,8 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
         yield from _ros1(
             settings, os.environ.get("SKYTETHER_TOKEN", "") if config is None else _token(settings, config)
         )
+    if settings is not None and config is not None and settings.ros2 is not None:
+        yield from _ros2(settings, config.parent, _token(settings, config))
 
 
 def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
@@ -133,6 +135,34 @@ def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
         yield Finding("types", "trouble", f"{f.what} ({f.where}): {f.says}", todo)
     if found and not wrong:
         yield Finding("types", "ok", f"{len(found)} topics of the graph go with the service's")
+
+
+def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
+    """The ROS 2 graph: its router, and the types of what the service takes and gives."""
+    from skytether.robot.doctor import Finding
+
+    from .config_file import ConfigError
+    from .ros2_config import need_extra
+
+    if settings.ros2 is None:
+        return
+    try:
+        need_extra()
+        from .robot_ros2 import look_ros2
+
+        found = [f for f in look_ros2(settings, settings.ros2, folder, token) if f.what != "orchestrator"]
+    except ConfigError as error:
+        yield _trouble("ros graph", str(error), "correct ros2 in robot.yaml, or install the extra")
+        return
+    for f in (f for f in found if not f.good):
+        todo = (
+            "start the graph's Zenoh router, or correct ros2.router in robot.yaml"
+            if f.what == "ROS 2 router"
+            else f"give {f.where} the type {f.kind}, or name another topic in remap of robot.yaml"
+        )
+        yield Finding("types" if f.kind else "ros graph", "trouble", f"{f.what} ({f.where}): {f.says}", todo)
+    if all(f.good for f in found):
+        yield Finding("ros graph", "ok", f"{found[0].says}; what goes with the service was looked at")
 
 
 def _trouble(check: str, says: str, todo: str) -> Finding:

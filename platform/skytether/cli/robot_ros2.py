@@ -60,6 +60,15 @@ def check_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str
     Raises:
         ConfigError: The extra is missing, or Zenoh does not take a setting.
     """
+    return show(look_ros2(settings, ros2, folder, token))
+
+
+def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str) -> list[Finding]:
+    """Everything that a run will need, one by one.
+
+    Raises:
+        ConfigError: The extra is missing, or Zenoh does not take a setting.
+    """
     config = ros2_config(settings, ros2)
     manifest, findings = look_at_orchestrator(settings, token)
     with join_graph(ros2, folder, config.home) as node:
@@ -78,7 +87,7 @@ def check_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
             findings += [_row(settings, part, names, node) for part in rows]
             findings.append(_wheels(config, node))
-    return show(findings)
+    return findings
 
 
 def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) -> Finding:

@@ -7,7 +7,17 @@ import pytest
 
 from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, CallError, GraphPort, LocalGraph, SessionSpec, topics_from_api
-from skytether.messages import Twist, Vector3, encode, hash_of
+from skytether.messages import (
+    Header,
+    TFMessage,
+    Time,
+    TransformStamped,
+    Twist,
+    Vector3,
+    decode,
+    encode,
+    hash_of,
+)
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.translate import Translated
 from skytether.wire.events import Connected, MessageReceived
@@ -191,6 +201,23 @@ def test_what_comes_before_the_robot_waits_until_it_tells_its_encoding(stage):
     (agreed,) = rows({**STATUS, "direction": "out"}, encoding="ros1")
     port.notify(Connected((agreed,)))
     assert bridge.published == [("status", b"\5\0\0\0ready")]
+
+
+def test_static_transforms_of_several_nodes_are_one_latched_message(stage):
+    (row,) = rows({**STATUS, "name": "/tf_static", "type": TFMessage.TYPE})
+    bridge, port = FakeBridge(), Ros2Port(stage.ours(), [row], Role.ROBOT)
+    port.attach(bridge)
+    dds, rihs = "tf2_msgs::msg::dds_::TFMessage_", hash_of(TFMessage.TYPE, "cdr")
+    transforms = [TransformStamped(Header(Time(1), "base"), child) for child in ("laser", "camera")]
+    for i, transform in enumerate(transforms):
+        node = stage.rmw(f"broadcaster_{i}")
+        node.publisher("/tf_static", dds, rihs, depth=1)(encode(TFMessage([transform]), "cdr"))
+
+    def frames():
+        newest = decode(TFMessage, bridge.published[-1][1], "cdr") if bridge.published else TFMessage()
+        return sorted(t.child_frame_id for t in newest.transforms)
+
+    stage.until(lambda: frames() == ["camera", "laser"], "they are not together")
 
 
 def test_a_ways_end(stage):

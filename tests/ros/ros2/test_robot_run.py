@@ -1,5 +1,6 @@
 """``skytether robot run`` on a robot that is a ROS 2 graph: a real router, orchestrator and service; played nodes."""
 
+import json
 import os
 import signal
 import subprocess
@@ -141,6 +142,10 @@ def test_the_check_looks_topic_by_topic(stage, config, skytether):
     assert process.returncode == 1, found + said
     assert "2 to mend" in said
     assert found.count("!!") == 2
+    examined = skytether("doctor", str(config), "--json")
+    findings = [f for f in json.loads(examined.communicate(timeout=60)[0]) if f["check"] in ("types", "ros graph")]
+    assert {f["state"] for f in findings} == {"trouble"}
+    assert any("RIHS01_" + "0" * 64 in f["says"] for f in findings)
     plain = "".join(found.split())
     assert "RIHS01_" + "0" * 64 in plain
     assert type_hash(LaserScan, "cdr") in plain

@@ -14,6 +14,8 @@ from typing import Protocol, runtime_checkable
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
 from skytether.messages import Encoding, hash_of
+from skytether.ros.static_tf import TOPIC as STATIC_TF
+from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.table import ANY
 from skytether.wire.topic import Role, Topic
@@ -164,7 +166,12 @@ class Ros2Port:
         if endpoint.kind is Kind.PUBLISHER:
             way.handle = self._node.publish(endpoint, waits=row.reliable)
         else:
-            way.handle = self._node.subscribe(endpoint, partial(self._send, row.name))
+            send = partial(self._send, row.name)
+            if endpoint.name == STATIC_TF:
+                merge = StaticTransforms(self.encoding).merge
+                way.handle = self._node.subscribe(endpoint, lambda payload: send(merge(payload)))
+            else:
+                way.handle = self._node.subscribe(endpoint, send)
 
     def _send(self, topic: str, payload: bytes) -> None:
         """In a thread of Zenoh's: a message from the graph."""
