@@ -309,15 +309,13 @@ def test_the_bridge_to_dds(stage):
     stage.until(lambda: node.troubles, "nothing was said")
     assert "RIHS01_" + "0" * 64 in node.troubles[0]
     assert RIHS_STRING in node.troubles[0]
-    count = len(got)
     for _ in range(5):
         session.put("base/chatter", b"wrong")
         time.sleep(0.05)
-    assert b"wrong" not in got
-    assert len(got) == count
     wrong.undeclare()
     stage.until(lambda: not node.troubles, "the trouble stayed")
     stage.until(lambda: session.put("base/chatter", b"right") or got[-1] == b"right", "nothing comes any more")
+    assert b"wrong" not in got  # Zenoh keeps the order
     for thing in (watch, taker, server):
         thing.undeclare()
 
