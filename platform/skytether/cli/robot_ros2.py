@@ -13,6 +13,7 @@ from skytether.ros.names import Names
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.node import Ros2Node
+from skytether.ros.ros2.qos import row_settings
 
 from .robot_check import Finding, look_at_orchestrator, show, unknown
 from .robot_config import RobotConfig, Ros2Config
@@ -113,7 +114,10 @@ def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) ->
     if waits and not others:
         return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for")
     who = ", ".join(sorted({o.node for o in others if o.node}))
-    return Finding(row.name, name, row.type, f"{verb} {who}".strip() if waits else verb)
+    says = f"{verb} {who}".strip() if waits else verb
+    if kind is Kind.SUBSCRIPTION and not row.latched and any(row_settings(o.qos)["latched"] for o in others):
+        says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
+    return Finding(row.name, name, row.type, says)
 
 
 def _wheels(config: Ros2RobotConfig, node: Ros2Node) -> Finding:

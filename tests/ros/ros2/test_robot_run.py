@@ -153,12 +153,14 @@ def test_the_check_looks_topic_by_topic(stage, config, skytether):
     base.close()
     good = stage.rmw("base")
     good.subscribe("/cmd_vel", DDS_STAMPED, type_hash(TwistStamped, "cdr"))
-    good.publisher("/scan", DDS_SCAN, type_hash(LaserScan, "cdr"))
+    good.publisher("/scan", DDS_SCAN, type_hash(LaserScan, "cdr"), depth=1)
     process = skytether("robot", "run", str(config), "--check")
     found, said = process.communicate(timeout=60)
     assert process.returncode == 0, found + said
     assert "all is there" in said
-    assert "from /base" in " ".join(found.split())
+    plain = " ".join(found.split())
+    assert "from /base" in plain
+    assert "transient local" in plain
 
 
 def test_without_a_router_the_check_says_so_and_a_run_waits(stage, config, skytether, own_stage):
