@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from importlib.metadata import entry_points
 from typing import Any
 
 import httpx
@@ -19,6 +20,7 @@ from skytether.api.rest import (
     State,
     TopicReport,
 )
+from skytether.orchestrator.sites import RUNTIMES
 
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
 
@@ -236,10 +238,13 @@ def test_sites(served: Any) -> None:
     assert refused(operator.delete_site, "lab")[0] == 404
 
 
+INSTALLED = ", ".join(sorted(point.name for point in entry_points(group=RUNTIMES)))
+
+
 @pytest.mark.parametrize(
     ("runtime", "options", "text"),
     [
-        ("dokcer", {}, "runtime: there is no runtime 'dokcer'; installed are: process"),
+        ("dokcer", {}, f"runtime: there is no runtime 'dokcer'; installed are: {INSTALLED}"),
         ("process", {"advertise": "x"}, "options.advertise: unknown key, did you mean 'advertise_host'?"),
     ],
 )

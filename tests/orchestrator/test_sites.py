@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,8 @@ def test_a_site_whose_runtime_is_gone_is_listed_with_the_reason_and_can_be_delet
     stored(tmp_path, SiteCreate(name="old", tier="edge", runtime="dokcer"))
     core = start(find=load_runtime)
     site = core.sites.get("old")
-    assert site.unreachable == "runtime: there is no runtime 'dokcer'; installed are: process"
+    installed = ", ".join(sorted(point.name for point in entry_points(group=module.RUNTIMES)))
+    assert site.unreachable == f"runtime: there is no runtime 'dokcer'; installed are: {installed}"
     assert "site old cannot be used" in caplog.text
     core.sites.delete("old")
     assert core.sites.all() == []

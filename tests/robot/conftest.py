@@ -111,6 +111,7 @@ class ObedientOrchestrator:
         self.states = [State.RUNNING]
         self.reason = ""
         self.session: Session | None = None
+        self.successor: str | None = None
         self._number = 0
 
     def create_instance(self, request: InstanceCreate, *, idempotency_key: str) -> Instance:
@@ -139,6 +140,7 @@ class ObedientOrchestrator:
             state=state,
             reason=self.reason,
             session=self.session,
+            successor=self.successor,
             created_at=epoch,
             updated_at=epoch,
             lease_expires_at=epoch,

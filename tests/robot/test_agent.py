@@ -50,8 +50,15 @@ class Rig:
 
         self.agent = Agent(config, base, client=orchestrator, bridge=bridge, clock=lambda: self.now)
 
+    def tick(self):
+        self.now += 0.01
+        self.agent.tick(self.now)
+
     def ask(self):
+        """One exchange, and what the control loop and the watch do of it."""
         self.agent._asker.step()
+        self.agent._driver._change_over()
+        self.agent._settle()
 
     @property
     def bridges(self):
@@ -128,6 +135,33 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     cloud.send(rig.now)
     rig.agent.tick(rig.now)
     assert rig.agent.status().driver.first_command_at == rig.now
+
+
+def test_while_the_cloud_drives_another_session_takes_over_with_its_first_command(rig, orchestrator, make_cloud):
+    rig.ask()
+    old = rig.agent._driver.session
+    before = make_cloud(old)
+    while rig.agent.source is not Source.CLOUD:
+        before.send(rig.now)
+        rig.tick()
+    orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
+    rig.ask()
+    assert rig.agent._driver.session is old
+    for _ in range(20):  # the other one is joined, and has not commanded yet
+        before.send(rig.now)
+        rig.tick()
+        rig.agent.watch(rig.now)
+    assert rig.agent.source is Source.CLOUD
+    assert [endpoint.running for endpoint in rig.bridges] == [True, True]
+    sessions = rig.agent._open_sessions
+    after = make_cloud(sessions["00000000000000cd"].session)
+    after.send(rig.now)
+    rig.tick()
+    assert rig.agent._driver.session is not old
+    assert rig.agent.source is Source.CLOUD
+    rig.agent.watch(rig.now)
+    assert [endpoint.running for endpoint in rig.bridges] == [False, True]
+    assert len(rig.agent.status().driver.transitions) == 2  # the start, and the cloud: no hand-over in between
 
 
 def test_a_bridge_that_cannot_be_opened_is_said_once_and_tried_again(rig, monkeypatch, caplog, make_bridge):

@@ -217,6 +217,40 @@ def test_an_instance_elsewhere_that_fails_or_dawdles_is_given_up_and_the_first_k
     assert mover.asker.trouble == ""
 
 
+def test_a_successor_is_followed_and_the_first_let_go_when_it_serves(orchestrator):
+    serves = []
+    told = []
+    asker = Asker(
+        orchestrator,
+        REQUEST,
+        on_instance=lambda instance: told.append(instance.id),
+        taken_over=lambda instance: instance.id in serves,
+    )
+    asker.step()
+    orchestrator.successor = "i7"
+    asker.step()  # renews, learns of it
+    orchestrator.successor = None
+    asker.step()
+    asker.step()
+    assert told[-1] == "i7"
+    assert "delete" not in [name for name, _ in orchestrator.calls], "the first drives until the other one does"
+    serves.append("i7")
+    asker.step()
+    assert [call for call in orchestrator.calls if call[0] == "delete"] == [("delete", "i1")]
+    assert asker.release() == "i7"
+
+
+def test_when_the_first_ends_while_another_is_coming_that_one_is_kept(orchestrator):
+    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, taken_over=lambda _: False)
+    asker.step()
+    orchestrator.successor = "i7"
+    asker.step()
+    orchestrator.successor = None
+    orchestrator.states = [State.FAILED, State.RUNNING]
+    asker.step()
+    assert asker.release() == "i7"
+
+
 def test_a_refused_token_is_looked_for_again_and_a_new_one_tried_soon(orchestrator):
     fresh = [True, False]
     asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, on_refused=lambda: fresh.pop(0))

@@ -35,7 +35,7 @@ from .driver import Base, Driver, Observer
 from .graph_base import Graph
 from .link import Quality
 from .notices import Notices
-from .service_manager import ServiceManager, terms
+from .service_manager import ServiceManager, Terms, terms
 from .session import Endpoint, LiveSession
 from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
@@ -109,6 +109,15 @@ class AgentConfig:
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
 
 
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A session that is open, the instance that it is of, and what that is held to."""
+
+    session: LiveSession
+    instance: rest.Instance
+    terms: Terms
+
+
 MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
 """Session, port, address to bind, address of the service."""
 
@@ -168,7 +177,8 @@ class Agent:
             self._request({}),
             wanted=self._wanted,
             elsewhere=self._elsewhere,
-            on_stayed=self._tasks.stayed if self._tasks else lambda *_: None,
+            taken_over=self._taken_over,
+            on_stayed=self._stayed,
             on_refused=self._another_token,
             clock=clock,
             on_instance=self._follow,
@@ -181,6 +191,12 @@ class Agent:
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
         self._manager: ServiceManager | None = None
+        self._open_sessions: dict[str, _Opened] = {}
+        """By session id."""
+        self._served = ""
+        """The session that the manager watches."""
+        self._left = ""
+        """The one before; its instance may still be told of."""
         self._notices = Notices(_log)
         self._stats: SessionStats | None = None
         self._trouble = ""
@@ -213,9 +229,7 @@ class Agent:
         if self._server is not None:
             self._server.close()
             self._server = None
-        session, self._driver.session = self._driver.session, None
-        if session is not None:
-            session.close()
+        self._drop_sessions()
         self._asker.release()
         if self._own_client is not None:
             self._own_client.close()
@@ -317,11 +331,30 @@ class Agent:
             return self._request({})
         if self._tasks.decision.offload:
             return self._request(self._tasks.measurements())
-        session, self._driver.session = self._driver.session, None
-        if session is not None:
-            session.close()
+        self._drop_sessions()
         self._instance = None
         return None
+
+    def _drop_sessions(self) -> None:
+        self._driver.let_go()
+        opened, self._open_sessions = list(self._open_sessions.values()), {}
+        for one in opened:
+            one.session.close()
+
+    def _taken_over(self, instance: rest.Instance) -> bool:
+        session = self._driver.session
+        return session is not None and instance.session is not None and session.id == instance.session.id
+
+    def _stayed(self, instance: rest.Instance, reason: str) -> None:
+        """What was to take over does not."""
+        serving = self._driver.session
+        if serving is not None:
+            self._driver.let_go()
+            self._driver.session = serving
+        for session_id in [i for i in self._open_sessions if serving is None or i != serving.id]:
+            self._open_sessions.pop(session_id).session.close()
+        if self._tasks is not None:
+            self._tasks.stayed(instance, reason)
 
     def _elsewhere(self, instance: rest.Instance) -> bool:
         wanted = self._tasks.decision.site if self._tasks else None
@@ -347,6 +380,7 @@ class Agent:
 
     def watch(self, now: float) -> None:
         """Look at the bridge's counters once."""
+        self._settle()
         session = self._driver.session
         if session is None or session.bridge is None:
             return
@@ -361,18 +395,20 @@ class Agent:
                 self._notices.say(kind, sentence, now)
 
     def _follow(self, instance: rest.Instance) -> None:
-        """The orchestrator said something about the instance: open a new session, or follow the service's address."""
-        self._instance = instance
-        if self._tasks is not None:
-            self._tasks.placed(instance)
+        """The orchestrator said something about an instance: open a session to it, or follow the service's address.
+
+        Another instance comes beside the one that drives, and takes over with its first command (`Driver.offer`).
+        """
         granted = instance.session
-        if granted is None or granted.host is None or granted.port is None:
+        opened = self._open_sessions.get(granted.id) if granted else None
+        if opened is None or granted is None or granted.id == self._served:
+            self._told(instance)
+        if granted is None or granted.host is None or granted.port is None or granted.id == self._left:
             return
         peer = self._config.route(granted.host, granted.port)
-        current = self._driver.session
         try:
-            if current is not None and current.id == granted.id:
-                current.move(peer)
+            if opened is not None:
+                opened.session.move(peer)
                 return
             session = self._open(granted, peer)
         except (BridgeError, ValueError) as error:
@@ -383,12 +419,28 @@ class Agent:
             return
         self._trouble = ""
         held_to = terms(granted.needs, granted.topics, self._config.command_topic)
-        self._manager = ServiceManager(held_to, self._config.command_topic, self._config.limits.max_gap_s)
-        self._driver.quality = Quality()
-        self._driver.hold_to(held_to)
-        self._driver.session = session
-        if current is not None:
-            current.close()
+        self._open_sessions[granted.id] = _Opened(session, instance, held_to)
+        self._driver.offer(session)
+
+    def _told(self, instance: rest.Instance) -> None:
+        self._instance = instance
+        if self._tasks is not None:
+            self._tasks.placed(instance)
+
+    def _settle(self) -> None:
+        """Hold the service that serves now to its terms, once it has changed, and close what was left."""
+        session = self._driver.session
+        opened = self._open_sessions.get(session.id) if session else None
+        if opened is not None and session is not None and session.id != self._served:
+            self._left, self._served = self._served, session.id
+            self._told(opened.instance)
+            self._manager = ServiceManager(opened.terms, self._config.command_topic, self._config.limits.max_gap_s)
+            self._driver.quality = Quality()
+            self._driver.hold_to(opened.terms)
+        while self._driver.left:
+            left = self._driver.left.popleft()
+            self._open_sessions.pop(left.id, None)
+            left.close()
 
     def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
         for topic in granted.topics:

@@ -30,6 +30,8 @@ _REFUSED_S = 10.0
 """Before a refused token is tried again: an operator has to act."""
 _IDLE_S = 0.5
 """Between looks whether the service is wanted again."""
+_MOVING_S = 0.05
+"""Between looks at an instance that is to take over."""
 _MOVE_S = 20.0
 """An instance elsewhere that is not running by then is given up; the one that runs is kept."""
 
@@ -64,6 +66,7 @@ class Asker:
             an instance that is held is then let go. Without it: ``request``, always.
         elsewhere: Whether an instance at another site is wanted instead of this one. It is asked for, and this one let
             go once that runs.
+        taken_over: Whether an instance that runs serves the robot now, so that the one before can be let go.
         on_stayed: Told the instance that is kept, and why there is none elsewhere.
         on_refused: Called when the token was refused; True if there is another one to try.
         on_instance: Told every answer about an instance that is coming up or running.
@@ -82,6 +85,7 @@ class Asker:
         on_instance: Callable[[Instance], None],
         wanted: Callable[[], InstanceCreate | None] | None = None,
         elsewhere: Callable[[Instance], bool] = lambda _: False,
+        taken_over: Callable[[Instance], bool] = lambda _: True,
         on_stayed: Callable[[Instance, str], None] = lambda *_: None,
         on_refused: Callable[[], bool] = lambda: False,
         clock: Callable[[], float] = time.monotonic,
@@ -94,6 +98,7 @@ class Asker:
         self._service = request.service
         self._wanted = wanted or (lambda: request)
         self._elsewhere = elsewhere
+        self._taken_over = taken_over
         self._on_stayed = on_stayed
         self._on_refused = on_refused
         self._clock = clock
@@ -121,6 +126,7 @@ class Asker:
         Returns:
             Seconds until the next is due.
         """
+        self._change()
         request = self._wanted()
         if request is None:
             self.release()
@@ -141,12 +147,14 @@ class Asker:
             return self._lost(f"instance {instance.id} is {instance.state}{reason}")
         self._instance = instance
         self._on_instance(instance)
-        if instance.state is not State.RUNNING:
-            return _POLL_S
-        self._backoff.reset()
-        self._trouble = ""
-        if self._next is not None or self._elsewhere(instance):
+        running = instance.state is State.RUNNING
+        if running:
+            self._backoff.reset()
+            self._trouble = ""
+        if self._next is not None or instance.successor or (running and self._elsewhere(instance)):
             return self._move(instance, request)
+        if not running:
+            return _POLL_S
         if not self._healthy():
             return self._looks.next()
         self._looks.reset()
@@ -190,25 +198,36 @@ class Asker:
         return instance.id
 
     def _move(self, held: Instance, request: InstanceCreate) -> float:
-        """Bring an instance up elsewhere, and change to it; whatever goes wrong with it, this one is kept."""
+        """Bring an instance up elsewhere, or follow the orchestrator to one; this one is kept until that one serves.
+
+        Whatever goes wrong with it costs nothing.
+        """
         try:
             if self._next is None:
-                made = self._client.create_instance(request, idempotency_key=str(uuid.uuid4()))
+                if held.successor:
+                    made = self._client.get_instance(held.successor)
+                else:
+                    made = self._client.create_instance(request, idempotency_key=str(uuid.uuid4()))
                 self._next = (made, self._clock())
                 return _POLL_S
             (coming, began) = self._next
-            found = self._client.get_instance(coming.id)
+            found = self._client.renew_instance(coming.id, Renew())
         except (ApiError, Unreachable) as error:
             return self._stay(held, str(error))
-        if found.state is State.RUNNING:
-            self._next = None
-            self._instance = found
-            self._on_instance(found)
-            self._let_go(held)
-            return _POLL_S
+        self._next = (found, began)
         if found.state.final or found.state is State.STOPPING or self._clock() - began > _MOVE_S:
-            return self._stay(held, found.reason or f"it is {found.state}")
-        return _LOOK_S
+            return self._stay(held, found.reason or f"it is {found.state}, and does not serve")
+        if found.state is State.RUNNING:
+            self._on_instance(found)
+            self._change()
+        return _MOVING_S
+
+    def _change(self) -> None:
+        """Let the one before go, once another one serves."""
+        if self._next is not None and self._next[0].state is State.RUNNING and self._taken_over(self._next[0]):
+            held, self._instance = self._instance, self._next[0]
+            self._next = None
+            self._let_go(held)
 
     def _stay(self, held: Instance, reason: str) -> float:
         if self._next is not None:
@@ -226,7 +245,8 @@ class Asker:
         return self._client.get_instance(self._instance.id)
 
     def _lost(self, sentence: str) -> float:
-        self._instance = None
+        """The instance has ended; one that is coming is followed, otherwise another is asked for."""
+        self._instance, self._next = (self._next[0] if self._next else None), None
         self._key = str(uuid.uuid4())
         return self._say(sentence, self._backoff.next())
 

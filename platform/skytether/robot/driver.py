@@ -128,6 +128,10 @@ class Driver:
         observer: Observer | None = None,
     ) -> None:
         self.session: LiveSession | None = None
+        self.left: deque[LiveSession] = deque()
+        """Those before, for somebody else to close: that may take a while."""
+        self._offered: deque[LiveSession] = deque()
+        self._coming: LiveSession | None = None
         self.quality = Quality()
         self._base = base
         self._fallback = fallback
@@ -180,6 +184,15 @@ class Driver:
         self._ticks += 1
         self._write(velocity)
 
+    def offer(self, session: LiveSession) -> None:
+        """Another session, instead of the one that there is; it gets the same readings until it takes over."""
+        self._offered.append(session)
+
+    def let_go(self) -> None:
+        """Have no session, and none that is coming."""
+        self._offered.clear()
+        self._coming = self.session = None
+
     def halt(self) -> None:
         """Tell the wheels to stand; the last thing that the loop does."""
         self._supervised = Supervised()
@@ -206,13 +219,27 @@ class Driver:
         for topic, message in self._base.read(now):
             self._readings[topic] = Reading(message, now)
             self._read[topic] += 1
+            for session in (self.session, self._coming):
+                if session is not None:
+                    try:
+                        session.publish(topic, message)
+                    except Exception as error:  # costs the cloud a reading; the robot's own control goes on
+                        self._caught("publish", error)
+
+    def _change_over(self) -> None:
+        """Make before break: while the cloud drives, another session takes over with its first command."""
+        while self._offered:
+            if self._coming is not None:
+                self.left.append(self._coming)
+            self._coming = self._offered.popleft()
+        coming = self._coming
+        if coming is not None and (self._choice.source is not Source.CLOUD or coming.commands):
             if self.session is not None:
-                try:
-                    self.session.publish(topic, message)
-                except Exception as error:  # costs the cloud a reading; the robot's own control goes on
-                    self._caught("publish", error)
+                self.left.append(self.session)
+            self.session, self._coming = coming, None
 
     def _take_commands(self, now: float) -> None:
+        self._change_over()
         if self.session is None:
             return
         for epoch, message in self.session.take():

@@ -99,6 +99,11 @@ class LiveSession:
         if self.connected and self.bridge is not None and topic in self._topics:
             self.bridge.publish(topic, encode(message, self.encoding))
 
+    @property
+    def commands(self) -> bool:
+        """Whether any wait to be taken."""
+        return self.connected and bool(self._arrived)
+
     def take(self) -> list[tuple[int, MessageReceived]]:
         """What arrived since the last call, with the number of its handshake, oldest first."""
         taken = []
