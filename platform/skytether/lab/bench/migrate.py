@@ -1,0 +1,130 @@
+"""How long a robot is without commands when its service moves from one site to another.
+
+Everything is real: an orchestrator with two sites, the service as a process on each, a simulated walker whose agent
+drives at 100 Hz. The service is moved to and fro while it drives.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from skytether.api.client import Client
+from skytether.api.rest import RobotCreate, SiteCreate
+from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.embedded import EmbeddedOrchestrator
+from skytether.lab.trail import Trail
+from skytether.lab.world import World
+from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.command import Command, Source
+from skytether.robot.supervisor import Objection
+
+from .start import BenchError
+
+PERIOD_MS = 10.0
+"""Of the service's commands."""
+_LIMIT_S = 30.0
+_LOOK_S = 0.02
+_AROUND_S = 0.5
+"""Commands from so long before the request until so long after the change count."""
+
+
+@dataclass(frozen=True, slots=True)
+class MigrateRow:
+    """One line of the table.
+
+    Attributes:
+        n: Moves.
+        gap_p50_ms: Median of the longest time between two commands around each move.
+        gap_max_ms: The largest of them.
+        gap_still_p50_ms: The same over as long a time without a move: what machine and service do by themselves.
+        gap_still_max_ms: The largest of those.
+        move_p50_s: Median time from the request to the first command of the other instance.
+        fallbacks: Moves during which the robot's own controller took over.
+        bound_ms: Two periods of the service's commands.
+    """
+
+    n: int
+    gap_p50_ms: float
+    gap_max_ms: float
+    gap_still_p50_ms: float
+    gap_still_max_ms: float
+    move_p50_s: float
+    fallbacks: int
+    bound_ms: float = 2 * PERIOD_MS
+
+    def document(self) -> dict[str, object]:
+        """For ``--json``."""
+        return asdict(self)
+
+
+class _Commands:
+    """Arrivals of commands that were admitted."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def __call__(self, command: Command, objection: Objection | None) -> None:
+        if objection is None:
+            self.times.append(command.received_at)
+
+    def longest_gap_ms(self, since: float, until: float) -> float:
+        times = [t for t in list(self.times) if since <= t <= until]
+        return max((b - a for a, b in pairwise(times)), default=np.inf) * 1e3
+
+
+def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: None) -> MigrateRow:
+    """Move a service ``n`` times under a driven robot.
+
+    Raises:
+        BenchError: It did not drive, or was not moved, in time.
+    """
+    gaps, still, moves, fallbacks = [], [], [], 0
+    with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
+        operator.create_site(SiteCreate(name="other", tier="edge", runtime="process"))
+        token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
+        bind = ("127.0.0.1", 0)
+        config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=bind, renew_s=0.5)
+        seen = _Commands()
+        with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
+            _wait(lambda: agent.source is Source.CLOUD, agent)
+            for i in range(n):
+                time.sleep(2 * _AROUND_S)
+                began = time.monotonic()
+                still.append(seen.longest_gap_ms(began - 2 * _AROUND_S, began))
+                before = len(agent.status().driver.transitions)
+                coming = operator.migrate_instance(_instance(agent)).id
+                _wait(lambda: _instance(agent) == coming, agent)  # noqa: B023 (called at once)
+                changed = time.monotonic()
+                time.sleep(_AROUND_S)
+                gaps.append(seen.longest_gap_ms(began - _AROUND_S, changed + _AROUND_S))
+                moves.append(changed - began)
+                fallbacks += len(agent.status().driver.transitions) > before
+                on_move(i, gaps[-1])
+    return MigrateRow(
+        n,
+        round(float(np.median(gaps)), 2),
+        round(max(gaps), 2),
+        round(float(np.median(still)), 2),
+        round(max(still), 2),
+        round(float(np.median(moves)), 3),
+        fallbacks,
+    )
+
+
+def _instance(agent: Agent) -> str:
+    instance = agent.status().instance
+    return instance.id if instance else ""
+
+
+def _wait(condition: Callable[[], bool], agent: Agent) -> None:
+    deadline = time.monotonic() + _LIMIT_S
+    while not condition():
+        if time.monotonic() > deadline:
+            why = agent.status().trouble or "the service was not moved"
+            raise BenchError(f"nothing happened within {_LIMIT_S:.0f} s: {why}")
+        time.sleep(_LOOK_S)
