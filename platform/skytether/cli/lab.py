@@ -100,7 +100,7 @@ def migrate(
     from rich.table import Table
 
     from skytether.lab.bench.migrate import bench_migrate
-    from skytether.lab.bench.start import BenchError
+    from skytether.lab.bench.pair import BenchError
     from skytether.lab.embedded import EmbeddedError
 
     try:

@@ -23,7 +23,7 @@ from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.command import Command, Source
 from skytether.robot.supervisor import Objection
 
-from .start import BenchError
+from .pair import BenchError
 
 PERIOD_MS = 10.0
 """Of the service's commands."""
