@@ -126,3 +126,20 @@ def test_recordings_are_never_overwritten(tmp_path):
 def test_the_speed_must_be_positive(bag):
     assert run(bag, "--speed", 0).exit_code == 2
     assert ReplayConfig(bag, "r").speed == 1.0
+
+
+def test_remappings_are_read_and_mistakes_in_them_told(bag, token):
+    to = ("--url", "http://127.0.0.1:9", "--token-file", token)
+    assert command._remappings(["/scan:=scan", "/a:=/b"]) == {"/scan": "scan", "/a": "/b"}
+    assert "must be OLD:=NEW" in refused(run(bag, "--remap", "/talk=talk", *to))
+    assert "/talk is renamed twice" in refused(run(bag, "--remap", "/talk:=a", "--remap", "/talk:=b", *to))
+    assert "has no topic /tale" in refused(run(bag, "--remap", "/tale:=talk", *to))
+
+
+def test_two_topics_cannot_be_sent_as_one(tmp_path, token):
+    path = tmp_path / "two.bag"
+    with Writer(path) as writer:
+        for name in ("/a", "/b"):
+            writer.add_connection(name, "std_msgs/msg/String", typestore=get_typestore(Stores.ROS1_NOETIC))
+    told = refused(run(path, "--remap", "/a:=/b", "--url", "http://127.0.0.1:9", "--token-file", token))
+    assert "would be sent as /b" in told

@@ -78,3 +78,13 @@ def test_what_cannot_be_done_is_told_in_a_sentence_and_leaves_nothing_running(ba
     nobody = replay(bag, "--url", orchestrator.url, "--token-file", tmp_path / "token")
     assert nobody.returncode == 1
     assert f"no orchestrator answers at {orchestrator.url}" in " ".join(nobody.stderr.split())
+
+
+def test_a_topic_is_sent_under_the_name_that_the_service_has_for_it(bag, replay, tmp_path):
+    output = tmp_path / "output"
+    result = replay(bag, "--speed", 60, "--remap", "/scan:=laser", "--output", output, "--json")
+    assert result.returncode == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["topics"]["/scan"]["delivered"] == 1265
+    with Path(document["files"][0]).open("rb") as stream:
+        assert {channel.topic for _, channel, _ in make_reader(stream).iter_messages()} == {"laser"}

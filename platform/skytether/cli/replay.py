@@ -22,6 +22,9 @@ def replay(
     service: Annotated[str, typer.Option(help="What takes the topics in.")] = "recorder",
     speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Times faster than it was recorded.")] = 1.0,
     topic: Annotated[list[str] | None, typer.Option(help="Send this topic only; may be given again.")] = None,
+    remap: Annotated[
+        list[str] | None, typer.Option(help="Send a topic under another name: /scan:=scan; may be given again.")
+    ] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot that is played.")] = "replay",
     url: Annotated[
         str | None,
@@ -42,7 +45,8 @@ def replay(
     from skytether.robot.bag import BagError
     from skytether.robot.replay import ReplayConfig, ReplayError
 
-    config = ReplayConfig(bag, robot, service, topics=tuple(topic) if topic else None, speed=speed)
+    topics = tuple(topic) if topic else None
+    config = ReplayConfig(bag, robot, service, topics=topics, remap=_remappings(remap or []), speed=speed)
     try:
         if url is None:
             result, files = _with_own_orchestrator(config, output)
@@ -76,6 +80,19 @@ def _with_own_orchestrator(config: ReplayConfig, output: Path) -> tuple[ReplayRe
             result = _stream(config, client)
         written = [path for path in orchestrator.state_dir.rglob(f"data/*/*/{result.instance}/*") if path.is_file()]
         return result, [Path(shutil.move(path, _free(output / path.name))) for path in sorted(written)]
+
+
+def _remappings(texts: list[str]) -> dict[str, str]:
+    """``OLD:=NEW``, as ROS writes it."""
+    found: dict[str, str] = {}
+    for text in texts:
+        old, sign, new = text.partition(":=")
+        if not (old and sign and new):
+            fail(f"--remap must be OLD:=NEW, such as /scan:=scan, not '{text}'", 2)
+        if old in found:
+            fail(f"--remap: {old} is renamed twice", 2)
+        found[old] = new
+    return found
 
 
 def _free(path: Path) -> Path:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import nan
@@ -54,7 +55,8 @@ class ReplayConfig:
         robot: Name of the robot that is played.
         service: What takes the topics in.
         params: The service's.
-        topics: Which ones; None: all that the service takes.
+        topics: Which ones, by their names in the recording; None: all that the service takes.
+        remap: Names for the service, by those of the recording.
         speed: Times faster than it was recorded.
         bind: Local address of the robot's end of the bridge.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
@@ -65,6 +67,7 @@ class ReplayConfig:
     service: str = "recorder"
     params: Mapping[str, Any] = field(default_factory=dict)
     topics: tuple[str, ...] | None = None
+    remap: Mapping[str, str] = field(default_factory=dict)
     speed: float = 1.0
     bind: Address = ("0.0.0.0", 0)  # noqa: S104 - see AgentConfig.bind
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
@@ -159,13 +162,16 @@ def replay(
 def _chosen(config: ReplayConfig, bag: Bag) -> frozenset[str]:
     if not config.speed > 0:
         raise ReplayError(f"the speed must be above 0, not {config.speed}")
-    if config.topics is None:
-        return frozenset(bag.topics)
-    unknown = sorted(set(config.topics) - set(bag.topics))
+    unknown = sorted({*(config.topics or ()), *config.remap} - set(bag.topics))
     if unknown:
         has = ", ".join(sorted(bag.topics)) or "none"
         raise ReplayError(f"{config.bag} has no topic {', '.join(unknown)}; it has {has}")
-    return frozenset(config.topics)
+    names = frozenset(bag.topics if config.topics is None else config.topics)
+    sent_as = Counter(config.remap.get(name, name) for name in names)
+    twice = sorted(name for name, count in sent_as.items() if count > 1)
+    if twice:
+        raise ReplayError(f"two topics of {config.bag} would be sent as {twice[0]}; choose one with --topic")
+    return names
 
 
 class _Replay:
@@ -226,7 +232,7 @@ class _Replay:
         sent = 0
         for at, topic, data in self._bag.messages(self._names):
             self._sleep_until(begin + at / self._config.speed)
-            bridge.publish(topic, data)
+            bridge.publish(self._sent_as(topic), data)
             sent += 1
             self._progress(Progress("streaming", sent, total, at))
         self._progress(Progress("confirming", sent, total, self._bag.duration))
@@ -308,14 +314,15 @@ class _Replay:
             time.sleep(delay)
 
     def _table(self, session: rest.Session) -> tuple[Topic, ...]:
-        offers = {name: self._bag.topics[name].offer for name in self._bag.topics if name in self._names}
+        offers = {self._sent_as(name): self._bag.topics[name].offer for name in self._bag.topics if name in self._names}
         table = robot_table(session.topics, offers)
-        taken = {topic.name for topic in table if topic.direction is Direction.IN}
+        agreed = {topic.name for topic in table if topic.direction is Direction.IN}
+        taken = {name for name in self._names if self._sent_as(name) in agreed}
         if not taken or (self._config.topics is not None and taken != self._names):
             takes = ", ".join(topic.name for topic in session.topics if topic.direction == "in") or "none"
             raise ReplayError(
                 f"service '{self._config.service}' does not take {', '.join(sorted(self._names - taken))}; "
-                f"it takes {takes}"
+                f"it takes {takes}; the recording's names are changed with --remap OLD:=NEW"
             )
         self._names = frozenset(taken)
         return table
@@ -328,18 +335,23 @@ class _Replay:
 
     def _confirm(self, bridge: Bridge, total: int) -> SessionStats:
         best, since = -1, time.monotonic()
+        ours = {self._sent_as(name) for name in self._names}
         while True:
             stats = bridge.stats()
-            delivered = sum(topic.delivered for topic in stats.topics if topic.topic in self._names)
+            delivered = sum(topic.delivered for topic in stats.topics if topic.topic in ours)
             if delivered > best:
                 best, since = delivered, time.monotonic()
             if delivered >= total or time.monotonic() - since > _STALLED_S:
                 return stats
             time.sleep(_POLL_S)
 
+    def _sent_as(self, name: str) -> str:
+        """The service's name of a topic of the recording."""
+        return self._config.remap.get(name, name)
+
     def _result(self, name: str, stats: SessionStats) -> TopicResult:
         counted = {topic.topic: topic for topic in stats.topics}
-        topic = counted.get(name) or TopicStats(name, Direction.IN, 0)
+        topic = counted.get(self._sent_as(name)) or TopicStats(name, Direction.IN, 0)
         return TopicResult(
             topic=name,
             type=self._bag.topics[name].offer.type,

@@ -1,0 +1,88 @@
+"""The package folder for ROS users: roslaunch, the script that it starts, the unit of systemd."""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from ros1_graph import wait_for
+
+PACKAGE = Path(__file__).parents[3] / "ros1" / "skytether"
+
+
+@pytest.fixture
+def program(tmp_path):
+    """The command line of this checkout, as an installed program."""
+    path = tmp_path / "skytether"
+    folders = os.pathsep.join(sys.path)
+    path.write_text(
+        f'#!/bin/sh\nPYTHONPATH={shlex.quote(folders)} exec {shlex.quote(sys.executable)} -m skytether.cli "$@"\n'
+    )
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def robot_yaml(tmp_path):
+    """A robot whose orchestrator is away."""
+    token = tmp_path / "walker.token"
+    token.touch(0o600)
+    token.write_text("secret")
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        "robot: walker\norchestrator: http://127.0.0.1:9\ntoken_file: walker.token\nservice: virtual-trail\n"
+        "status_port: null\nros1: {namespace: /}\n"
+    )
+    return path
+
+
+@pytest.mark.ros1
+@pytest.mark.slow
+def test_roslaunch_skytether_robot_launch_is_all_that_a_ros_user_types(graph, program, robot_yaml):
+    more = {
+        "ROS_PACKAGE_PATH": f"{PACKAGE.parent}:/usr/share",
+        "SKYTETHER": str(program),
+        "SKYTETHER_ROBOT": str(robot_yaml),
+    }
+    launched = graph.start("roslaunch", "skytether", "robot.launch", env={**graph.environment, **more})
+    wait_for(lambda: graph.publishers("/cmd_vel") == ["/skytether"], "the agent's node")
+    graph.end(launched)
+    wait_for(lambda: graph.publishers("/cmd_vel") == [], "its end")
+
+
+def test_the_script_says_what_is_missing_and_passes_on_what_is_not_ros_s(tmp_path):
+    script = str(PACKAGE / "scripts" / "robot_run")
+    missing = subprocess.run(
+        [script, "x.yaml"], capture_output=True, text=True, env={"PATH": "/usr/bin:/bin", "SKYTETHER": "not-there"}
+    )
+    assert missing.returncode == 2
+    assert "pip install skytether" in missing.stderr
+    echo = subprocess.run(
+        [script, "a b.yaml", "__name:=skytether", "--check", "__log:=/x"],
+        capture_output=True,
+        text=True,
+        env={"PATH": "/usr/bin:/bin", "SKYTETHER": "echo"},
+    )
+    assert echo.stdout == "robot run a b.yaml --check\n"
+
+
+def test_the_package_s_files_are_what_catkin_and_roslaunch_read():
+    package = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    assert package.findtext("name") == "skytether"
+    (node,) = ElementTree.parse(PACKAGE / "launch" / "robot.launch").getroot().iter("node")
+    assert (node.get("pkg"), node.get("type")) == ("skytether", "robot_run")
+    assert os.access(PACKAGE / "scripts" / "robot_run", os.X_OK)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+def test_the_unit_is_one_that_systemd_takes(tmp_path):
+    unit = tmp_path / "skytether-robot.service"
+    text = (PACKAGE / "systemd" / unit.name).read_text()
+    unit.write_text(text.replace("/opt/skytether/bin/skytether", shutil.which("true")))
+    checked = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
+    assert checked.returncode == 0
+    assert unit.name not in checked.stderr
