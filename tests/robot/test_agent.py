@@ -15,7 +15,7 @@ from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.arbiter import Reason
 from skytether.robot.command import Source
 from skytether.robot.fallback import FallbackError
-from skytether.wire.events import Connected
+from skytether.wire.events import Connected, Refused
 from skytether.wire.stats import PathStats, SessionStats, TopicStats
 from skytether.wire.topic import Role
 
@@ -222,6 +222,36 @@ def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
         cloud.send(rig.now)
         rig.agent.tick(rig.now)
     assert rig.agent.status().driver.transitions[-1].reason is Reason.RTT
+
+
+def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_followed(
+    rig, orchestrator, make_cloud, caplog
+):
+    rows = [t.model_copy(update={"period_ms": 10}) if t.name == "cmd_vel" else t for t in SESSION.topics]
+    orchestrator.session = SESSION.model_copy(update={"topics": tuple(rows)})
+    rig.ask()
+    cloud, sent = make_cloud(rig.agent._driver.session), 0
+    for _ in range(500):
+        rig.now += 0.01
+        for i in range(10):
+            cloud.send(rig.now, linear=0.02 * i)
+        sent += 10
+        rig.agent.tick(rig.now)
+        topic = TopicStats("cmd_vel", "out", 127, sent=sent, delivered=sent)
+        rig.bridges[0].snapshot = SessionStats(True, (topic,))
+        rig.agent.watch(rig.now)
+    assert rig.agent.status().driver.velocity.linear == pytest.approx(0.18)
+    named = [message for message in caplog.messages if "times a second" in message]
+    assert len(named) == 1
+    assert "sends cmd_vel 1000 times a second, its manifest says 100" in named[0]
+
+
+def test_a_session_that_the_service_refuses_is_told(rig):
+    rig.ask()
+    rig.agent._driver.session.notify(Refused("topic force: types differ"))
+    assert rig.agent.status().trouble == "the service refused the session: topic force: types differ"
+    rig.agent._driver.session.notify(Connected(()))
+    assert rig.agent.status().trouble == ""
 
 
 def test_a_control_loop_that_dies_leaves_the_wheels_standing(rig, base):

@@ -227,12 +227,14 @@ def test_sensors_that_went_silent_stop_the_fallback(rig, monkeypatch):
     assert status.objections["stale"] > 0
 
 
-def test_a_clock_that_jumps_back_brakes(driven):
+def test_a_clock_that_jumps_back_brakes_and_is_named_once(driven, caplog):
     driven.now -= 10
     driven.run(TICK)
     assert driven.base.velocity[0] < 0.2
     driven.run(2.0, linear=0.2)
     assert driven.driver.status().source is Source.CLOUD
+    named = [message for message in caplog.messages if "their age cannot be known" in message]
+    assert len(named) == 1
 
 
 def test_the_services_needs_decide(driven):

@@ -267,7 +267,7 @@ class Agent:
         return AgentStatus(
             driver=self._driver.status(),
             instance=self._instance,
-            trouble=self._asker.trouble or self._trouble,
+            trouble=self._asker.trouble or self._trouble or (session.refused if session else ""),
             asked_at=self._asked_at,
             connected=session is not None and session.connected,
             session=self._stats,

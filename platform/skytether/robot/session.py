@@ -68,6 +68,8 @@ class LiveSession:
         self.encoding = encoding
         self._graph = graph
         self.connected = False
+        self.refused = ""
+        """Why there is no session, if the service says so; one sentence."""
         self.bridge: Endpoint | None = None
         self.peer: tuple[str, int] | None = None
         self._topics = topics
@@ -127,10 +129,11 @@ class LiveSession:
         """Port: know what is up."""
         if isinstance(event, Connected):
             self._epoch = next(self._epochs)
-            self.connected = True
+            self.connected, self.refused = True, ""
         elif isinstance(event, Disconnected):
             self.connected = False
         elif isinstance(event, Refused):
-            _log.error("the service refused the session: %s", event.reason)
+            self.refused = f"the service refused the session: {event.reason}"
+            _log.error("%s", self.refused)
         if self._graph is not None:
             self._graph.notify(event)
