@@ -40,8 +40,11 @@ def test_slower_services_are_waited_for_less_than_two_periods(period):
 def test_uneven_commands_are_waited_for_as_long_as_they_have_been_uneven():
     patience, at = Patience(0.05, 0.15, TICK), 0.0
     for i in range(100):
-        at += 0.11 if i == 50 else 0.05
+        at += 0.11 if i in (40, 50) else 0.05
         patience.arrived(at)
+    assert patience.limit_s == pytest.approx(patience.least_s), "two hiccups make no uneven link"
+    at += 0.11
+    patience.arrived(at)
     assert patience.limit_s == pytest.approx(0.11 + TICK / 2)
     for _ in range(1300):  # 65 s
         at += 0.05

@@ -30,6 +30,8 @@ _LEARNED_AFTER = 20
 """Gaps between commands that must have been seen before patience is less than the most."""
 _MEMORY_S = 30.0
 """For how long a long gap is remembered at least [s]; at most twice as long."""
+_HICCUPS = 2
+"""Gaps within that time that may be longer than what is waited for: a machine that stalls once makes no uneven link."""
 _OVERRATE = 3.0
 """A topic that comes more than this many times as often as its manifest says is named."""
 
@@ -66,9 +68,9 @@ class Patience:
     """How long the service may be silent before the robot's own controller takes over.
 
     At 100 Hz and faster, or where the manifest does not say how fast: ``most_s``, whole. Slower services are given less
-    than two periods, so that no robot goes on for long with a command that has no successor, but at least the longest
-    gap of the last half minute (as far as ``most_s``): on a link that lets commands come unevenly the robot would
-    otherwise change hands all the time.
+    than two periods, so that no robot goes on for long with a command that has no successor, but at least the gaps that
+    came again and again in the last half minute (as far as ``most_s``): on a link that lets commands come unevenly the
+    robot would otherwise change hands all the time.
 
     Args:
         period_s: Between commands, as the manifest says [s]; None: it does not say.
@@ -84,8 +86,10 @@ class Patience:
         self._tick_s = tick_s
         self._last: float | None = None
         self._seen = 0
-        self._longest = [0.0, 0.0]
-        """Of this half minute, and of the one before."""
+        self._longest: list[list[float]] = [[], []]
+        """Of this half minute, and of the one before; the longest first."""
+        self._usual = 0.0
+        """Longest gap but for hiccups [s]."""
         self._turned = -inf
 
     @property
@@ -98,18 +102,19 @@ class Patience:
         gap = at - self._last if self._last is not None else 0.0
         self._last = at
         if at - self._turned > _MEMORY_S:
-            self._longest = [0.0, self._longest[0]]
+            self._longest = [[], self._longest[0]]
             self._turned = at
         if 0 < gap <= self._most:  # a longer one was an outage, and says nothing about ordinary days
             self._seen += 1
-            self._longest[0] = max(self._longest[0], gap)
+            self._longest[0] = sorted([*self._longest[0], gap], reverse=True)[: _HICCUPS + 1]
+            self._usual = min(sorted([*self._longest[0], *self._longest[1]], reverse=True)[: _HICCUPS + 1])
 
     @property
     def limit_s(self) -> float:
         """Now [s]."""
         if not self._adapts or self._seen < _LEARNED_AFTER:
             return self._most
-        return min(max(self._least, max(self._longest) + self._tick_s / 2), self._most)
+        return min(max(self._least, self._usual + self._tick_s / 2), self._most)
 
 
 class ServiceManager:
