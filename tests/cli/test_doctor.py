@@ -6,7 +6,6 @@ import json
 import socket
 import ssl
 import subprocess
-import sys
 import threading
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -120,6 +119,7 @@ def certificate(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_self_signed_certificate_is_found_and_trusted_when_given(certificate, echo):
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate)
@@ -135,6 +135,7 @@ def test_a_self_signed_certificate_is_found_and_trusted_when_given(certificate, 
         assert "another name" in found["certificate"]["says"]
 
 
+@pytest.mark.slow
 def test_a_site_without_an_echo_is_udp_trouble():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
@@ -270,8 +271,3 @@ def test_a_router_that_rebinds_is_found(cable, echo_port):
         thread.join()
     assert "addresses in turn" in found.says
     assert "paths in robot.yaml" in found.todo
-
-
-def test_help_names_what_is_looked_at():
-    result = subprocess.run([sys.executable, "-m", "skytether.cli", "doctor", "--help"], capture_output=True, text=True)
-    assert result.returncode == 0

@@ -3,7 +3,7 @@ from itertools import pairwise
 from math import inf, isfinite, nan
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs
@@ -153,6 +153,7 @@ QUALITY = st.builds(
 )
 
 
+@settings(max_examples=40)
 @given(st.lists(st.tuples(QUALITY, QUALITY, st.floats(0, 1), st.booleans()), max_size=30))
 def test_the_choice_never_changes_more_often_than_hysteresis_allows(looks):
     decision, changes = start(POLICY, 0.0), []
