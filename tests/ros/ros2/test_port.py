@@ -235,6 +235,19 @@ def test_a_ways_end(stage):
     assert set(port._ways) == {"reset/request", "reset/response"}
 
 
+def test_a_hash_in_the_row_is_taken_for_topics_and_calls(stage):
+    rihs = "RIHS01_" + "4" * 64
+    given = (
+        {"name": "own", "type": "my_msgs/msg/Own", "direction": "out", "type_hash": rihs},
+        {"name": "ask", "kind": "call", "type": "my_msgs/srv/Ask", "direction": "in", "type_hash": rihs},
+    )
+    port = Ros2Port(stage.ours(), rows(*given), Role.ROBOT)
+    port.attach(FakeBridge())
+    rmw = stage.rmw("node")
+    stage.until(lambda: [t for t in rmw.sees("MP", "/own") if rihs in t], "the topic has another hash")
+    stage.until(lambda: [t for t in rmw.sees("SS", "/ask") if rihs in t], "the service has another hash")
+
+
 @pytest.mark.parametrize(
     ("row", "text"),
     [

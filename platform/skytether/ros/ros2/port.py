@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Container, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, runtime_checkable
 
@@ -202,7 +202,7 @@ class Ros2Port:
         kind = Kind.SERVER if self._calls[name] is self._role else Kind.CLIENT
         service = self._typed(name, request.type.removesuffix("_Request"))
         graph_name = self._named(name + REQUEST).removesuffix(REQUEST)
-        return Endpoint(kind, graph_name, service, hash_of(service, "cdr"), SERVICE)
+        return Endpoint(kind, graph_name, service, self._hash(replace(request, type=service)), SERVICE)
 
     def _ask_peer(self, bridge: Caller, name: str, request: bytes) -> bytes:
         """In a worker's thread of the node: a call from our graph is answered by the peer's."""
