@@ -1,0 +1,119 @@
+"""Queues of a publication, on real sockets of loopback but without a master."""
+
+import asyncio
+import socket
+
+import pytest
+
+from skytether.ros.ros1.publication import Publication
+from skytether.ros.ros1.tcpros import pack_frame, pack_header, read_frame, read_header
+
+
+def run(work, **options):
+    """Call work(publication, connect) in a loop in which the publication is served."""
+
+    async def main():
+        loop = asyncio.get_running_loop()
+
+        def soon(callback):
+            loop.call_soon_threadsafe(callback)
+            return True
+
+        options.setdefault("latched", False)
+        options.setdefault("queue", 5)
+        publication = Publication("/me", soon, "/big", "std_msgs/String", "a" * 32, "string data", **options)
+
+        async def serve(reader, writer):
+            try:
+                await publication.serve(await read_header(reader), reader, writer)
+            except OSError:
+                pass
+            finally:
+                writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        address = server.sockets[0].getsockname()
+
+        async def connect(**header):
+            sock = socket.socket()
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            sock.setblocking(False)
+            await loop.sock_connect(sock, address)
+            reader, writer = await asyncio.open_connection(sock=sock, limit=4096)
+            fields = {"callerid": "/you", "topic": "/big", "type": "*", "md5sum": "*", **header}
+            writer.write(pack_header(fields))
+            return reader, writer, await read_header(reader)
+
+        async with server:
+            try:
+                await asyncio.wait_for(work(publication, connect), 30)
+            finally:
+                publication.close()
+
+    asyncio.run(main())
+
+
+def test_a_slow_subscriber_loses_the_oldest_and_gets_the_newest():
+    async def work(publication, connect):
+        reader, writer, header = await connect()
+        assert (header["md5sum"], header["message_definition"]) == ("a" * 32, "string data")
+        size, count = 200_000, 100
+        for number in range(count):
+            publication.publish(number.to_bytes(4) + bytes(size))
+            await asyncio.sleep(0)
+        got = []
+        while not got or got[-1] != count - 1:
+            frame = await read_frame(reader)
+            assert len(frame) == size + 4
+            got.append(int.from_bytes(frame[:4]))
+        assert got == sorted(got)
+        assert len(got) < count
+        assert got[-5:] == list(range(count - 5, count))
+        writer.close()
+
+    run(work)
+
+
+def test_messages_are_held_for_a_first_subscriber_and_a_latched_one_for_all():
+    async def held(publication, connect):
+        publication.publish(b"goal")
+        await asyncio.sleep(0.01)
+        reader, writer, _ = await connect()
+        assert await read_frame(reader) == b"goal"
+        publication.publish(b"next")
+        assert await read_frame(reader) == b"next"
+        writer.close()
+
+    run(held, hold_s=60.0)
+
+    async def latched(publication, connect):
+        publication.publish(b"old")
+        publication.publish(b"map")
+        await asyncio.sleep(0.01)
+        for _ in range(2):
+            reader, writer, header = await connect()
+            assert header["latching"] == "1"
+            assert await read_frame(reader) == b"map"
+            writer.close()
+
+    run(latched, latched=True)
+
+
+@pytest.mark.parametrize(
+    "header", [{"md5sum": "b" * 32, "type": "std_msgs/String"}, {"md5sum": "*", "type": "std_msgs/Bool"}]
+)
+def test_another_type_is_refused_with_both_sums_and_named_once(header, caplog):
+    async def work(publication, connect):
+        for _ in range(3):
+            _, writer, answer = await connect(**header)
+            assert "a" * 32 in answer["error"]
+            assert header["md5sum"] in answer["error"]
+            writer.close()
+        assert publication.subscribers == []
+
+    run(work)
+    assert len(caplog.records) == 1
+
+
+def test_frames_are_the_message_behind_its_length():
+    assert pack_frame(memoryview(b"abc")) == b"\x03\0\0\0abc"
