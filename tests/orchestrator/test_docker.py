@@ -306,6 +306,15 @@ def test_an_engine_that_goes_away_and_comes_back(docker_site: DockerSite, tmp_pa
     proxy.cut()
 
 
+def stopped(runtime: DockerRuntime) -> bool:
+    """Ask as the reconciler does: again, when the site did not answer."""
+    try:
+        runtime.stop("i1", force=True)
+    except RuntimeFailure:
+        return False
+    return True
+
+
 def runtime_answers(runtime: DockerRuntime) -> bool:
     try:
         runtime.observe()
@@ -352,7 +361,7 @@ def test_an_engine_behind_ssh(sshd: str, docker_site: DockerSite, tmp_path: Path
             tunnel._process.kill()  # the network is gone for a moment
             tunnel._process.wait()
             until(lambda: runtime_answers(runtime) and runtime.observe()["i1"].phase is Phase.RUNNING)
-            runtime.stop("i1", force=True)
+            until(lambda: stopped(runtime))
             until_phase(runtime, Phase.EXITED)
         unknown = {**options, "ssh": {**options["ssh"], "known_hosts": str(tmp_path / "none")}}
         with closing(docker_site.open(tmp_path, **unknown)) as runtime:

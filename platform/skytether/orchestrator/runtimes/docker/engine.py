@@ -189,14 +189,16 @@ class Tunnel:
         Raises:
             OSError: No connection; with what the client said.
         """
-        if self._process is not None and self._process.poll() is None and self._folder is not None:
-            return self._folder / "engine.sock"
-        self.close()
+        if self._folder is None:
+            # A short path: a socket's has 107 bytes at most, and a state folder's may be longer.
+            self._folder = Path(tempfile.mkdtemp(prefix="skytether-"))
+        here, said = self._folder / "engine.sock", self._folder / "said"
+        if self._process is not None and self._process.poll() is None and here.exists():
+            return here
+        self._end()
+        here.unlink(missing_ok=True)  # always the same path: clients that are made stay good
         if shutil.which("ssh") is None:
             raise OSError("the program 'ssh' is missing: install openssh-client")
-        # A short path: a socket's has 107 bytes at most, and a state folder's may be longer.
-        self._folder = Path(tempfile.mkdtemp(prefix="skytether-"))
-        here, said = self._folder / "engine.sock", self._folder / "said"
         with said.open("wb") as file:
             self._process = subprocess.Popen(
                 self.command(here), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=file
@@ -205,13 +207,19 @@ class Tunnel:
         while not here.exists():
             if self._process.poll() is not None or time.monotonic() > deadline:
                 lines = [line for line in said.read_text(errors="replace").splitlines() if line.strip()]
-                self.close()
+                self._end()
                 raise OSError(f"ssh: {lines[-1].strip() if lines else 'no connection'}")
             time.sleep(0.01)
         return here
 
     def close(self) -> None:
-        """End the client."""
+        """End the client, and forget the path."""
+        self._end()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+
+    def _end(self) -> None:
         if self._process is not None:
             self._process.terminate()
             try:
@@ -222,6 +230,3 @@ class Tunnel:
             if self._process.stdin is not None:
                 self._process.stdin.close()
             self._process = None
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder = None
