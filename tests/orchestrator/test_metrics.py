@@ -66,6 +66,7 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
         "placement_refusals_total",
+        "reconcile_pass_seconds",
     }
     labels = set(re.findall(r"(\w+)=\"", text))
     assert labels <= ALLOWED | STANDARD

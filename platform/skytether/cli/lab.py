@@ -123,6 +123,38 @@ def migrate(
     )
 
 
+@bench.command("api")
+def api(
+    instances: Annotated[int, typer.Option(min=1, max=2000, help="Sleeping instances that run meanwhile.")] = 200,
+    rate: Annotated[float, typer.Option(min=1, max=10_000, help="Requests a second.")] = 100,
+    seconds: Annotated[float, typer.Option(min=1, max=600, help="For how long.")] = 20,
+    json: Annotated[bool, typer.Option("--json", help="Print one row.")] = False,
+) -> None:
+    """Ask an orchestrator that runs many instances: its answers, its reconcile passes, its memory."""
+    from rich.table import Table
+
+    from skytether.lab.bench.api import bench_api
+    from skytether.lab.bench.pair import BenchError
+    from skytether.lab.embedded import EmbeddedError
+
+    try:
+        with console.status("starting ...") as line:
+            row = bench_api(instances, rate, seconds, line.update)
+    except (BenchError, EmbeddedError) as error:
+        fail(str(error))
+    if json:
+        print_json(row.document())
+        return
+    table = Table("", "measured", title=f"{row.instances} instances, {row.rate_hz:g} requests a second")
+    table.add_row("answers, p50 / p99", f"{row.api_p50_ms:.1f} / {row.api_p99_ms:.1f} ms")
+    table.add_row("requests without a good answer", f"{row.failed} of {row.requests}")
+    table.add_row("reconcile pass, p50 / slowest, at most", f"{row.pass_p50_ms:g} / {row.pass_max_ms:g} ms")
+    table.add_row("memory of the orchestrator", f"{row.memory_mb:.0f} MiB")
+    table.add_row("instances lost or doubled", str(row.lost))
+    table.add_row("all started within", f"{row.start_s:.1f} s")
+    console.print(table)
+
+
 @bench.command("failover")
 def failover(
     n: Annotated[int, typer.Option("-n", min=1, max=10_000, help="Cuts at each rate.")] = 20,

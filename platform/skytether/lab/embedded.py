@@ -42,6 +42,13 @@ class EmbeddedOrchestrator:
         return (self.state_dir / "operator.token").read_text().strip()
 
     @property
+    def pid(self) -> int:
+        """Of its process, while it runs."""
+        if self._process is None:
+            raise EmbeddedError("the orchestrator does not run")
+        return self._process.pid
+
+    @property
     def log(self) -> str:
         """What the orchestrator wrote so far."""
         return (self.state_dir / "orchestrator.log").read_text(errors="replace")

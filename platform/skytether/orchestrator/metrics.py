@@ -73,6 +73,13 @@ class Metrics(Collector):
             buckets=_BUCKETS,
             registry=self._registry,
         )
+        self._passes = Histogram(
+            "skytether_reconcile_pass_seconds",
+            "One look at a site and what was done about it",
+            ("site",),
+            buckets=_BUCKETS,
+            registry=self._registry,
+        )
         self._refusals = Counter(
             "skytether_placement_refusals",
             "Sites refused in placement",
@@ -105,7 +112,12 @@ class Metrics(Collector):
             }
         )
 
+    def reconciled(self, site: str, seconds: float) -> None:
+        """One pass over a site."""
+        self._passes.labels(site).observe(seconds)
+
     def forget_site(self, site: str) -> None:
+        self._passes.remove_by_labels({"site": site})
         self._start.remove_by_labels({"site": site})
         self._refusals.remove_by_labels({"site": site})
 

@@ -72,7 +72,10 @@ class Reconciler:
 
     def site_step(self, site: Site) -> float:
         """One pass over a site; returns seconds until the next."""
-        return self._with_database(lambda: self._site_pass(site))
+        began = time.monotonic()
+        delay = self._with_database(lambda: self._site_pass(site))
+        self._metrics.reconciled(site.name, time.monotonic() - began)
+        return delay
 
     def _with_database(self, step: Callable[[], float]) -> float:
         """Wait where the database does not answer; once it does, leases count anew: nobody could renew meanwhile."""

@@ -5,8 +5,10 @@ Wall-clock, not monotonic: leases and back-off must mean the same after a restar
 
 from __future__ import annotations
 
+import json
 import secrets
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 from skytether.api.manifest import Manifest, ServiceSpec
@@ -88,7 +90,13 @@ class Record:
 
     @property
     def spec(self) -> ServiceSpec:
-        return Manifest.model_validate(self.manifest).spec
+        return _spec(json.dumps(self.manifest))
+
+
+@lru_cache(maxsize=256)
+def _spec(manifest: str) -> ServiceSpec:
+    """Parsed once: a pass over many instances asks again and again, and few services are theirs."""
+    return Manifest.model_validate_json(manifest).spec
 
 
 def new_record(**values: Any) -> Record:
