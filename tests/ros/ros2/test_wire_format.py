@@ -6,6 +6,8 @@ zenoh-plugin-ros2dds/src/liveliness_mgt.rs.
 """
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from skytether.ros.ros2.attachment import Attachment, pull_attachment, push_attachment
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
@@ -165,6 +167,40 @@ def test_qualities_that_others_write():
 def test_what_is_no_endpoint_is_none(token):
     assert RmwZenoh().parse(token) is None
     assert Ros2Dds().parse(token) is None
+
+
+CHUNK = st.sampled_from(
+    [
+        "@ros2_lv",
+        "@",
+        "0",
+        "a",
+        "MP",
+        "SS",
+        "%",
+        "%x",
+        "std_msgs::msg::dds_::String_",
+        "RIHS01_0",
+        "::,:,:,:,,",
+        "std§msg§S",
+    ]
+) | st.text("0123456789:,;=K*$?§%x", max_size=12)
+
+
+@given(st.lists(CHUNK, max_size=14).map("/".join) | st.text(max_size=60))
+@example("@/a/@ros2_lv/MP/x/std_msgs§msg§String/:1:1:0,1,2")
+def test_no_token_raises(token):
+    for dialect in (RmwZenoh(), Ros2Dds()):
+        dialect.parse(token)
+
+
+def test_a_hash_that_could_be_no_part_of_a_key_is_none():
+    """A learned hash becomes part of our own keys."""
+    token = "@ros2_lv/0/a/0/1/MP/%/%/n/%x/std_msgs::msg::dds_::String_/{}/::,:,:,:,,"
+    for wrong in ("*", "$*", "a?b", "RIHS01_é"):
+        parsed = RmwZenoh().parse(token.format(wrong))
+        assert parsed is not None
+        assert parsed[1].type_hash == ""
 
 
 def test_the_bridge_to_dds_writes_names_as_keys():

@@ -143,7 +143,8 @@ class RmwZenoh:
         type_name, qos = ros_type(parts[10]), quality.pull_rmw(parts[12])
         if type_name is None or qos is None:
             return None
-        type_hash = "" if parts[11] == NO_HASH else parts[11]
+        # A learned hash becomes part of our keys, so nothing else will do.
+        type_hash = parts[11] if parts[11] != NO_HASH and parts[11].isidentifier() and parts[11].isascii() else ""
         where = f"{namespace.rstrip('/')}/{node}"
         return parts[2], Endpoint(Kind(parts[5]), name, type_name, type_hash, qos, where)
 

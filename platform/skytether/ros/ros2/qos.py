@@ -92,9 +92,9 @@ def push_dds(qos: Qos, type_hash: str) -> str:
 def pull_dds(text: str) -> tuple[Qos, str] | None:
     """Inverse of `push_dds`; None for what is no quality of service."""
     parts = text.split(":", 4)
-    if len(parts) < 4 or not _numbers(parts[1], parts[2], *parts[3].split(",")):
+    history, _, depth = parts[3].partition(",") if len(parts) > 3 else ("", "", "")
+    if len(parts) < 4 or not _numbers(parts[1], parts[2], history, depth):
         return None
-    history, _, depth = parts[3].partition(",")
     kept = MAX_DEPTH if history == "1" else int(depth or 1)
     data = parts[4] if len(parts) > 4 else ""
     hashes = [item.strip().removeprefix("typehash=") for item in data.split(";") if "typehash=" in item]
