@@ -31,7 +31,7 @@ def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With
 
     try:
         settings = load_safety(config)
-        guard = Guard(settings, open_wheels(settings))
+        guard = Guard(settings, wheels := open_wheels(settings, "guard"))
     except ConfigError as error:
         fail(str(error), 2)
     except (GuardError, OSError) as error:
@@ -43,7 +43,10 @@ def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With
     if not settings.sensors:
         console.print("warning: safety.sensors is empty: the robot does not see what it drives into", style="yellow")
     log_without_waiting()
-    guard.run(ended.is_set)
+    try:
+        guard.run(ended.is_set)
+    finally:
+        wheels.close()
 
 
 def stop(

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from skytether.robot.safety.config import SafetyConfig
+from skytether.ros.names import namespace_of
 
 from .config_file import read_config
 
@@ -18,15 +19,28 @@ class _GateFile(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _limits_of_the_robot(cls, document: Any) -> Any:
-        return with_limits(document)
+    def _take_from_the_robot(cls, document: Any) -> Any:
+        return inherit(document)
 
 
-def with_limits(document: Any) -> Any:
-    """The file with its own ``limits`` as those of the section ``safety``, where that has none."""
-    if isinstance(document, dict) and isinstance(document.get("safety"), dict) and document.get("limits") is not None:
-        return document | {"safety": {"limits": document["limits"]} | document["safety"]}
-    return document
+def inherit(document: Any) -> Any:
+    """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
+
+    These are ``limits``, and of ``ros1``, unless the wheels are behind ``sockets``, where the graph and its wheels are.
+    """
+    if not isinstance(document, dict) or not isinstance(document.get("safety"), dict):
+        return document
+    safety = dict(document["safety"])
+    if isinstance(document.get("limits"), dict):
+        safety.setdefault("limits", document["limits"])
+    graph = document.get("ros1")
+    own = safety.get("ros1") or {}
+    if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:
+        robot = {key: graph[key] for key in ("master", "host", "cmd_vel", "namespace", "node") if graph.get(key)}
+        if "namespace" not in robot and isinstance(document.get("robot"), str):
+            robot["namespace"] = namespace_of(document["robot"])
+        safety["ros1"] = robot | own
+    return document | {"safety": safety}
 
 
 def load_safety(path: Path) -> SafetyConfig:

@@ -13,6 +13,8 @@ from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
 from skytether.messages import hash_of
 from skytether.robot.ros1 import Ros1RobotConfig
+from skytether.robot.safety.client import GateError, ask
+from skytether.robot.safety.config import SafetyConfig
 from skytether.ros.names import Names, resolve
 from skytether.ros.ros1.master import MasterError
 from skytether.ros.ros1.node import Node
@@ -52,7 +54,10 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
     if manifest is not None and findings[-1].good:
         specs = manifest.spec.topics
         findings += _topics(settings, graph.names(specs), node, specs)
-        findings.append(_wheels(graph, node))
+        if settings.safety is None:
+            findings.append(_wheels(graph.cmd_vel or "", graph, node))
+    if settings.safety is not None:
+        findings.append(_gate(settings.safety))
     return findings
 
 
@@ -138,8 +143,17 @@ def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
     return Finding(spec.name, name, spec.type, says)
 
 
-def _wheels(graph: Ros1RobotConfig, node: Node) -> Finding:
-    name = resolve(graph.cmd_vel, graph.home)
+def _gate(safety: SafetyConfig) -> Finding:
+    try:
+        stopped = ask(safety.place(), {"do": "status"})["stopped"]
+    except GateError as error:
+        return Finding("gate", str(safety.place()), "", str(error), good=False)
+    says = f"has the wheels, and is stopped: {stopped}" if stopped else "has the wheels"
+    return Finding("gate", str(safety.place()), "", says, good=not stopped)
+
+
+def _wheels(cmd_vel: str, graph: Ros1RobotConfig, node: Node) -> Finding:
+    name = resolve(cmd_vel, graph.home)
     kind = node.master.topic_types().get(name, "*")
     if kind not in ("*", "geometry_msgs/Twist"):
         return Finding("wheels", name, "geometry_msgs/Twist", f"is a {kind}", good=False)

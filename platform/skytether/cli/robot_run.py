@@ -16,6 +16,7 @@ from .output import console, fail
 
 if TYPE_CHECKING:
     from skytether.robot.agent import AgentConfig
+    from skytether.robot.driver import Base
     from skytether.robot.ros1 import Ros1RobotConfig
     from skytether.robot.snapshot import AgentStatus
     from skytether.ros.ros1.node import Node
@@ -74,7 +75,7 @@ def _run(settings: RobotConfig, ros1: Ros1Config, config: AgentConfig, seconds: 
     with _node(settings, ros1, ended) as node:
         robot = Ros1Robot(ros1_config(settings, ros1), node)
         try:
-            with Agent(config, robot.base, graph=robot) as agent:
+            with Agent(config, _base(settings, robot.base), graph=robot) as agent:
                 _watch(agent.status, ended, seconds)
         except FallbackError as error:
             fail(str(error), 2)
@@ -102,10 +103,20 @@ def _run_ros2(
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
     with join_ros2(settings, ros2, folder) as robot:
         try:
-            with Agent(agent_config(settings, folder, token), robot.base, graph=robot) as agent:
+            with Agent(agent_config(settings, folder, token), _base(settings, robot.base), graph=robot) as agent:
                 _watch(agent.status, threading.Event(), seconds)
         except FallbackError as error:
             fail(str(error), 2)
+
+
+def _base(settings: RobotConfig, graph: Base) -> Base:
+    """The wheels: behind the gate if there is one, else a topic of the graph."""
+    if settings.safety is None:
+        return graph
+    from skytether.robot.safety.base import GatedBase
+    from skytether.robot.safety.client import GateLink
+
+    return GatedBase(graph, GateLink(settings.safety.place()))
 
 
 @contextmanager
@@ -201,7 +212,7 @@ def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
         service=settings.service,
         namespace=ros1.namespace,
         remap=ros1.remap,
-        cmd_vel=ros1.cmd_vel,
+        cmd_vel=ros1.cmd_vel if settings.safety is None else None,
         idle_s=ros1.idle_s,
         readings=ros1.readings,
         topics=ros1.topics,

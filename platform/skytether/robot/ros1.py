@@ -32,7 +32,7 @@ class Ros1RobotConfig:
         service: The service's: what it sends is found below that name.
         namespace: Of the robot's topics; None: its name.
         remap: Names in the graph, by topic, call, action or reading.
-        cmd_vel: What the wheels listen to.
+        cmd_vel: What the wheels listen to; None: others have the wheels.
         idle_s: See `skytether.robot.graph_base.IDLE_S`.
         readings: Types of what the robot's own control reads, by name.
         topics: Sent to a service that takes any.
@@ -44,7 +44,7 @@ class Ros1RobotConfig:
     service: str
     namespace: str | None = None
     remap: Mapping[str, str] = field(default_factory=dict)
-    cmd_vel: str = "cmd_vel"
+    cmd_vel: str | None = "cmd_vel"
     idle_s: float | None = IDLE_S
     readings: Mapping[str, str] = field(default_factory=dict)
     topics: Collection[str] = ()
@@ -82,9 +82,12 @@ class Ros1Robot:
         self._config = config
         self._node = node
         self._port: Ros1Port | None = None
-        wheels = node.advertise(resolve(config.cmd_vel, config.home), Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+        send: Callable[[bytes], object] = _nowhere
+        if config.cmd_vel is not None:
+            topic = resolve(config.cmd_vel, config.home)
+            send = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1).publish
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
-        self.base = GraphBase(readings, "ros1", wheels.publish, idle_s=config.idle_s)
+        self.base = GraphBase(readings, "ros1", send, idle_s=config.idle_s)
         own = config.names(())
         self._ends: list[Callable[[], None]] = [
             node.subscribe(own.own(name), cls.TYPE, hash_of(cls.TYPE, "ros1"), self._reader(name))
@@ -153,3 +156,7 @@ class Ros1Robot:
             self._port.close()
         for end in self._ends:
             end()
+
+
+def _nowhere(_: bytes) -> None:
+    """Where velocities go that are not this graph's."""

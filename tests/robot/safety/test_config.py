@@ -69,6 +69,21 @@ def test_the_robots_own_limits_hold_unless_the_section_has_some(load):
     assert load(LEAST | {"limits": {"linear_max": 0.2}}, limits={"linear_max": 0.4}).rules().limits.linear_max == 0.2
 
 
+def test_the_robots_graph_is_the_gates_too_unless_it_says_otherwise(load):
+    graph = {"master": "http://robot:11311", "namespace": None, "remap": {"force": "/wrench"}, "cmd_vel": "/wheels"}
+    way = load(LEAST, robot="my-walker", ros1=graph).ros1
+    assert (way.master, way.namespace, way.cmd_vel, way.node) == (
+        "http://robot:11311",
+        "/my_walker",
+        "/wheels",
+        "skytether",
+    )
+    own = load(LEAST | {"ros1": {"namespace": "/", "node": "gate"}}, robot="my-walker", ros1=graph).ros1
+    assert (own.master, own.namespace, own.node) == ("http://robot:11311", "/", "gate")
+    assert load(LEAST | {"sockets": {}}, ros1=graph).ros1 is None
+    assert load(LEAST).ros1 is None
+
+
 def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
     assert load(LEAST, srevice="virtual-trail")
 
@@ -91,6 +106,9 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"sensors": {"scan": {"yaw": 90}}}, "safety.sensors.scan.yaw: unknown key, did you mean 'yaw_deg'?"),
         ({"sensors": {"scan": {"on_unknown": "free"}}}, "on_unknown: input should be 'stop' or 'slow'"),
         ({"joystick": {"topic": "scan"}}, "safety: the topic 'scan' cannot be two things"),
+        ({"sockets": {}, "ros1": {}}, "safety: there are ros1 and sockets"),
+        ({"ros1": {"cmd_vel": "1x"}}, "safety.ros1.cmd_vel: '1x' is no name of a graph"),
+        ({"ros1": {}, "sensors": {"my scan": {}}}, "'my scan' is no name of a graph"),
         ({"guard_s": 0.03}, "guard_s must be two periods of rate_hz or more: 0.04"),
         ({"sockets": {"wheels": "wheels.sock"}}, "must be unix:PATH or udp:HOST:PORT, not 'wheels.sock'"),
     ],

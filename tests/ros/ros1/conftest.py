@@ -1,13 +1,17 @@
 from pathlib import Path
 
 import pytest
+import yaml
 from ros1_graph import Ros1Graph, debian_packages
 from ros1_pair import Pair
+from ros1_walker import Walker
 
 from skytether.api.client import Client
-from skytether.api.manifest import TopicSpec
-from skytether.api.rest import SiteCreate
+from skytether.api.manifest import Manifest, TopicSpec
+from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
+
+EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
 
 
 @pytest.fixture
@@ -59,3 +63,33 @@ def orchestrator(tmp_path):
         client.delete_site("local")
         orchestrator.client = client
         yield orchestrator
+
+
+@pytest.fixture
+def walker(graph):
+    walker = Walker(graph)
+    yield walker
+    walker.close()
+
+
+@pytest.fixture
+def config(graph, orchestrator, tmp_path):
+    """A robot.yaml, and the robot registered."""
+    manifest = yaml.safe_load((EXAMPLES / "wall_stop" / "service.yaml").read_text())
+    # How well a busy machine keeps time is not what is asked here.
+    manifest["spec"]["needs"] = {"cpu": 0.1}
+    orchestrator.client.put_service("wall-stop", Manifest.model_validate(manifest))
+    token = tmp_path / "walker.token"
+    token.touch(0o600)
+    token.write_text(orchestrator.client.create_robot(RobotCreate(name="walker")).token)
+    path = tmp_path / "robot.yaml"
+    document = {
+        "robot": "walker",
+        "orchestrator": orchestrator.url,
+        "token_file": "walker.token",
+        "service": "wall-stop",
+        "limits": {"max_gap_s": 2.0},
+        "ros1": {"master": graph.uri, "namespace": "/"},
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path

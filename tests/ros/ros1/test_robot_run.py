@@ -4,83 +4,18 @@ import json
 import signal
 import subprocess
 import sys
-import threading
 import time
-from pathlib import Path
 
 import pytest
-import yaml
 from ros1_graph import wait_for
 
-from skytether.api.manifest import Manifest
-from skytether.api.rest import RobotCreate
-from skytether.messages import LaserScan, Twist, decode, encode, type_hash
+from skytether.messages import LaserScan, Twist, decode, type_hash
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
 
-EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
-SCAN_MD5, TWIST_MD5 = type_hash(LaserScan, "ros1"), type_hash(Twist, "ros1")
-
-
-class Walker:
-    """The robot's own nodes: a laser at 20 Hz, and wheels that remember what they were told."""
-
-    def __init__(self, graph):
-        self.told = []
-        self.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 200)
-        self.node = Node("walker", graph.uri, look_s=0.2)
-        self.node.start()
-        self.laser = self.node.advertise("/scan", "sensor_msgs/LaserScan", SCAN_MD5)
-        listener = Listener(lambda data, _: self.told.append(decode(Twist, data, "ros1").linear.x))
-        self.node.subscribe("/cmd_vel", "geometry_msgs/Twist", TWIST_MD5, listener)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self):
-        while not self._ended.wait(0.05):
-            self.laser.publish(encode(self.scan, "ros1"))
-
-    @property
-    def speed(self):
-        return self.told[-1] if self.told else None
-
-    def close(self):
-        self._ended.set()
-        self._thread.join()
-        self.node.close()
-
-
-@pytest.fixture
-def walker(graph):
-    walker = Walker(graph)
-    yield walker
-    walker.close()
-
-
-@pytest.fixture
-def config(graph, orchestrator, tmp_path):
-    """A robot.yaml, and the robot registered."""
-    manifest = yaml.safe_load((EXAMPLES / "wall_stop" / "service.yaml").read_text())
-    # How well a busy machine keeps time is not what is asked here.
-    manifest["spec"]["needs"] = {"cpu": 0.1}
-    orchestrator.client.put_service("wall-stop", Manifest.model_validate(manifest))
-    token = tmp_path / "walker.token"
-    token.touch(0o600)
-    token.write_text(orchestrator.client.create_robot(RobotCreate(name="walker")).token)
-    path = tmp_path / "robot.yaml"
-    document = {
-        "robot": "walker",
-        "orchestrator": orchestrator.url,
-        "token_file": "walker.token",
-        "service": "wall-stop",
-        "limits": {"max_gap_s": 2.0},
-        "ros1": {"master": graph.uri, "namespace": "/"},
-    }
-    path.write_text(yaml.safe_dump(document))
-    return path
+SCAN_MD5 = type_hash(LaserScan, "ros1")
 
 
 def test_a_service_drives_a_robot_of_ros_1_and_stops_it_where_the_laser_knows_nothing(graph, config, walker, tmp_path):

@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from skytether.api.manifest import Strict
 from skytether.messages import Bool, Joy, LaserScan, Message, Range
 from skytether.robot.supervisor import Limits
+from skytether.ros.names import check_name
 
 from .footprint import Footprint, circle, polygon
 from .joystick import JoystickParams
@@ -21,6 +22,8 @@ from .protocol import default_folder
 from .ranges import Mount
 from .rules import Action, RangeSensor, Rules
 from .zones import ZoneParams
+
+DEFAULT_MASTER = "http://localhost:11311"
 
 _Metres = Annotated[float, Field(ge=-100, le=100)]
 _Topic = Annotated[str, Field(min_length=1, max_length=255)]
@@ -137,6 +140,24 @@ class SocketsConfig(_Numbers):
         return text
 
 
+class Ros1Way(_Numbers):
+    """A robot that is a ROS 1 graph: names are absolute, or in ``namespace``."""
+
+    master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
+    host: str | None = None
+    """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
+    namespace: str = "/"
+    node: _Topic = "skytether"
+    """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
+    cmd_vel: _Topic = "cmd_vel"
+    """What the wheels listen to; nobody else may publish it."""
+
+    @field_validator("namespace", "node", "cmd_vel")
+    @classmethod
+    def _a_name(cls, name: str) -> str:
+        return check_name(name)
+
+
 class SafetyConfig(_Numbers):
     """The whole section."""
 
@@ -154,10 +175,18 @@ class SafetyConfig(_Numbers):
     """The guard brakes when the gate has said nothing for this long, and the gate when the guard has not."""
     folder: Path | None = None
     """Of the gate's sockets; null: ``/run/skytether`` for root, else ``$XDG_RUNTIME_DIR/skytether``."""
-    sockets: SocketsConfig = SocketsConfig()
+    sockets: SocketsConfig | None = None
+    """Drivers that are no ROS nodes; the way to the hardware unless ``ros1`` is given."""
+    ros1: Ros1Way | None = None
+    """Sensors and wheels are topics."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> SafetyConfig:
+        if self.sockets is not None and self.ros1 is not None:
+            raise ValueError("there are ros1 and sockets, and the wheels can have only one of them")
+        if self.ros1 is not None:
+            for name in self.kinds():
+                check_name(name)
         topics = [*self.sensors, *(part.topic for part in (self.joystick, self.estop) if part)]
         for topic in topics:
             if topics.count(topic) > 1:

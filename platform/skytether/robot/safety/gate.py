@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import warm
+from skytether.messages import Twist, warm
 from skytether.robot.notices import Notices
 
 from .config import SafetyConfig
@@ -272,10 +272,10 @@ def main() -> None:
     log_without_waiting()
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm(config.kinds().values(), "cdr")
+    warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
     notices = Notices(_log)
     sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, time.monotonic()))
-    loop = GateLoop(config, guard, sensors, open_wheels(config))
+    loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"))
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short
     loop.run()

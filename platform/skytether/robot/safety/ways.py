@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
-from .config import SafetyConfig, address
+from .config import SafetyConfig, SocketsConfig, address
 from .hardware import Address, Sensors, SocketSensors, SocketWheels, Wheels
 from .protocol import SENSORS_SOCKET, WHEELS_SOCKET
 
@@ -15,16 +16,30 @@ def open_sensors(config: SafetyConfig, trouble: Callable[[str, str], object]) ->
     Raises:
         OSError: It cannot be had.
     """
-    return SocketSensors(_address(config, config.sockets.sensors, SENSORS_SOCKET), config.kinds(), trouble)
+    if config.ros1 is not None:
+        from .ros1 import Ros1Sensors
+
+        return Ros1Sensors(config.ros1, config.kinds(), trouble)
+    sockets = config.sockets or SocketsConfig()
+    return SocketSensors(_address(config, sockets.sensors, SENSORS_SOCKET), config.kinds(), trouble)
 
 
-def open_wheels(config: SafetyConfig) -> Wheels:
+def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
     """Where velocities go.
+
+    Args:
+        config: The section of robot.yaml.
+        role: Who writes.
 
     Raises:
         OSError: It cannot be had.
     """
-    return SocketWheels(_address(config, config.sockets.wheels, WHEELS_SOCKET))
+    if config.ros1 is not None:
+        from .ros1 import Ros1Wheels
+
+        return Ros1Wheels(config.ros1, role)
+    sockets = config.sockets or SocketsConfig()
+    return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 
 
 def _address(config: SafetyConfig, text: str | None, name: str) -> Address:

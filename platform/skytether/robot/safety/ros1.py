@@ -1,0 +1,102 @@
+"""The gate's way to the hardware of a robot that is a ROS 1 graph: nodes of its own, beside the agent's.
+
+The guard's node publishes the wheels' topic. The gate has one that takes the sensors, and one that publishes the
+wheels' topic when the guard is gone. Who is connected stays so when the master dies.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+
+from skytether.control.admittance import Velocity
+from skytether.messages import DecodeError, Message, Twist, Vector3, decode, encode, hash_of
+from skytether.ros.names import resolve
+from skytether.ros.ros1.node import Node, NodeError
+from skytether.ros.ros1.subscription import Listener
+
+from .config import Ros1Way
+
+_WAITING = 64
+"""Readings that wait for the gate's next turn; the newest are kept."""
+
+
+class Ros1Wheels:
+    """The wheels' topic, geometry_msgs/Twist.
+
+    Args:
+        way: Where it is.
+        role: Ends the node's name: ``guard`` or ``gate``.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros1Way, role: str) -> None:
+        self._node = _start(way, role)
+        topic = resolve(way.cmd_vel, way.namespace)
+        self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+
+    def write(self, velocity: Velocity) -> None:
+        """Wheels: publish it."""
+        twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
+        self._publication.publish(encode(twist, "ros1"))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
+
+
+class Ros1Sensors:
+    """Topics of the robot's own sensors.
+
+    Args:
+        way: Where they are.
+        kinds: Message type by topic, as configured: absolute, or in the namespace.
+        trouble: Told a kind and a sentence about each message that is not used.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros1Way, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]) -> None:
+        self._trouble = trouble
+        self._lock = threading.Lock()
+        self._waiting: deque[tuple[str, type[Message], bytes | memoryview]] = deque(maxlen=_WAITING)
+        self._node = _start(way, "sensors")
+        for name, kind in kinds.items():
+            topic = resolve(name, way.namespace)
+            self._node.subscribe(topic, kind.TYPE, hash_of(kind.TYPE, "ros1"), self._listener(name, kind))
+
+    def read(self) -> Iterable[tuple[str, Message]]:
+        """Sensors: what came since the last turn."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, deque(maxlen=_WAITING)
+        found = []
+        for name, kind, data in waiting:
+            try:
+                found.append((name, decode(kind, data, "ros1")))
+            except DecodeError as error:
+                self._trouble(f"sensors:{name}:bytes", f"{name}: {error}")
+        return found
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
+
+    def _listener(self, name: str, kind: type[Message]) -> Listener:
+        def take(data: bytes | memoryview, _: object) -> None:
+            with self._lock:
+                self._waiting.append((name, kind, data))
+
+        return Listener(take)
+
+
+def _start(way: Ros1Way, role: str) -> Node:
+    node = Node(f"{way.node}_{role}", way.master, host=way.host)
+    try:
+        node.start()
+    except NodeError as error:
+        raise OSError(str(error)) from error
+    return node

@@ -1,0 +1,95 @@
+"""The gate as nodes of a real ROS 1 graph, with a real agent, bridge and service beside it that are killed."""
+
+import subprocess
+
+import numpy as np
+import pytest
+import yaml
+from ros1_graph import wait_for
+
+from skytether.messages import Joy, LaserScan, encode, type_hash
+from skytether.robot.safety.client import GateError, ask
+
+pytestmark = [pytest.mark.ros1, pytest.mark.slow]
+
+
+@pytest.fixture
+def gated(config, tmp_path):
+    """The robot.yaml with a section safety."""
+    document = yaml.safe_load(config.read_text())
+    document["safety"] = {
+        "footprint": {"radius": 0.3},
+        "sensors": {"/scan": {"max_age_s": 1.0}},
+        "joystick": {"topic": "/joy", "deadman": 0, "max_age_s": 2.0},
+        "estop": {"topic": "/estop", "max_age_s": None},
+        "guard_s": 0.5,
+        "folder": str(tmp_path / "gate"),
+    }
+    config.write_text(yaml.safe_dump(document))
+    return config
+
+
+def stands(walker):
+    wait_for(lambda: walker.speed == 0.0, "the standstill")
+
+
+def drives(walker):
+    wait_for(lambda: walker.speed is not None and walker.speed > 0.15, "the service to drive")
+
+
+def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, tmp_path):
+    folder = tmp_path / "gate"
+    said = (tmp_path / "gate.log").open("wb")
+    guard = graph.skytether("robot", "gate", str(gated), stdout=said, stderr=said)
+    said.close()
+    agent = graph.skytether("robot", "run", str(gated))
+    button = graph.start("rostopic", "pub", "-r", "5", "/estop", "std_msgs/Bool", "data: false")
+    drives(walker)
+    assert set(graph.publishers("/cmd_vel")) == {"/skytether_guard", "/skytether_gate"}
+    # The agent, and with it its bridge, is killed at full speed.
+    agent.kill()
+    stands(walker)
+    agent = graph.skytether("robot", "run", str(gated))
+    drives(walker)
+    # Something comes nearer than the service, 0.5 m from its walls, would let it.
+    walker.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 100 + [0.35] * 100)
+    stands(walker)
+    walker.scan = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 200)
+    drives(walker)
+    # The master dies: who is connected stays connected.
+    graph.kill_master()
+    pad = walker.node.advertise("/joy", "sensor_msgs/Joy", type_hash(Joy, "ros1"))
+    graph.start_master()
+    held = Joy(axes=np.array([1.0, 0.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+
+    def joystick_drives() -> bool:
+        pad.publish(encode(held, "ros1"))
+        return ask(folder, {"do": "status"}, 30)["hand"] == "joystick"
+
+    wait_for(joystick_drives, "the joystick")
+    pad.publish(encode(Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32)), "ros1"))
+    drives(walker)
+    # The emergency stop button, pressed by a node of the robot.
+    graph.end(button)
+    graph.ask("rostopic", "pub", "-1", "/estop", "std_msgs/Bool", "data: true")
+    stands(walker)
+    with pytest.raises(GateError, match="still pressed"):
+        ask(folder, {"do": "reset"}, 30)
+    graph.ask("rostopic", "pub", "-1", "/estop", "std_msgs/Bool", "data: false")
+    ask(folder, {"do": "reset"}, 30)
+    drives(walker)
+    # The guard itself is killed: the gate has a publisher of its own.
+    guard.kill()
+    stands(walker)
+    assert "Traceback" not in (tmp_path / "gate.log").read_text()
+
+
+def test_the_check_says_whether_the_gate_is_there(graph, gated, walker):
+    def check():
+        said = graph.skytether("robot", "run", str(gated), "--check", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        found, told = (text.decode() for text in said.communicate(timeout=60))
+        return said.returncode, found + told
+
+    status, text = check()
+    assert status == 1
+    assert "no gate listens" in text.replace("\n", " ")
