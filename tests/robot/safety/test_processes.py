@@ -70,11 +70,14 @@ class Robot:
         wait(lambda: self._newest()[0] > 0.15, "the robot drives", self)
 
     def stands(self, seconds: float = 0.5) -> None:
-        """It comes to a standstill, and stays there."""
-        wait(lambda: self._newest() == (0.0, 0.0), "the robot stands", self)
-        self.told.clear()
-        time.sleep(seconds)
-        assert set(self.told) <= {(0.0, 0.0)}
+        """It comes to a standstill and stays there, that long at least."""
+
+        def stays() -> bool:
+            self.told.clear()
+            time.sleep(seconds)
+            return set(self.told) == {(0.0, 0.0)}
+
+        wait(lambda: self._newest() == (0.0, 0.0) and (not seconds or stays()), "the robot stands", self)
 
     def close(self) -> None:
         for process in (self.agent, self.guard):

@@ -72,11 +72,19 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     # The emergency stop button, pressed by a node of the robot.
     graph.end(button)
     graph.ask("rostopic", "pub", "-1", "/estop", "std_msgs/Bool", "data: true")
+    wait_for(lambda: "button was pressed" in ask(folder, {"do": "status"}, 30)["stopped"], "the button")
     stands(walker)
     with pytest.raises(GateError, match="still pressed"):
         ask(folder, {"do": "reset"}, 30)
     graph.ask("rostopic", "pub", "-1", "/estop", "std_msgs/Bool", "data: false")
-    ask(folder, {"do": "reset"}, 30)
+
+    def released() -> bool:
+        try:
+            return not ask(folder, {"do": "reset"}, 30)["stopped"]
+        except GateError:
+            return False
+
+    wait_for(released, "the reset")
     drives(walker)
     # The guard itself is killed: the gate has a publisher of its own.
     guard.kill()

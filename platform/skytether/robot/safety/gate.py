@@ -35,6 +35,8 @@ _log = logging.getLogger("skytether.gate")
 
 _COMMANDS_EACH_TURN = 64
 """The kernel keeps about as many; of a sender that is faster it takes no more."""
+_MANY_COMMANDS = 16
+"""In one turn; an agent at 100 Hz has two."""
 _LAST_STOPS_S = 0.5
 """How long a gate without a guard tells the wheels to stand before it ends."""
 _ASKING_S = 1.0
@@ -158,7 +160,11 @@ class GateLoop:
     def turn(self, now: float) -> None:
         """One turn of the loop."""
         with self._lock:
-            for data in receive(self._commands, 256, _COMMANDS_EACH_TURN):
+            arrived = receive(self._commands, 256, _COMMANDS_EACH_TURN)
+            if len(arrived) > _MANY_COMMANDS:
+                sentence = f"more than {_MANY_COMMANDS} commands came within one turn; the newest counts"
+                self._notices.say("rate", sentence, now)
+            for data in arrived:
                 command = unpack_command(data, Hand.AGENT, now)
                 if command is None:
                     self._notices.say("bytes", "something that is no command comes to the gate's command socket", now)
