@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from .robot_config import RobotConfig
 
-_MARKS = {"ok": "[green]ok[/]", "trouble": "[red]trouble[/]", "skipped": "[yellow]skipped[/]"}
+_COLOURS = {"ok": "green", "trouble": "red", "skipped": "yellow"}
 
 
 def doctor(
@@ -54,10 +54,11 @@ def doctor(
         print_json([finding.document() for finding in findings])
     else:
         for finding in findings:
-            console.print(f"{_MARKS[finding.state]:>18} [bold]{finding.check}[/]: ", end="")
+            mark = f"[{_COLOURS[finding.state]}]{finding.state:>8}[/]"
+            console.print(f"{mark} [bold]{finding.check}[/]: ", end="")
             console.print(finding.says, markup=False, soft_wrap=True)
             if finding.todo:
-                console.print(f"          -> {finding.todo}", markup=False, soft_wrap=True)
+                console.print(f"         -> {finding.todo}", markup=False, soft_wrap=True)
     if any(finding.state == "trouble" for finding in findings):
         raise typer.Exit(1)
 
