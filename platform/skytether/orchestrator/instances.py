@@ -170,15 +170,20 @@ class Instances:
         Raises:
             NotFoundError: As for ``get``.
         """
-        seen = self.get(principal, instance)
-        measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
-        renewed = self._store.renew(instance, self._clock(), renew.lease_s, {**seen.measurements, **measured})
-        if renewed is None:
-            return self._store.get(instance) or seen
-        if renew.report is not None:
-            report = self._metrics.bounded(renewed, renew.report)
-            self._store.report(instance, self._clock(), report.model_dump(mode="json"))
-        return renewed
+        measurements = None
+        if renew.measurements:
+            measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
+            measurements = {**self.get(principal, instance).measurements, **measured}
+        told = renew.report
+        renewed = self._store.renew(
+            instance,
+            self._clock(),
+            renew.lease_s,
+            robot=principal.robot,
+            measurements=measurements,
+            report=(lambda record: self._metrics.bounded(record, told).model_dump(mode="json")) if told else None,
+        )
+        return renewed or self.get(principal, instance)
 
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.
@@ -235,7 +240,7 @@ class Instances:
             placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
             session=self._session(record) if with_session else None,
             replaces=record.replaces,
-            successor=successor.id if with_session and (successor := self._store.successor(record.id)) else None,
+            successor=self._store.successor_id(record.id) if with_session else None,
             restarts=record.restarts,
             created_at=utc(record.created_at),
             updated_at=utc(record.updated_at),

@@ -214,6 +214,12 @@ class Store:
         found = self._records(select(instances).where(mine).order_by(instances.c.created_at.desc()).limit(1))
         return found[0] if found else None
 
+    def successor_id(self, instance: str) -> str | None:
+        """Its id alone, for every answer about an instance."""
+        mine = (instances.c.replaces == instance) & instances.c.state.not_in([*_FINAL, State.STOPPING])
+        with self._engine.connect() as connection:
+            return connection.scalar(select(instances.c.id).where(mine).order_by(instances.c.created_at.desc()))
+
     def last_params(self, service: str) -> dict[str, Any] | None:
         """What the last robot that asked for a service asked for; None: nobody did."""
         newest = select(instances.c.params).where(instances.c.service == service, instances.c.spare.is_(False))
@@ -221,27 +227,47 @@ class Store:
             return connection.scalar(newest.order_by(instances.c.created_at.desc()).limit(1))
 
     def renew(
-        self, instance: str, now: float, lease_s: float | None, measurements: dict[str, Any] | None = None
+        self,
+        instance: str,
+        now: float,
+        lease_s: float | None,
+        *,
+        robot: str | None = None,
+        measurements: dict[str, Any] | None = None,
+        report: Callable[[Record], dict[str, Any]] | None = None,
     ) -> Record | None:
-        """Keep an instance's lease; None if it has ended or ends."""
+        """Keep an instance's lease, and its robot's report instead of the one before; whoever leads exports that.
+
+        Args:
+            instance: Which.
+            now: Seconds since the epoch.
+            lease_s: From now on; None: as before.
+            robot: Whose it must be; None: anybody's.
+            measurements: Instead of those before; None: as before.
+            report: Makes the report of the instance as it is; None: there is none.
+
+        Returns:
+            The instance; None if it is not there, not the robot's, or has ended or ends.
+        """
         alive = instances.c.state.not_in([*_FINAL, State.STOPPING])
         length = instances.c.lease_s if lease_s is None else lease_s
         statement = update(instances).where(instances.c.id == instance, alive)
+        if robot is not None:
+            statement = statement.where(instances.c.robot == robot)
         if measurements is not None:
             statement = statement.values(measurements=measurements)
         # The version counts up, so that whoever is about to end it for its old lease has to look again.
         statement = statement.values(lease_s=length, lease_expires_at=now + length, version=instances.c.version + 1)
         with self._writer.begin() as connection:
             row = connection.execute(statement.returning(instances)).mappings().one_or_none()
-        return None if row is None else _record(row)
-
-    def report(self, instance: str, now: float, report: dict[str, Any]) -> None:
-        """Keep a robot's report on an instance, instead of the one before; whichever orchestrator leads exports it."""
-        values = {"at": now, "report": report}
-        with self._writer.begin() as connection:
-            mine = reports.c.instance == instance
-            if connection.execute(update(reports).where(mine).values(**values)).rowcount == 0:
-                connection.execute(insert(reports).values(instance=instance, **values))
+            if row is None:
+                return None
+            record = _record(row)
+            if report is not None:
+                values = {"at": now, "report": report(record)}
+                if connection.execute(update(reports).where(reports.c.instance == instance), values).rowcount == 0:
+                    connection.execute(insert(reports).values(instance=instance, **values))
+        return record
 
     def reports(self) -> dict[str, dict[str, Any]]:
         """The last report on each instance that has not ended."""
