@@ -104,6 +104,8 @@ def test_small_verbs(script: Script, client: Client) -> None:
     client.delete_instance("i1")
     assert 0 < client.probe("lab") < 5
     assert client.logs("i1", tail=7) == "grün\n"
+    script.answers["GET", "/api/v1/instances/i1/logs?tail=7&follow=true"] = (200, "text/plain", b"as it comes\n")
+    assert "".join(client.follow_logs("i1", tail=7)) == "as it comes\n"
 
 
 def test_a_problem_is_an_error_with_its_sentence(script: Script, client: Client) -> None:

@@ -46,6 +46,7 @@ def test_the_whole_life_of_an_instance(served: Any) -> None:
     assert (grant.session_id, grant.session_key) == (session.id, session.key)
     assert session.key not in repr(running)
     assert "run 1 of toy" in robot.logs(made.id)
+    assert "run 1 of toy" in "".join(robot.follow_logs(made.id))  # fakes cannot be followed: what there is
     robot.delete_instance(made.id)
     robot.delete_instance(made.id)
     assert [e.state for e in robot.watch(made.id, timeout=5)] == [

@@ -236,6 +236,25 @@ def test_ends_are_told_apart(docker_site: DockerSite, runtime: DockerRuntime) ->
     assert (bad.exit_status, bad.detail, bad.last_line) == (3, "", "boom")
 
 
+def test_a_log_is_followed_until_its_run_ends(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    assert runtime.follow("i1", 10) is None
+    runtime.start(launch(docker_site, params={"say": "hello", "flood": 3}))
+    until_phase(runtime, Phase.RUNNING)
+    stream = runtime.follow("i1", 2)
+    assert stream is not None
+    text = ""
+    while "line 2" not in text:
+        text += stream.read() or ""
+    assert text == "line 1\nline 2\n"
+    runtime.stop("i1", force=True)
+    while (piece := stream.read()) is not None:
+        text += piece
+    stream.close()
+    assert text == "line 1\nline 2\n"
+    until_phase(runtime, Phase.EXITED)
+    assert runtime.follow("i1", 2) is None
+
+
 def test_a_port_that_is_taken(docker_site: DockerSite, tmp_path: Path) -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

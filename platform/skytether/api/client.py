@@ -137,6 +137,19 @@ class Client:
         """The last lines that it wrote."""
         return self._request("GET", f"/instances/{instance_id}/logs?tail={tail}").text
 
+    def follow_logs(self, instance_id: str, tail: int = 200) -> Iterator[str]:
+        """The last lines of its present run, then what that writes as it comes, until it ends."""
+        path = f"{_PREFIX}/instances/{instance_id}/logs?tail={tail}&follow=true"
+        timeout = httpx.Timeout(self._http.timeout.connect, read=None)
+        try:
+            with self._http.stream("GET", path, timeout=timeout) as response:
+                if response.is_error:
+                    response.read()
+                    raise ApiError(_problem(response))
+                yield from response.iter_text()
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+
     def watch(self, instance_id: str, after: int = 0, *, timeout: float | None = None) -> Iterator[InstanceEvent]:
         """Every change so far after event ``after``, then each as it comes, until the instance has ended.
 

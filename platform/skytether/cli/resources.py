@@ -221,12 +221,21 @@ def show_instance(instance: str, url: Url = None, token_file: TokenFile = None, 
 def show_logs(
     instance: str,
     tail: Annotated[int, typer.Option(min=1, help="Lines.")] = 200,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Of its present run, and what that writes until it ends.")
+    ] = False,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
 ) -> None:
     """Print what an instance wrote."""
+    if follow and json:
+        fail("--follow prints as it comes: leave --json out", 2)
     with connected(url, token_file) as client:
+        if follow:
+            for text in client.follow_logs(instance, tail):
+                typer.echo(text, nl=False)
+            return
         text = client.logs(instance, tail)
     if json:
         print_json({"instance": instance, "lines": text.splitlines()})

@@ -18,7 +18,7 @@ from .moves import Moves
 from .placement import Decision
 from .reconcile import Reconciler, told
 from .records import Record, new_record
-from .runtimes.base import RuntimeFailure
+from .runtimes.base import LogStream, RuntimeFailure
 from .security import Secrets
 from .sites import Sites
 from .store import KeyReusedError, Store
@@ -223,6 +223,14 @@ class Instances:
         site = self._sites.find(self.get(principal, instance).site)
         try:
             return site.runtime.logs(instance, lines) if site else ""
+        except RuntimeFailure as error:
+            raise SilentSiteError(str(error)) from error
+
+    def follow(self, principal: Principal, instance: str, lines: int) -> LogStream | None:
+        """The log of an instance's present run, as it is written; None: nothing runs. Raises as ``logs``."""
+        site = self._sites.find(self.get(principal, instance).site)
+        try:
+            return site.runtime.follow(instance, lines) if site else None
         except RuntimeFailure as error:
             raise SilentSiteError(str(error)) from error
 

@@ -7,8 +7,8 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Query
-from fastapi.responses import PlainTextResponse
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew
@@ -16,6 +16,7 @@ from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate,
 from ..core import Orchestrator
 from ..instances import utc
 from ..records import Record
+from ..runtimes.base import LogStream
 from ..store import EventRow
 from .deps import PREFIX, Actor, Caller, Core, says
 
@@ -75,9 +76,36 @@ def migrate(core: Core, caller: Actor, instance: str, asked: Migrate) -> Instanc
 
 
 @router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404, 503))
-def logs(core: Core, caller: Caller, instance: str, tail: Annotated[int, Query(ge=1)] = 200) -> str:
-    """The last lines that the instance wrote, over all its runs."""
-    return core.instances.logs(caller, instance, min(tail, core.settings.limits.log_lines))
+async def logs(
+    core: Core,
+    caller: Caller,
+    request: Request,
+    instance: str,
+    tail: Annotated[int, Query(ge=1)] = 200,
+    follow: bool = False,
+) -> Response:
+    """The last lines that the instance wrote, over all its runs.
+
+    With ``follow`` those of its present run, then what that writes as it comes, until it ends.
+    """
+    lines = min(tail, core.settings.limits.log_lines)
+    stream = await asyncio.to_thread(core.instances.follow, caller, instance, lines) if follow else None
+    if stream is None:
+        return PlainTextResponse(await asyncio.to_thread(core.instances.logs, caller, instance, lines))
+    return StreamingResponse(_relayed(core, request, stream), media_type="text/plain")
+
+
+async def _relayed(core: Orchestrator, request: Request, stream: LogStream) -> AsyncIterator[str]:
+    """Until the run ends, nobody listens any more, or the orchestrator is to end."""
+    try:
+        while not core.broker.closed and not await request.is_disconnected():
+            text = await asyncio.to_thread(stream.read)
+            if text is None:
+                return
+            if text:
+                yield text
+    finally:
+        stream.close()
 
 
 @router.get("/{instance}/events", response_class=EventSourceResponse, responses=says(404))

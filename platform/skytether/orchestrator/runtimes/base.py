@@ -88,6 +88,18 @@ ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
 """Names of container images for what the kernel says."""
 
 
+class LogStream(ABC):
+    """What one run writes, as it comes. Used from one thread at a time, but for ``close``."""
+
+    @abstractmethod
+    def read(self) -> str | None:
+        """What is new; empty after about a second without; None: the run has ended, and all of it was read."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go; may be called again, and while somebody reads."""
+
+
 class RuntimeFailure(Exception):  # noqa: N818 (not an error of ours)
     """The site did not do what it was asked, or does not answer; one sentence saying what to do."""
 
@@ -162,6 +174,16 @@ class Runtime(ABC):
         Raises:
             RuntimeFailure: The site does not answer.
         """
+
+    def follow(self, instance: str, lines: int) -> LogStream | None:  # noqa: ARG002 (none is followed here)
+        """The last lines of the present run, then what it writes; None: nothing runs, or it cannot be followed.
+
+        From any thread.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+        return None
 
     def load(self) -> float | None:
         """Share of the site's processors that is busy, whoever makes them so, 0 to 1; None: not known.

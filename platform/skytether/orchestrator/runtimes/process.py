@@ -17,8 +17,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,7 +32,7 @@ from typing_extensions import override
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
-from .base import ARCHITECTURES, Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
 from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
 
 _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
@@ -235,6 +237,14 @@ class ProcessRuntime(Runtime):
             return b"".join(deque(log, maxlen=lines)).decode(errors="replace")
         return ""
 
+    @override
+    def follow(self, instance: str, lines: int) -> LogStream | None:
+        run = self._runs.get(instance)
+        log = self._folder / instance / "log"
+        if run is None or run.ended is not None or not log.exists():
+            return None
+        return FileLog(log, lines, lambda: run.ended is not None)
+
     def close(self) -> None:
         _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
 
@@ -244,6 +254,49 @@ class ProcessRuntime(Runtime):
             with contextlib.suppress(FileNotFoundError):
                 if log.stat().st_size > self._options.log_bytes:
                     _keep_newer_half(log, self._options.log_bytes // 2)
+
+
+class FileLog(LogStream):
+    """Follows a log file; one that was cut is read on from where it is then."""
+
+    def __init__(self, path: Path, lines: int, ended: Callable[[], bool], poll: float = 0.1) -> None:
+        """``lines``: to begin with; ``ended``: whether no more will come; ``poll``: seconds between two looks."""
+        self._path = path
+        self._ended = ended
+        self._poll = poll
+        with path.open("rb") as file:
+            self._before = b"".join(deque(file, maxlen=lines)).decode(errors="replace")
+            self._at = file.tell()
+        self._closed = threading.Event()
+
+    def read(self) -> str | None:
+        if self._before:
+            text, self._before = self._before, ""
+            return text
+        deadline = time.monotonic() + 1
+        while not self._closed.is_set():
+            ended = self._ended()  # before the look: what is written until then is read
+            new = self._new()
+            if new:
+                return new
+            if ended:
+                return None
+            if time.monotonic() >= deadline:
+                return ""
+            self._closed.wait(self._poll)
+        return None
+
+    def _new(self) -> str:
+        with contextlib.suppress(FileNotFoundError), self._path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            file.seek(min(self._at, size))
+            content = file.read()
+            self._at = file.tell()
+            return content.decode(errors="replace")
+        return ""
+
+    def close(self) -> None:
+        self._closed.set()
 
 
 _left_running: list[subprocess.Popen[bytes]] = []

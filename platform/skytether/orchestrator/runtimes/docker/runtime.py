@@ -14,11 +14,12 @@ from typing_extensions import override
 
 from skytether.api.manifest import ServiceSpec, Strict
 
-from ..base import ARCHITECTURES, Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from ..base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
 from .engine import Engine
 from .follow import Follower
 from .images import check_credentials
 from .launch import Job, kill, remove
+from .logs import ContainerLog
 from .network import ensure_network
 from .objects import Seen, observation, refusal
 from .options import DockerOptions
@@ -156,6 +157,11 @@ class DockerRuntime(Runtime):
             if left <= 0:
                 break
         return "".join(reversed(texts))
+
+    @override
+    def follow(self, instance: str, lines: int) -> LogStream | None:
+        newest = self._newest(instance)
+        return ContainerLog(self._engine, newest.id, lines) if newest is not None and newest.runs else None
 
     @override
     def close(self) -> None:
