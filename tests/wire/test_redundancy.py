@@ -84,6 +84,29 @@ def test_copies_keep_a_distance_at_which_a_burst_is_over():
     assert plan_copies(0.999999, LossModel(0.5, 10, 1.0), 0.002, 0.05, 5).more == 5
 
 
+def test_where_few_packets_are_sent_a_burst_takes_as_many_copies():
+    model = LossModel(0.03, 4, 0.01)
+    dense = plan_copies(0.999, model, 0.002, 0.1, 20, 1000.0)
+    sparse = plan_copies(0.999, model, 0.002, 0.1, 20, 20.0)
+    # Each copy is the next packet of the burst: 0.03 * 0.75^n.
+    assert sparse.more >= 11
+    assert dense.more < 5
+    # With 1,000 packets a second, some are in between even if the burst is over in no time.
+    assert plan_copies(0.999, LossModel(0.03, 4, 1e-6), 0.002, 0.1, 9, 1000.0).spacing > 0.009
+
+
+def test_small_messages_follow_in_waves_where_losses_come_in_bursts():
+    redundancy = Redundancy(Config())
+    assert redundancy.waves(2, 0.999, 0.2).more == 0
+    redundancy.model = LossModel(0.03, 4, 0.01)
+    redundancy.pace = 500.0
+    waves = redundancy.waves(2, 0.999, 0.2)
+    assert 1 <= waves.more <= 5
+    assert waves.spacing >= 0.015
+    assert waves.spacing * waves.more <= 0.1
+    assert redundancy.waves(40, 0.999, 0.2).more == 0
+
+
 def test_spread_copies_meet_their_target_in_bursts_of_time():
     model, delivery, count, random = LossModel(0.05, 4, 0.01), 0.995, 20_000, Random(2)
     more, spacing = plan_copies(delivery, model, 0.002, 0.2, 9)

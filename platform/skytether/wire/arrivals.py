@@ -339,4 +339,4 @@ class DelayMeter:
         base.append((now, self._level))
         while base[0][0] < now - self.BASE_TIME:
             base.popleft()
-        self.queue = max(0.0, self._level - base[0][1] - 3 * error)
+        self.queue = max(0.0, self._level - base[0][1] - 4 * error)

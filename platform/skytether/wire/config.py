@@ -58,7 +58,7 @@ class Config:
     """How long the keys before a new handshake still open packets that were on their way."""
     assumed_loss: float = 0.05
     """Share of packets taken to be lost on a path before anything is known of it (rule 5)."""
-    max_copies: int = 8
+    max_copies: int = 12
     """Most packets that carry the same one-shard message."""
     max_parity: float = 1.0
     """Most parity shards per data shard; messages of few shards may have ``max_copies - 1`` in any case."""

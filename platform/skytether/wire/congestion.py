@@ -31,11 +31,13 @@ HASTE = 2.0
 DOUBLE = 2.0
 """Growth in a second of a rate that only bursts (a camera's frames) make full use of, while delays do not grow."""
 FAR = 0.4
-"""Share of a measured capacity below which a rate used without pause grows like that too."""
+"""Share of the capacity, if one was measured, below which a rate used without pause grows like that too."""
 STEADY = 0.05
 """Most growth in a second, as a share of the rate, up to where there was a queue: the next is noticed after 0.2 s."""
 NEAR = 0.05
 """Share of the rate at which there was a queue that counts as near: there the growth is the slowest."""
+SLOW = 0.01
+"""Growth there in a second, as a share of the rate."""
 SATURATED = 0.7
 """Share of the rate used from which a path is taken to be used without pause."""
 USED_TIME = 0.3
@@ -128,21 +130,26 @@ class RateControl:
                 self._share *= YIELD
                 self._hold = now + rtt + REST
         else:
-            growth = STEP * (1 + ((now - self._cut_at) / HASTE) ** 2)
-            if self._share < (1 + NEAR) * self._full:
-                growth = min(growth, max(STEP, STEADY * self._share))
-                if self._share > (1 - NEAR) * self._full:
-                    growth, self._cut_at = STEP / 2, now
+            growth = self._growth(feedback, now)
             self._evade(feedback, rtt, now)
         if self._share < before:
             self._cut_at = now
         elif waited and (self.competing or self._share < MARGIN * feedback.capacity):
-            bursts = self._used < SATURATED * self.rate or self._share < FAR * feedback.capacity < math.inf
-            if bursts and not self.competing and not self._queued(feedback):
-                growth = max(growth, math.log(DOUBLE) * self._share)
             self._share += growth * elapsed
         self._share = min(max(self._share, LOWEST), self._ceiling)
         self.rate = min(self._share, max(self._drain, LOWEST))
+
+    def _growth(self, feedback: Feedback, now: float) -> float:
+        """Bits per second per second by which the rate may grow."""
+        near = abs(self._share - self._full) < NEAR * self._full
+        free = self._used < SATURATED * self.rate or self._share < FAR * feedback.capacity
+        if free and not self._queued(feedback):
+            return math.log(DOUBLE) * self._share
+        if near:
+            self._cut_at = now
+            return max(STEP / 2, SLOW * self._share)
+        growth = STEP * (1 + ((now - self._cut_at) / HASTE) ** 2)
+        return min(growth, max(STEP, STEADY * self._share)) if self._share < self._full else growth
 
     def _evade(self, feedback: Feedback, rtt: float, now: float) -> None:
         """Keep below the capacity, and without a queue."""

@@ -80,6 +80,14 @@ def encode(data: tuple[memoryview, ...], rows: tuple[int, ...]) -> list[bytes]:
     return parity
 
 
+def encode_sealed(sealed: memoryview, shape: Shape, rows: range) -> list[bytes]:
+    """The same of a sealed message of one block, padded to whole shards."""
+    if not rows:
+        return []
+    size = shape.size
+    return encode(tuple(sealed[i * size : (i + 1) * size] for i in range(shape.shards)), tuple(rows))
+
+
 def decode(shards: tuple[memoryview | bytes | Bytes, ...], indices: tuple[int, ...]) -> list[bytes]:
     """Data shards of one block from any k of its shards, distinct, of equal size."""
     data: list[bytes] = _decoder(len(shards)).decode(shards, indices)

@@ -30,12 +30,20 @@ RECENT_BYTES = 2**20
 
 
 class Copy:
-    """A sealed one-shard message that is sent again."""
+    """A sealed one-shard message that is sent again; or one shard of a larger one that is sent later."""
 
-    __slots__ = ("common", "deadline", "due", "left", "sealed", "spacing", "topic")
+    __slots__ = ("common", "deadline", "due", "left", "sealed", "shard", "spacing", "topic")
 
     def __init__(
-        self, topic: SendTopic, common: bytes, sealed: bytes, left: int, spacing: float, due: float, deadline: float
+        self,
+        topic: SendTopic,
+        common: bytes,
+        sealed: bytes,
+        left: int,
+        spacing: float,
+        due: float,
+        deadline: float,
+        shard: int = 0,
     ) -> None:
         self.topic = topic
         self.common = common
@@ -44,6 +52,7 @@ class Copy:
         self.spacing = spacing
         self.due = due
         self.deadline = deadline
+        self.shard = shard
 
     def __lt__(self, other: Copy) -> bool:
         return self.due < other.due

@@ -32,6 +32,8 @@ UNKNOWN = 8e6, 0.08
 frame at full speed would be a queue of its length."""
 BURST_TIME = 0.03
 """Seconds in which it arrives, beyond a round trip until the peer has told so."""
+PACE_TIME = 1.0
+"""Seconds that the number of packets sent in a second is averaged over."""
 FAMILIAR = 500
 """Packets from which a path is known well."""
 OWN_DELAY = 0.05
@@ -52,10 +54,10 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "_arrived_at", "_assumed_loss", "_cautious", "_fed_back_at", "_known", "_settle_at", "address",
-        "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo", "heard_at", "id", "large",
-        "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number", "pacer", "packets_received",
-        "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
+        "_arrived_at", "_assumed_loss", "_cautious", "_fed_back_at", "_known", "_pace", "_settle_at", "_singles",
+        "address", "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo", "heard_at", "id",
+        "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number", "pacer",
+        "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -90,6 +92,9 @@ class Path:
         self.redundancy = Redundancy(config)
         self._assumed_loss = config.assumed_loss
         self._arrived_at = now
+        self._singles = 0
+        """Packets sent one by one since the last feedback."""
+        self._pace = math.inf
         self._measure(now)
 
     def _measure(self, now: float) -> None:
@@ -144,12 +149,21 @@ class Path:
         if elapsed <= 0:
             return
         self._fed_back_at = now
+        self._follow_pace(self._singles / elapsed, elapsed)
+        self._singles = 0
         used, waited = self.pacer.usage()
         if now >= self.pacer.burst_at + self.rtts.minimum + BURST_TIME:
             self._known = True
         waited = waited and self._known
         self.control.take(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
         self.pacer.set_rate(self.control.rate if self._known else min(self.control.rate, self._cautious))
+
+    def _follow_pace(self, pace: float, elapsed: float) -> None:
+        if self._pace == math.inf:
+            self._pace = pace
+        self._pace += (1 - math.exp(-elapsed / PACE_TIME)) * (pace - self._pace)
+        # Rounded down by up to a third, so that plans are made once.
+        self.redundancy.pace = 1.5 ** math.floor(math.log(max(self._pace, 1.0), 1.5))
 
     def shared(self, batches: list[Transmit]) -> list[Transmit]:
         """Copies for addresses where the peer may be, as far as they may have them."""
@@ -164,6 +178,7 @@ class Path:
     def number(self, count: int = 1) -> int:
         """Claim packet numbers; returns the first."""
         first = self.next_number
+        self._singles += count == 1
         self.next_number = (first + count) % NUMBERS
         self.packets_sent += count
         return first

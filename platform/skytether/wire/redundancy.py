@@ -21,6 +21,9 @@ APART = 3.0
 """Mean durations of a burst between two copies: 5 % of bursts last longer."""
 SPREAD = 0.5
 """Share of a message's lifespan in which its copies are sent."""
+FEW = 4
+"""Data shards up to which a message's parity is sent in waves where losses come in bursts: a burst that takes one of
+its packets may take all that are sent at once."""
 
 
 class Copies(NamedTuple):
@@ -74,7 +77,9 @@ def plan_bursts(k: int, delivery: float, loss: float, burst: float, limit: int) 
 
 
 @lru_cache(maxsize=1024)
-def plan_copies(delivery: float, model: LossModel, spacing: float, budget: float, limit: int) -> Copies:
+def plan_copies(
+    delivery: float, model: LossModel, spacing: float, budget: float, limit: int, pace: float = math.inf
+) -> Copies:
     """Fewest copies of a single packet that reach ``delivery``.
 
     Args:
@@ -83,16 +88,22 @@ def plan_copies(delivery: float, model: LossModel, spacing: float, budget: float
         spacing: Least seconds between two.
         budget: Seconds in which all of them have to be sent.
         limit: Most copies; the answer when the target cannot be met.
+        pace: Packets that are sent in a second. Whether a burst is over after some time or after some packets cannot
+            be known, so both have to pass.
     """
     if not model.time:
         return Copies(plan(1, delivery, model.loss, limit), spacing)
     if 1 - model.loss >= delivery:
         return Copies(0, spacing)
+    each = -math.log(1 - 1 / model.burst) if model.burst > 1 else math.inf
+    # How much less likely it becomes with each second that a burst goes on.
+    ends = min(each * pace, 1 / model.time)
     apart = spacing
     for count in range(1, limit + 1):
-        apart = max(spacing, min(APART * model.time, budget / count))
+        apart = max(spacing, min(APART / ends, budget / count))
         # A burst that took one packet takes the next if it goes on for that long; else they are lost independently.
-        again = model.loss + (1 - model.loss) * math.exp(-apart / model.time)
+        stays = max(math.exp(-apart / model.time), math.exp(-each * max(pace * apart, 1.0)))
+        again = model.loss + (1 - model.loss) * stays
         if 1 - model.loss * again**count >= delivery:
             return Copies(count, apart)
     return Copies(limit, apart)
@@ -105,16 +116,31 @@ class Redundancy:
         model: Losses of the path.
     """
 
-    __slots__ = ("_config", "model")
+    __slots__ = ("_config", "model", "pace")
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self.model = LossModel(config.assumed_loss)
+        self.pace = math.inf
+        """Packets that are sent in a second, but for those of large messages, which go together."""
 
     def copies(self, delivery: float, lifespan: float) -> Copies:
         """For a message of one shard."""
         config = self._config
-        return plan_copies(delivery, self.model, config.copy_spacing, SPREAD * lifespan, config.max_copies - 1)
+        return plan_copies(
+            delivery, self.model, config.copy_spacing, SPREAD * lifespan, config.max_copies - 1, self.pace
+        )
+
+    def waves(self, k: int, delivery: float, lifespan: float) -> Copies:
+        """For a message of ``k`` data shards: how often as many parity shards follow later; none if not in waves."""
+        config, model = self._config, self.model
+        if not model.time or model.burst <= 1 or k > FEW:
+            return Copies(0, 0.0)
+        limit = max(int(k * config.max_parity + 0.5), config.max_copies - 1) // k
+        # Any of a wave's packets may be the first one of a burst.
+        begin = min(model.loss / (1 - model.loss) / model.burst, 1.0)
+        wave = model._replace(loss=1 - (1 - model.loss) * (1 - begin) ** (k - 1))
+        return plan_copies(delivery, wave, config.copy_spacing, SPREAD * lifespan, limit, self.pace)
 
     def parity(self, k: int, blocks: int, delivery: float) -> int:
         """Parity shards for each block of ``k`` data shards of a message that has ``blocks``.

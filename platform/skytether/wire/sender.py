@@ -18,19 +18,21 @@ from .compression import FLAG, Compressed, original_size
 from .config import Config
 from .crypto import TAG_SIZE
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
-from .fragment import Shape, Shards, shape_for
+from .fragment import Shape, Shards, encode_sealed, shape_for
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
 from .measure import Outbound
 from .packet import DATA, HEADER_SIZE, push_common, push_shard, ticks
 from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
+from .redundancy import Copies
 from .reliable import NUMBER_SPAN, Outbox
 
 INNER = struct.Struct(">IQ")
 """Start of the plaintext: topic sequence, time of publishing in microseconds of the sender's clock with the highest
 bit set if the payload is compressed."""
 OVERHEAD = INNER.size + TAG_SIZE
+NO_WAVES = Copies(0, 0.0)
 MAX_ASTRAY = 16
 """Packets to unproven addresses that may wait for the socket."""
 MAX_BATCH = 65_507
@@ -240,8 +242,14 @@ class Sender:
             deadline = published_at + topic.lifespan
             return self._send_small(epoch, topic, number, common, plaintext, deadline, extra, lane, batches, now)
         shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
-        parity = lane.path.redundancy.parity(shape.block_k(0), shape.blocks, topic.delivery)
-        flight = Flight(topic, Shards(common, sealed, shape, parity), now + topic.lifespan)
+        redundancy, k, deadline = lane.path.redundancy, shape.block_k(0), now + topic.lifespan
+        waves = redundancy.waves(k, topic.delivery, topic.lifespan) if shape.blocks == 1 else NO_WAVES
+        parity = 0 if waves.more else redundancy.parity(k, shape.blocks, topic.delivery)
+        rows = range(k, k + k * waves.more)
+        for row, shard in zip(rows, encode_sealed(sealed, shape, rows), strict=True):
+            due = now + (row // k) * waves.spacing
+            heapq.heappush(lane.copies, Copy(topic, common, shard, 1, waves.spacing, due, deadline, row))
+        flight = Flight(topic, Shards(common, sealed, shape, parity), deadline)
         lane.flights.append(flight)
         if self._other is not None or topic.redundant:
             lane.remember(flight, now)
@@ -338,13 +346,15 @@ class Sender:
         if copy.left:
             copy.due = now + copy.spacing
             heapq.heappush(lane.copies, copy)
-        size = self._send_shard(copy.topic, copy.common, copy.sealed, lane.path, batches, now)
+        size = self._send_shard(copy.topic, copy.common, copy.sealed, lane.path, batches, now, copy.shard)
         copy.topic.counters.bytes_redundant += size
         return size
 
     @staticmethod
-    def _send_shard(topic: SendTopic, common: bytes, sealed: bytes, path: Path, batches: Batches, now: float) -> int:
-        packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
+    def _send_shard(
+        topic: SendTopic, common: bytes, sealed: bytes, path: Path, batches: Batches, now: float, shard: int = 0
+    ) -> int:
+        packet = b"".join((common, push_shard(0, shard, path.id, path.number(), ticks(now)), sealed))
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)
         return len(packet)
