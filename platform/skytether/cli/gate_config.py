@@ -7,10 +7,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config import Ros1Way, Ros2Way, SafetyConfig
 from skytether.ros.names import namespace_of
 
 from .config_file import read_config
+from .ros2_config import need_extra
 
 
 class _GateFile(BaseModel):
@@ -26,20 +27,21 @@ class _GateFile(BaseModel):
 def inherit(document: Any) -> Any:
     """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
 
-    These are ``limits``, and of ``ros1``, unless the wheels are behind ``sockets``, where the graph and its wheels are.
+    These are ``limits``, and of ``ros1`` or ``ros2``, unless the wheels are behind ``sockets``, where the graph and its
+    wheels are.
     """
     if not isinstance(document, dict) or not isinstance(document.get("safety"), dict):
         return document
     safety = dict(document["safety"])
     if isinstance(document.get("limits"), dict):
         safety.setdefault("limits", document["limits"])
-    graph = document.get("ros1")
-    own = safety.get("ros1") or {}
-    if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:
-        robot = {key: graph[key] for key in ("master", "host", "cmd_vel", "namespace", "node") if graph.get(key)}
-        if "namespace" not in robot and isinstance(document.get("robot"), str):
-            robot["namespace"] = namespace_of(document["robot"])
-        safety["ros1"] = robot | own
+    for way, model in (("ros1", Ros1Way), ("ros2", Ros2Way)):
+        graph, own = document.get(way), safety.get(way) or {}
+        if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:
+            robot = {key: graph[key] for key in model.model_fields if graph.get(key) is not None}
+            if "namespace" not in robot and isinstance(document.get("robot"), str):
+                robot["namespace"] = namespace_of(document["robot"])
+            safety[way] = robot | own
     return document | {"safety": safety}
 
 
@@ -49,4 +51,11 @@ def load_safety(path: Path) -> SafetyConfig:
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key of the section is wrong or missing.
     """
-    return read_config(path, _GateFile).safety
+    safety = read_config(path, _GateFile).safety
+    if safety.ros2 is None:
+        return safety
+    need_extra()
+    if safety.ros2.zenoh_config is None:
+        return safety
+    there = safety.ros2.model_copy(update={"zenoh_config": path.absolute().parent / safety.ros2.zenoh_config})
+    return safety.model_copy(update={"ros2": there})

@@ -57,7 +57,7 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         if settings.safety is None:
             findings.append(_wheels(graph.cmd_vel or "", graph, node))
     if settings.safety is not None:
-        findings.append(_gate(settings.safety))
+        findings.append(look_at_gate(settings.safety))
     return findings
 
 
@@ -143,7 +143,8 @@ def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
     return Finding(spec.name, name, spec.type, says)
 
 
-def _gate(safety: SafetyConfig) -> Finding:
+def look_at_gate(safety: SafetyConfig) -> Finding:
+    """Whether the gate before the wheels is there, and not stopped."""
     try:
         stopped = ask(safety.place(), {"do": "status"})["stopped"]
     except GateError as error:

@@ -84,6 +84,13 @@ def test_the_robots_graph_is_the_gates_too_unless_it_says_otherwise(load):
     assert load(LEAST).ros1 is None
 
 
+def test_the_same_holds_for_ros_2(load, tmp_path):
+    graph = {"router": "tcp/robot:7447", "domain": 7, "zenoh_config": "zenoh.json5", "readings": {}, "node": "walker"}
+    way = load(LEAST, robot="my-walker", ros2=graph).ros2
+    assert (way.router, way.domain, way.namespace, way.node) == ("tcp/robot:7447", 7, "/my_walker", "walker")
+    assert way.zenoh_config == tmp_path / "zenoh.json5"
+
+
 def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
     assert load(LEAST, srevice="virtual-trail")
 
@@ -106,7 +113,7 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"sensors": {"scan": {"yaw": 90}}}, "safety.sensors.scan.yaw: unknown key, did you mean 'yaw_deg'?"),
         ({"sensors": {"scan": {"on_unknown": "free"}}}, "on_unknown: input should be 'stop' or 'slow'"),
         ({"joystick": {"topic": "scan"}}, "safety: the topic 'scan' cannot be two things"),
-        ({"sockets": {}, "ros1": {}}, "safety: there are ros1 and sockets"),
+        ({"sockets": {}, "ros1": {}}, "safety: there are sockets and ros1"),
         ({"ros1": {"cmd_vel": "1x"}}, "safety.ros1.cmd_vel: '1x' is no name of a graph"),
         ({"ros1": {}, "sensors": {"my scan": {}}}, "'my scan' is no name of a graph"),
         ({"guard_s": 0.03}, "guard_s must be two periods of rate_hz or more: 0.04"),

@@ -158,6 +158,30 @@ class Ros1Way(_Numbers):
         return check_name(name)
 
 
+class Ros2Way(_Numbers):
+    """A robot that is a ROS 2 graph; the keys are those of the section ``ros2``."""
+
+    router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
+    zenoh_config: Path | None = None
+    dialect: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    type_hashes: bool = True
+    bridge_namespace: str = "/"
+    namespace: str = "/"
+    node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
+    """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
+    cmd_vel: _Topic = "cmd_vel"
+    """What the wheels listen to; nobody else may publish it."""
+    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
+    frame: str = "base_link"
+    """Coordinate frame of stamped velocities."""
+
+    @field_validator("namespace", "bridge_namespace", "cmd_vel")
+    @classmethod
+    def _a_name(cls, name: str) -> str:
+        return check_name(name, 2)
+
+
 class SafetyConfig(_Numbers):
     """The whole section."""
 
@@ -176,17 +200,19 @@ class SafetyConfig(_Numbers):
     folder: Path | None = None
     """Of the gate's sockets; null: ``/run/skytether`` for root, else ``$XDG_RUNTIME_DIR/skytether``."""
     sockets: SocketsConfig | None = None
-    """Drivers that are no ROS nodes; the way to the hardware unless ``ros1`` is given."""
+    """Drivers that are no ROS nodes; the way to the hardware unless ``ros1`` or ``ros2`` is given."""
     ros1: Ros1Way | None = None
+    """Sensors and wheels are topics."""
+    ros2: Ros2Way | None = None
     """Sensors and wheels are topics."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> SafetyConfig:
-        if self.sockets is not None and self.ros1 is not None:
-            raise ValueError("there are ros1 and sockets, and the wheels can have only one of them")
-        if self.ros1 is not None:
-            for name in self.kinds():
-                check_name(name)
+        ways = [name for name in ("sockets", "ros1", "ros2") if getattr(self, name) is not None]
+        if len(ways) > 1:
+            raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
+        for name in self.kinds() if self.ros1 or self.ros2 else ():
+            check_name(name, 1 if self.ros1 else 2)
         topics = [*self.sensors, *(part.topic for part in (self.joystick, self.estop) if part)]
         for topic in topics:
             if topics.count(topic) > 1:

@@ -6,20 +6,16 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 
 from __future__ import annotations
 
-import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from skytether.control.admittance import Velocity
-from skytether.messages import DecodeError, Message, Twist, Vector3, decode, encode, hash_of
+from skytether.messages import Message, Twist, Vector3, encode, hash_of
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
 
 from .config import Ros1Way
-
-_WAITING = 64
-"""Readings that wait for the gate's next turn; the newest are kept."""
+from .inbox import Inbox
 
 
 class Ros1Wheels:
@@ -61,36 +57,22 @@ class Ros1Sensors:
     """
 
     def __init__(self, way: Ros1Way, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]) -> None:
-        self._trouble = trouble
-        self._lock = threading.Lock()
-        self._waiting: deque[tuple[str, type[Message], bytes | memoryview]] = deque(maxlen=_WAITING)
+        self._inbox = Inbox(kinds, "ros1", trouble)
         self._node = _start(way, "sensors")
         for name, kind in kinds.items():
             topic = resolve(name, way.namespace)
-            self._node.subscribe(topic, kind.TYPE, hash_of(kind.TYPE, "ros1"), self._listener(name, kind))
+            self._node.subscribe(topic, kind.TYPE, hash_of(kind.TYPE, "ros1"), self._listener(name))
 
     def read(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what came since the last turn."""
-        with self._lock:
-            waiting, self._waiting = self._waiting, deque(maxlen=_WAITING)
-        found = []
-        for name, kind, data in waiting:
-            try:
-                found.append((name, decode(kind, data, "ros1")))
-            except DecodeError as error:
-                self._trouble(f"sensors:{name}:bytes", f"{name}: {error}")
-        return found
+        return self._inbox.take()
 
     def close(self) -> None:
         """Leave the graph."""
         self._node.close()
 
-    def _listener(self, name: str, kind: type[Message]) -> Listener:
-        def take(data: bytes | memoryview, _: object) -> None:
-            with self._lock:
-                self._waiting.append((name, kind, data))
-
-        return Listener(take)
+    def _listener(self, name: str) -> Listener:
+        return Listener(lambda data, _: self._inbox.put(name, data))
 
 
 def _start(way: Ros1Way, role: str) -> Node:

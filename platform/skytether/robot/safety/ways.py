@@ -20,6 +20,10 @@ def open_sensors(config: SafetyConfig, trouble: Callable[[str, str], object]) ->
         from .ros1 import Ros1Sensors
 
         return Ros1Sensors(config.ros1, config.kinds(), trouble)
+    if config.ros2 is not None:
+        from .ros2 import Ros2Sensors
+
+        return Ros2Sensors(config.ros2, config.kinds(), trouble)
     sockets = config.sockets or SocketsConfig()
     return SocketSensors(_address(config, sockets.sensors, SENSORS_SOCKET), config.kinds(), trouble)
 
@@ -38,6 +42,10 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
         from .ros1 import Ros1Wheels
 
         return Ros1Wheels(config.ros1, role)
+    if config.ros2 is not None:
+        from .ros2 import Ros2Wheels
+
+        return Ros2Wheels(config.ros2, role)
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 

@@ -1,0 +1,97 @@
+"""The gate's way to the hardware of a robot that is a ROS 2 graph: nodes of its own on the graph's Zenoh router.
+
+A router that dies takes sensors and wheels away at once: a base that is told nothing must stop by itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+
+from skytether.control.admittance import Velocity
+from skytether.messages import Header, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
+from skytether.ros.names import resolve
+from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
+from skytether.ros.ros2.node import Ros2Error, Ros2Node
+from skytether.ros.ros2.qos import Qos
+
+from .config import Ros2Way
+from .inbox import Inbox
+
+
+class Ros2Wheels:
+    """The wheels' topic, geometry_msgs/msg/Twist or TwistStamped.
+
+    Args:
+        way: Where it is.
+        role: Ends the node's name: ``guard`` or ``gate``.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros2Way, role: str) -> None:
+        self._way = way
+        self._node = _start(way, role)
+        topic = resolve(way.cmd_vel, way.namespace)
+        self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, topic, way.cmd_vel_type))
+
+    def write(self, velocity: Velocity) -> None:
+        """Wheels: publish it."""
+        twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
+        if self._way.cmd_vel_type == TwistStamped.TYPE:
+            header = Header(Time.from_seconds(time.time()), self._way.frame)
+            self._publication.put(encode(TwistStamped(header, twist)))
+        else:
+            self._publication.put(encode(twist))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
+
+
+class Ros2Sensors:
+    """Topics of the robot's own sensors.
+
+    Args:
+        way: Where they are.
+        kinds: Message type by topic, as configured: absolute, or in the namespace.
+        trouble: Told a kind and a sentence about each message that is not used.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros2Way, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]) -> None:
+        self._inbox = Inbox(kinds, "cdr", trouble)
+        self._node = _start(way, "sensors")
+        for name, kind in kinds.items():
+            endpoint = _endpoint(Kind.SUBSCRIPTION, resolve(name, way.namespace), kind.TYPE)
+            self._node.subscribe(endpoint, partial(self._inbox.put, name))
+
+    def read(self) -> Iterable[tuple[str, Message]]:
+        """Sensors: what came since the last turn."""
+        return self._inbox.take()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
+
+
+def _start(way: Ros2Way, role: str) -> Ros2Node:
+    dialect: Dialect = (
+        RmwZenoh(way.domain, way.type_hashes) if way.dialect == "rmw_zenoh" else Ros2Dds(way.bridge_namespace)
+    )
+    name = NodeName(way.namespace, f"{way.node}_{role}")
+    try:
+        node = Ros2Node(dialect, router=way.router, config_file=way.zenoh_config, name=name)
+    except Ros2Error as error:
+        raise OSError(str(error)) from error
+    node.start()
+    return node
+
+
+def _endpoint(kind: Kind, name: str, type_name: str) -> Endpoint:
+    # Sensors are taken reliable or not; wheels that ask for reliable get that.
+    return Endpoint(kind, name, type_name, hash_of(type_name, "cdr"), Qos(reliable=kind is Kind.PUBLISHER, depth=1))
