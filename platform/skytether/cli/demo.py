@@ -99,6 +99,7 @@ def _told(change: Transition, s: float) -> str:
         "disconnected": "the service is not connected",
         "rtt": "the round trip is longer than the service bears",
         "loss": "more is lost than the service bears",
+        "late": "more comes too late than the service bears",
         "clock": "the age of commands is not known well enough",
         "recovered": "its commands come in time",
     }
