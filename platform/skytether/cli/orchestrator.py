@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from .output import fail
+from .output import console, fail
 
 app = typer.Typer(help="Run the orchestrator.", no_args_is_help=True)
 
@@ -90,3 +90,38 @@ def show_config(
     from skytether.orchestrator.config import example, page
 
     typer.echo(page() if markdown else example(), nl=False)
+
+
+StateDir = Annotated[
+    Path | None, typer.Option(help="Folder of the orchestrator's state.  [default: ~/.local/state/skytether]")
+]
+
+
+@app.command("backup")
+def back_up(
+    to: Annotated[Path, typer.Argument(help="A folder that is not there yet.")], state_dir: StateDir = None
+) -> None:
+    """Copy database, secret key and operator's token, while the orchestrator runs. Keep the copy as secret as these."""
+    from skytether.orchestrator.backup import BackupError, backup
+    from skytether.orchestrator.defaults import default_state_dir
+
+    try:
+        copied = backup((state_dir or default_state_dir()).expanduser(), to)
+    except BackupError as error:
+        fail(str(error))
+    console.print(f"copied {', '.join(copied)} to {to}")
+
+
+@app.command("restore")
+def restore_copy(
+    source: Annotated[Path, typer.Argument(help="What `backup` made.")], state_dir: StateDir = None
+) -> None:
+    """Put a copy into a state folder that holds none, before an orchestrator is started over it."""
+    from skytether.orchestrator.backup import BackupError, restore
+    from skytether.orchestrator.defaults import default_state_dir
+
+    try:
+        put = restore(source, (state_dir or default_state_dir()).expanduser())
+    except BackupError as error:
+        fail(str(error))
+    console.print(f"restored {', '.join(put)}")
