@@ -36,6 +36,7 @@ from skytether.ros.translate import Translated
 from skytether.wire.events import Connected, Disconnected, Event
 from skytether.wire.topic import Role
 
+from .beat import touch
 from .errors import ConfigError, ServiceError
 from .main import read_grant, write_ready_file
 from .ros_guard import CORE, Guard
@@ -130,6 +131,8 @@ def _work(grant: Grant, guard: Guard, node: Node, joined: _Joined, command: list
     launched = False
     idle_since = time.monotonic()
     while True:
+        if grant.ready_file is not None:
+            touch(grant.ready_file, 0.0)  # for the health check: this loop is alive
         told = None
         try:
             told = joined.notes.get(timeout=_POLL_S)
