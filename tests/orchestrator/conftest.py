@@ -91,7 +91,7 @@ class Fleet:
 
     def __call__(self, name: str) -> type[Any]:
         kind = getattr(runtimes, f"{name.capitalize()}Runtime", None)
-        if kind is None:
+        if kind is None or not name:
             return load_runtime(name)
         fleet = self
 
