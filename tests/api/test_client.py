@@ -158,7 +158,8 @@ def test_nobody_there_is_one_sentence_that_says_what_to_do(call: Callable[[Clien
     with Client(url) as client, pytest.raises(Unreachable) as caught:
         call(client)
     assert str(caught.value) == (
-        f"no orchestrator answers at {url}: start one with `skytether orchestrator run`, or give its address with --url"
+        f"no orchestrator answers at {url}: start one with `skytether orchestrator run`, or correct its address "
+        "(--url, or orchestrator in robot.yaml)"
     )
 
 

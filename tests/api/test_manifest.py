@@ -68,6 +68,7 @@ def test_a_service_with_a_graph_needs_only_its_launch_file():
         ({"entrypoint": "x", "launch": "/a.launch"}, "add graph: ros1"),
         ({"entrypoint": "x", "remap": {"a": "/b"}}, "add graph: ros1"),
         ({"graph": "ros1", "launch": "/a.launch", "remap": {"scan": "/x"}}, "the service has no topic 'scan'"),
+        ({"graph": "ros2", "launch": "/a.launch", "entrypoint": "x"}, "graph\n.*ROS 2 are not started here.*ros2: in"),
         ({"graph": "yarp", "launch": "/a.launch", "entrypoint": "x"}, "graph"),
     ],
 )

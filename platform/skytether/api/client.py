@@ -310,7 +310,7 @@ class Client:
             )
         return Unreachable(
             f"no orchestrator answers at {self._url}: "
-            "start one with `skytether orchestrator run`, or give its address with --url"
+            "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
         )
 
 

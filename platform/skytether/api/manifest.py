@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 """Names of services, sites and robots: a DNS label, so that every runtime can use them as they are."""
@@ -205,6 +205,16 @@ class ServiceSpec(Strict):
             if limit is not None and limit < need:
                 raise ValueError(f"limits.{key} is {limit:g}, less than needs.{key}, {need:g}")
         return self
+
+    @field_validator("graph", mode="before")
+    @classmethod
+    def _graphs_of_ros2_are_joined(cls, graph: Any) -> Any:
+        if graph == "ros2":
+            raise ValueError(
+                "graphs of ROS 2 are not started here, only those of ros1; start the nodes yourself, with their Zenoh "
+                "router, and join them with ros2: in the configuration of `skytether bridge`"
+            )
+        return graph
 
     @model_validator(mode="before")
     @classmethod

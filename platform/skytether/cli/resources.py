@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 service_app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
 site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
 instance_app = typer.Typer(help="What runs, for whom.", no_args_is_help=True)
-robot_app = typer.Typer(help="Who may ask.", no_args_is_help=True)
+robot_app = typer.Typer(help="Who may ask; and what runs on a robot: its agent and its gate.", no_args_is_help=True)
 
 
 def apply(

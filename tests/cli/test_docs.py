@@ -1,0 +1,88 @@
+"""What the pages of docs/ tell people to type is there: commands with their options, and YAML that is accepted."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+import yaml
+
+from skytether.api.manifest import Manifest
+from skytether.cli.app import app
+from skytether.cli.bridge_config import BridgeConfig
+from skytether.cli.config_file import check_config
+from skytether.cli.gate_config import inherit
+from skytether.cli.relay_config import RelayConfig
+from skytether.cli.robot_config import RobotConfig
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FILES = [*sorted((ROOT / "docs").rglob("*.service")), *sorted((ROOT / "ros1").rglob("*.service"))]
+ROBOT = {"robot": "walker", "orchestrator": "http://cloud:8600", "token_file": "t", "service": "s", "ros1": {}}
+TOPIC = {"name": "a", "type": "m/msg/M", "direction": "in"}
+END = {"role": "robot", "id": "ff" * 8, "key_file": "key", "peer": {"host": "h", "port": 1}, "topics": [TOPIC]}
+
+
+def commands() -> list[tuple[str, str]]:
+    """Every command line of ours: in blocks of code, between backticks, in units of systemd."""
+    found = []
+    for page in [*PAGES, *FILES]:
+        text = page.read_text()
+        lines = [line for block in re.findall(r"```\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+        lines += re.findall(r"`(skytether [^`]+)`", text) + re.findall(r"ExecStart=\S*/(skytether .*)", text)
+        found += [(page.name, line.strip()) for line in lines if line.strip().startswith("skytether ")]
+    return found
+
+
+@pytest.mark.parametrize(("page", "line"), commands())
+def test_a_command_of_the_documentation_is_there(page: str, line: str) -> None:
+    words = shlex.split(re.split(r"\\\||[|&>]", line)[0], comments=True)[1:]
+    command: Any = typer.main.get_command(app)
+    while words and hasattr(command, "commands"):
+        name = words.pop(0)
+        if name == "...":
+            return
+        assert name in command.commands, f"{page}: {line}"
+        command = command.commands[name]
+    options = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    for word in words:
+        assert not word.startswith("-") or word.partition("=")[0] in {*options, "-h", "--help"}, f"{page}: {line}"
+
+
+def blocks() -> list[tuple[str, str]]:
+    """Blocks of YAML. One that names a key again and again shows what it may be, line by line."""
+    found = []
+    for page in PAGES:
+        for block in re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL):
+            keys = re.findall(r"^(\w+):", block, re.MULTILINE)
+            several = len(keys) > len(set(keys))
+            parts = re.split(r"^(?=\w)", block, flags=re.MULTILINE) if several else [block]
+            found += [(page.name, part) for part in parts if part.strip()]
+    return found
+
+
+@pytest.mark.parametrize(("page", "block"), blocks())
+def test_yaml_of_the_documentation_is_accepted(page: str, block: str) -> None:
+    for document in yaml.safe_load_all(block):
+        accept(document, page)
+
+
+def accept(document: dict[str, Any], page: str) -> None:
+    """Check it as what it is, with what it leaves out added.
+
+    Raises:
+        ConfigError: It is refused.
+    """
+    if "apiVersion" in document:
+        Manifest.model_validate(document)
+    elif document.keys() <= RelayConfig.model_fields.keys():
+        check_config(document, RelayConfig, page)
+    elif document.keys() & {"role", "paths", "topics"}:
+        check_config({**END, **document}, BridgeConfig, page)
+    else:
+        graph = {"ros1": None} if "ros2" in document else {}
+        check_config(inherit({**ROBOT, **graph, **document}), RobotConfig, page)
