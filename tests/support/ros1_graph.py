@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 from xmlrpc.client import ServerProxy
 
+import psutil
+
 WAIT_S = 30.0
 
 
@@ -131,11 +133,24 @@ class Ros1Graph:
         process.send_signal(number)
         return process.wait(WAIT_S)
 
+    def _running(self) -> list[psutil.Process]:
+        home = str(self.folder)
+        return [
+            process
+            for process in psutil.process_iter(["environ", "status"])
+            if (process.info["environ"] or {}).get("ROS_HOME") == home
+            and process.info["status"] != psutil.STATUS_ZOMBIE
+        ]
+
     def close(self) -> None:
         """End everything that was started here, with all that it started."""
+        # Nodes that roscore and roslaunch start lead sessions of their own: all have our folder in their environment.
+        while left := self._running():
+            for found in left:
+                with contextlib.suppress(psutil.Error):
+                    found.kill()
+            psutil.wait_procs(left, timeout=WAIT_S)
         for process in reversed(self._processes):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             for pipe in (process.stdin, process.stdout, process.stderr):
                 if pipe is not None:

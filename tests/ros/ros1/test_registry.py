@@ -1,5 +1,8 @@
 """What the master is told, with a made-up master."""
 
+import threading
+import time
+
 import pytest
 
 from skytether.ros.ros1.master import MasterError, RefusedError
@@ -104,3 +107,25 @@ def test_the_own_address_is_what_ros_says_or_the_way_to_the_master():
     assert own_host("http://localhost:11311", {"ROS_IP": "10.0.0.2"}) == "10.0.0.2"
     assert own_host("http://127.0.0.1:11311", {}) == "127.0.0.1"
     assert own_host("http://no.such.host.invalid:11311", {}) == "127.0.0.1"
+
+
+def test_what_is_wanted_is_taken_back_at_the_end_whatever_round_is_under_way(master):
+    began, go = threading.Event(), threading.Event()
+
+    class Slow(Entry):
+        def register(self, master):
+            began.set()
+            assert go.wait(30)
+            super().register(master)
+
+    registry = Registry(master, "/me", lambda: "http://me/")
+    registry.want(Slow("a"))
+    registry.start()
+    assert began.wait(30)
+    closing = threading.Thread(target=registry.close)
+    closing.start()
+    while not registry._closing:
+        time.sleep(0.001)
+    go.set()
+    closing.join(30)
+    assert master.told == ["+a", "-a"]

@@ -35,7 +35,7 @@ def test_a_service_drives_a_robot_of_ros_1_and_stops_it_where_the_laser_knows_no
     said = process.stderr.read().decode()
     assert process.wait(30) == 0, said
     wait_for(lambda: walker.speed == 0.0, "the last standstill")
-    assert graph.publishers("/cmd_vel") == []
+    wait_for(lambda: graph.publishers("/cmd_vel") == [], "the node to be gone from the graph")
     assert "driving: cloud" in said
     assert "Traceback" not in said
 

@@ -120,10 +120,11 @@ class Registry:
         while True:
             with self._changed:
                 self._dirty = False
+                last = self._closing  # seen before the round: what is taken back at the end is taken back in it
             self.step()
+            if last:
+                return
             with self._changed:
-                if self._closing:
-                    return
                 self._changed.wait_for(lambda: self._dirty, self._look_s)
 
     def _wake(self) -> None:
