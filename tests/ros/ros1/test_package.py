@@ -11,7 +11,12 @@ from xml.etree import ElementTree
 import pytest
 from ros1_graph import wait_for
 
-PACKAGE = Path(__file__).parents[3] / "ros1" / "skytether"
+ROOT = Path(__file__).parents[3]
+PACKAGE = ROOT / "ros1" / "skytether"
+UNITS = [
+    PACKAGE / "systemd" / "skytether-robot.service",
+    ROOT / "docs" / "examples" / "robot" / "skytether-gate.service",
+]
 
 
 @pytest.fixture
@@ -79,10 +84,18 @@ def test_the_package_s_files_are_what_catkin_and_roslaunch_read():
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
-def test_the_unit_is_one_that_systemd_takes(tmp_path):
-    unit = tmp_path / "skytether-robot.service"
-    text = (PACKAGE / "systemd" / unit.name).read_text()
+@pytest.mark.parametrize("source", UNITS, ids=lambda path: path.name)
+def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
+    unit = tmp_path / source.name
+    text = source.read_text()
     unit.write_text(text.replace("/opt/skytether/bin/skytether", shutil.which("true")))
     checked = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
     assert checked.returncode == 0
     assert unit.name not in checked.stderr
+
+
+def test_agent_and_gate_meet_in_one_folder():
+    folders = {line for unit in UNITS for line in unit.read_text().splitlines() if "XDG_RUNTIME_DIR" in line}
+    assert folders == {"Environment=XDG_RUNTIME_DIR=/run"}
+    assert "RuntimeDirectory=skytether" in UNITS[1].read_text().splitlines()
+    assert {"User=skytether"} == {line for unit in UNITS for line in unit.read_text().splitlines() if "User=" in line}
