@@ -255,6 +255,23 @@ def test_a_log_is_followed_until_its_run_ends(docker_site: DockerSite, runtime: 
     assert runtime.follow("i1", 2) is None
 
 
+def test_what_it_uses_is_told_while_it_runs(docker_site: DockerSite, runtime: DockerRuntime) -> None:
+    runtime.start(launch(docker_site, params={"hog_mb": 20}))
+    until_phase(runtime, Phase.RUNNING)
+    seen = until(lambda: runtime.observe()["i1"] if runtime.observe()["i1"].cpu_s is not None else None)
+    assert seen.cpu_s > 0.001
+    assert seen.memory_bytes > 20 << 20
+    with socket.socket(type=socket.SOCK_DGRAM) as robot:
+
+        def received() -> bool:
+            robot.sendto(b"x" * 1000, (seen.host, seen.port))
+            return runtime.observe()["i1"].received_bytes > seen.received_bytes + 5000
+
+        until(received)
+    runtime.stop("i1", force=True)
+    assert until_phase(runtime, Phase.EXITED).cpu_s is None
+
+
 def test_a_port_that_is_taken(docker_site: DockerSite, tmp_path: Path) -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

@@ -20,6 +20,7 @@ from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
+from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
 from skytether.orchestrator.runtimes.docker.objects import (
     Seen,
@@ -229,6 +230,20 @@ def test_a_failed_health_check_is_told_in_its_own_words() -> None:
         well = parse(described(Health={"Status": status, "Log": log}))
         assert well is not None
         assert well.ill == ""
+
+
+def test_what_a_container_uses() -> None:
+    message = {
+        "cpu_stats": {"cpu_usage": {"total_usage": 1_500_000_000}},
+        "memory_stats": {"usage": 5000, "stats": {"inactive_file": 1000}},
+        "networks": {"eth0": {"rx_bytes": 1, "tx_bytes": 2}, "eth1": {"rx_bytes": 10, "tx_bytes": 20}},
+    }
+    assert usage_of(message) == Usage(1.5, 4000, 11, 22)
+    assert usage_of({**message, "networks": None}) == Usage(1.5, 4000, 0, 0)
+    assert usage_of({"memory_stats": {}}) is None  # it has ended
+    assert usage_of({**message, "memory_stats": {"usage": 1, "stats": {"total_inactive_file": 7}}}) == Usage(
+        1.5, 0, 11, 22
+    )
 
 
 def tar_of(content: bytes) -> bytes:

@@ -33,7 +33,9 @@ def topic(name: str = "scan", **more: Any) -> TopicReport:
 
 def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord, manifest: Any) -> None:
     record = record_with(new_record, manifest, "scan")
-    running = [Running(record, Observation(1, Phase.RUNNING, cpu_s=1.5, memory_bytes=1000))]
+    running = [
+        Running(record, Observation(1, Phase.RUNNING, cpu_s=1.5, memory_bytes=1000, received_bytes=70, sent_bytes=30))
+    ]
     metrics, report = reported(running)
     metrics.phase(record, "total", 0.4)
     metrics.refused("toy", [Refusal(site="far", reason="rtt", detail="")])
@@ -65,6 +67,8 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "instance_start_seconds",
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
+        "instance_network_receive_bytes_total",
+        "instance_network_transmit_bytes_total",
         "placement_refusals_total",
         "reconcile_pass_seconds",
     }
@@ -75,6 +79,8 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
     assert sample(text, "control_source", 'robot="walker",service="toy",source="fallback"') == 1
     assert sample(text, "control_source", 'robot="walker",service="toy",source="cloud"') == 0
     assert sample(text, "instance_cpu_seconds_total", 'robot="walker",service="toy",site="lab"') == 1.5
+    assert sample(text, "instance_network_receive_bytes_total", 'robot="walker",service="toy",site="lab"') == 70
+    assert sample(text, "instance_network_transmit_bytes_total", 'robot="walker",service="toy",site="lab"') == 30
     where = 'direction="in",priority="100",quantile="0.99",robot="walker",service="toy",topic="scan"'
     assert sample(text, "topic_one_way_delay_seconds", where) == 0.2
 

@@ -139,15 +139,22 @@ class Metrics(Collector):
 
 
 def _instances(running: Iterable[Running]) -> Iterator[Metric]:
-    cpu, memory = Sums(), Sums()
+    cpu, memory, received, sent = Sums(), Sums(), Sums(), Sums()
     for one in running:
         labels = (one.record.robot, one.record.service, one.record.site or "")
         if one.observation and one.observation.cpu_s is not None:
             cpu.add(labels, one.observation.cpu_s)
         if one.observation and one.observation.memory_bytes is not None:
             memory.add(labels, one.observation.memory_bytes)
+        if one.observation and one.observation.received_bytes is not None:
+            received.add(labels, one.observation.received_bytes)
+        if one.observation and one.observation.sent_bytes is not None:
+            sent.add(labels, one.observation.sent_bytes)
     yield counter("instance_cpu_seconds", "Processor time of the present runs", INSTANCE, cpu)
     yield gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
+    text = "By the network, of the present runs; containers only"
+    yield counter("instance_network_receive_bytes", text, INSTANCE, received)
+    yield counter("instance_network_transmit_bytes", text, INSTANCE, sent)
 
 
 def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Metric]:

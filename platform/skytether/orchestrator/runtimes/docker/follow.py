@@ -19,6 +19,7 @@ from docker.errors import APIError, NotFound
 
 from ..base import RuntimeFailure
 from .engine import Engine
+from .meter import Meter
 from .objects import OWNER, READY, Seen, carried_over, last_line, parse, ready_port
 
 log = logging.getLogger(__name__)
@@ -53,6 +54,7 @@ class Follower:
         self._closing = threading.Event()
         self._stream: Any = None
         self._info: Mapping[str, Any] = {}
+        self.meter = Meter(engine)
         self._thread = threading.Thread(target=self._run, name="docker-events", daemon=True)
 
     def start(self) -> None:
@@ -62,6 +64,7 @@ class Follower:
         """Stop following; returns when nothing is read any more."""
         self._closing.set()
         self._end_stream()
+        self.meter.close()
         if self._thread.is_alive():
             self._thread.join(_QUIET_S)
 
@@ -93,6 +96,7 @@ class Follower:
 
     def forget(self, container: str) -> None:
         """It is gone."""
+        self.meter.forget(container)
         with self._lock:
             self._seen.pop(container, None)
 
@@ -118,7 +122,12 @@ class Follower:
                 self._seen.pop(container, None)
             else:
                 self._seen[container] = seen
-        if seen is not None and seen.runs and not seen.ready:
+        if seen is None or not seen.runs:
+            self.meter.forget(container)
+            return seen
+        if not self._closing.is_set():
+            self.meter.follow(container)
+        if not seen.ready:
             self._await_ready(container)
         return seen
 
@@ -176,6 +185,7 @@ class Follower:
             gone = self._seen.keys() - there
             for container in gone:
                 del self._seen[container]
+                self.meter.forget(container)
         for container in there:
             seen = self.look(container)
             if not self._connected and seen is not None and seen.runs and not seen.ready:

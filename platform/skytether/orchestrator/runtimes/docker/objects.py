@@ -6,13 +6,14 @@ import io
 import json
 import tarfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec
 
 from ..base import Launch, Observation, Phase
+from .meter import Usage
 from .options import DockerOptions
 
 USER = 65_532
@@ -262,7 +263,7 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
     )
 
 
-def observation(seen: Seen, options: DockerOptions) -> Observation:
+def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None) -> Observation:
     """What the contract calls it."""
     if seen.ended:
         return Observation(
@@ -273,7 +274,8 @@ def observation(seen: Seen, options: DockerOptions) -> Observation:
             detail=_how_it_ended(seen),
         )
     if seen.runs and seen.ready and seen.host_port is not None:
-        return Observation(seen.attempt, Phase.RUNNING, options.advertised, seen.host_port, detail=seen.ill)
+        used = asdict(usage) if usage is not None else {}
+        return Observation(seen.attempt, Phase.RUNNING, options.advertised, seen.host_port, detail=seen.ill, **used)
     return Observation(seen.attempt, Phase.STARTING)
 
 

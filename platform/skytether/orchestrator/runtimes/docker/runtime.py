@@ -108,7 +108,12 @@ class DockerRuntime(Runtime):
             if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
                 newest[seen.instance] = seen
         # One that was made and not begun is no run: the orchestrator was killed in between, or a job is just at it.
-        found = {i: observation(s, self._options) for i, s in newest.items() if s.status != "created"}
+        meter = self._follower.meter
+        found = {
+            instance: observation(seen, self._options, meter.usage(seen.id))
+            for instance, seen in newest.items()
+            if seen.status != "created"
+        }
         with self._lock:
             jobs = dict(self._jobs)
         for instance, job in jobs.items():
