@@ -182,7 +182,8 @@ def test_topic_tools_image_proc_and_robot_state_publisher_run_as_a_service(graph
         wait_for(lambda: len(robot.heard["slow"]) > before, "what is throttled")
         assert len(robot.heard["slow"]) < len(robot.heard["echo"])
         assert [instance.state for instance in orchestrator.client.instances()] == ["running"]
-        ours = programs(launch)
+        home = home_of(launch)
+        ours = programs(home)
         assert {"relay", "throttle", "robot_state_publisher", "image_proc"} <= {Path(p).name for p in ours}
     finally:
         log = "".join(orchestrator.client.logs(instance.id) for instance in orchestrator.client.instances())
@@ -191,17 +192,21 @@ def test_topic_tools_image_proc_and_robot_state_publisher_run_as_a_service(graph
         sys.stdout.write(log + said)  # shown if it failed
         robot.close()
     assert "Traceback" not in said
-    wait_for(lambda: not programs(launch), "all nodes to end with the instance")
+    wait_for(lambda: not programs(home), "all nodes to end with the instance")
 
 
-def programs(launch):
-    """Command lines of nodes whose roslaunch was given our file, and of that: by the folder that they all log to."""
-    found = []
-    for process in psutil.process_iter(["cmdline", "environ"]):
-        environment = process.info["environ"] or {}
-        if "skytether-ros-" in environment.get("ROS_HOME", "") and process.info["cmdline"]:
-            found.append(process.info["cmdline"][0])
-    return found
+def home_of(launch):
+    """The folder of the graph that runs our launch file."""
+    running = psutil.process_iter(["cmdline", "environ"])
+    return next(p.info["environ"]["ROS_HOME"] for p in running if str(launch) in (p.info["cmdline"] or ()))
+
+
+def programs(home):
+    """What runs in the graph with this folder."""
+    running = psutil.process_iter(["cmdline", "environ"])
+    return [
+        p.info["cmdline"][0] for p in running if (p.info["environ"] or {}).get("ROS_HOME") == home and p.info["cmdline"]
+    ]
 
 
 @pytest.fixture
