@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 from docker.errors import APIError, NotFound
 
@@ -108,7 +108,8 @@ class Job:
         self.detail = ""
         self._go_on()
         self._prepare()
-        with _ONE_AT_A_TIME:
+        chooses = self._options.ports is not None or self.launch.spec.needs.gpu > 0
+        with _ONE_AT_A_TIME if chooses else nullcontext():
             self._go_on()
             made = self._create(image)
         if self._cancelled.is_set():
