@@ -151,6 +151,7 @@ links = st.builds(
 spells = st.lists(st.tuples(links, st.floats(0.001, 2.5)), max_size=12)
 
 
+@pytest.mark.slow
 @given(spells)
 @settings(max_examples=300, deadline=None)
 def test_it_never_goes_to_the_cloud_faster_than_the_hysteresis_and_never_on_stale_commands(spells):

@@ -38,6 +38,7 @@ def walk(*, rtt: float, loss: float = 0.0, seed: int = 1, duration: float = 46.0
     return world, measure(samples, TRAIL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rtt", "loss"),
     [(0.0, 0.0), (0.1, 0.05), (0.3, 0.0), (0.5, 0.3)],

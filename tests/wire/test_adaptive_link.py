@@ -127,6 +127,7 @@ def test_jitter_on_a_link_of_20_mbit(world, seed, seconds):
     assert measured.p99["camera"] <= 0.19
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_jitter_that_keeps_the_order_costs_rate_and_nothing_above_the_camera(world, seed):
     # It spreads a frame as a slower link does, and is at times taken for one.
@@ -143,6 +144,7 @@ def test_bursts_of_four(world, seed, seconds):
     assert measured.delivered["camera"] >= 0.97
 
 
+@pytest.mark.slow
 @short_and_long(1, 2, 3)
 def test_thirty_percent(world, seed, seconds):
     measured = Measured(world, link_of("loss-30%"), seed=seed, seconds=seconds)
@@ -157,6 +159,7 @@ def test_a_clean_link_costs_next_to_nothing(world):
     assert measured.rate == 100e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_machine_that_pauses_costs_no_rate(world, seed):
     measured = Measured(world, link_of("50ms-1%"), seed=seed, seconds=8.0, pauses=0.7)

@@ -77,6 +77,7 @@ def test_any_bytes(live, data, segment, path):
         assert state(live, role) == before
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32))
 @settings(max_examples=40)
 def test_plausible_forgeries_alone_and_in_batches(live, seed):
@@ -191,6 +192,7 @@ def test_a_stranger_cannot_bring_an_end_up(make_world, seed):
     assert service.next_timer() is None
 
 
+@pytest.mark.slow
 def test_memory_of_a_flooded_end_is_bounded(make_world):
     """Forged shards of all sizes, forged and repeated HELLOs, what was sent before: measured, not counted."""
     config = Config(max_message=100_000, reassembly_limit=400_000, queue_limit=200_000)

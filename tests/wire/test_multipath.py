@@ -154,6 +154,7 @@ def test_a_much_worse_path_is_left_and_one_as_bad_is_not(two):
         assert [e for _, e in link.events[role] if isinstance(e, PathSwitched)][-1:] == [PathSwitched(1, "better")]
 
 
+@pytest.mark.slow
 def test_losses_alone_make_no_path_flap(two):
     lossy = LinkConditions(delay=0.02, loss=0.05, seed=3)
     link = two(first=lossy, second=LinkConditions(delay=0.022, loss=0.05, seed=4))

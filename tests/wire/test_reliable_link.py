@@ -42,6 +42,7 @@ conditions = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(
     up=conditions, down=conditions, outages=st.lists(st.tuples(st.floats(0, 3), st.floats(0.05, 2.5)), max_size=3),
     seed=st.integers(0, 2**32), new_keys=st.booleans(),
@@ -161,6 +162,7 @@ def test_memory_of_the_sender_is_bounded(world):
     assert streams.outbox("event").used == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [4 * 2**20, pytest.param(16 * 2**20, marks=pytest.mark.slow)])
 def test_a_large_map_over_a_bad_link_hurts_no_velocity_command(make_world, size):
     bad = LinkConditions(delay=0.05, loss=0.05)

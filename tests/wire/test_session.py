@@ -75,6 +75,7 @@ conditions = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(
     up=conditions, down=conditions, corrupt=st.sampled_from([0.0, 0.05]), mtu=st.sampled_from([512, 1200, 9000]),
     seed=st.integers(0, 2**32),
@@ -156,6 +157,7 @@ def test_the_books_balance_in_the_end(make_world, topics, bad, seed):
             assert row.delivered == len(traffic.delivered(row.topic))
 
 
+@pytest.mark.slow
 def test_delivery_meets_its_target_at_the_assumed_loss(world, topics):
     loss = LinkConditions(delay=0.02, loss=0.05, seed=5)
     link = world.link(connect=False, up=loss, down=loss)
@@ -326,6 +328,7 @@ def test_delays_are_right_within_their_stated_error(world, clock):
     assert path.rtt_p50 == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.slow
 def test_both_ends_know_the_losses_of_both_directions(world):
     up, down = LinkConditions(loss=0.1, seed=1), LinkConditions(loss=0.03, burst=3, seed=2)
     link = world.link(connect=False, up=up, down=down)

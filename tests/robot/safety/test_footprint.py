@@ -107,6 +107,7 @@ shapes = st.sampled_from([SQUARE, circle(0.3), polygon([(0.6, 0.0), (-0.2, 0.3),
 speeds = st.one_of(st.just(0.0), st.floats(-1, 1).filter(lambda v: abs(v) > 1e-3))
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(shapes, st.tuples(st.floats(-2, 2), st.floats(-2, 2)), speeds, speeds)
 def test_contact_is_where_a_simulation_with_small_steps_finds_it(shape: Footprint, point, linear, angular):

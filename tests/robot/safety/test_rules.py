@@ -378,6 +378,7 @@ legs = st.lists(st.tuples(st.floats(-0.6, 0.9), st.floats(-1.5, 1.5), st.integer
 things = st.lists(st.tuples(st.floats(0.42, 2.0), st.floats(-math.pi, math.pi)), min_size=1, max_size=12)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(legs, things)
 def test_no_sequence_of_commands_drives_the_robot_into_anything(legs, things):
