@@ -80,6 +80,9 @@ ros1:
         ("ros1: {params: ['/a//b']}", "params.0: '/a//b' is no name"),
         ("ros1: {readings: {force: std_msgs/msg/Nothing}}", "ros1.readings: force: no message type"),
         ("ros1: {idle_s: 0}", "ros1.idle_s"),
+        ("ros1: {}\nparams: {speeds: [1, .nan]}", "params: speeds.1: must be a finite number, not nan"),
+        ("ros1: {}\nparams: {since: 2020-01-01}", "params: since: must be text, a number, true or false"),
+        ("ros1: {}\nfallback: {name: path, options: {speed: .inf}}", "fallback.options: speed: must be a finite number"),
     ],
 )
 def test_a_mistake_is_named_by_its_key(read, text, says):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import difflib
 import os
 from dataclasses import fields
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from skytether.api.manifest import Name, Strict
 from skytether.messages import type_of
@@ -25,6 +26,19 @@ from .ros2_config import Ros2Graph
 DEFAULT_MASTER = "http://localhost:11311"
 
 
+def _plain(value: Any, place: str = "") -> Any:
+    """Refuse what JSON has no word for: a NaN would reach the service as null."""
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            _plain(inner, f"{place}{key}.")
+    elif isinstance(value, float) and not isfinite(value):
+        raise ValueError(f"{place[:-1]}: must be a finite number, not {value}")
+    elif value is not None and not isinstance(value, bool | int | float | str):
+        raise ValueError(f"{place[:-1]}: must be text, a number, true or false, not {value!r:.40}; quote what is text")
+    return value
+
+
+PlainValues = Annotated[dict[str, Any], AfterValidator(_plain)]
 Weight = Annotated[float, Field(ge=0, le=1e6)]
 _POLICY = Policy()
 
@@ -34,7 +48,7 @@ class FallbackConfig(Strict):
 
     name: Annotated[str, Field(min_length=1)] = "stop"
     """Entry point of the group ``skytether.fallbacks``."""
-    options: dict[str, Any] = {}
+    options: PlainValues = {}
 
 
 class GraphConfig(Strict):
@@ -166,7 +180,7 @@ class RobotConfig(Strict):
     token_file: Path
     """Holds the token that the registration printed; relative to this file's folder."""
     service: Name
-    params: dict[str, Any] = {}
+    params: PlainValues = {}
     """The service's."""
     command_topic: Annotated[str, Field(min_length=1)] = "cmd_vel"
     """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
