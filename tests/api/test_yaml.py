@@ -21,6 +21,12 @@ def test_all_documents_are_read_and_merges_may_repeat_keys(tmp_path: Path) -> No
         (b"a: 2001-99-99", "is no YAML"),
         (b"[" * 100_000, "is no YAML"),
         (b"x" * (1 << 20) + b"x", "is larger than 1048576 bytes"),
+        (b"a: &a {b: [*a]}", "an alias stands for what it is part of"),
+        (
+            b"a: &a [1, 1, 1, 1]\n"
+            + b"".join(b"%c: &%c [%s]\n" % (n, n, b", ".join([b"*%c" % (n - 1)] * 9)) for n in b"bcdefghi"),
+            "an alias stands for what it is part of, or for far too much",
+        ),
         (b"!!python/object/apply:os.system [ls]", "is no YAML in line 1"),
     ],
 )

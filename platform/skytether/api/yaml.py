@@ -9,6 +9,8 @@ from typing import Any
 import yaml
 
 _MAX_BYTES = 1 << 20
+_MAX_VALUES = _MAX_BYTES
+"""Of a document with its aliases written out. Without aliases there are never so many: each takes a byte at least."""
 
 
 class YamlError(Exception):
@@ -68,8 +70,24 @@ def parse_yaml(text: bytes, path: Path) -> list[Any]:
     if len(text) > _MAX_BYTES:
         raise YamlError(f"{path}: is larger than {_MAX_BYTES} bytes: that is nothing people write")
     try:
-        return [document for document in yaml.load_all(text, _Loader) if document is not None]
+        documents = [document for document in yaml.load_all(text, _Loader) if document is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         raise YamlError(f"{path}: is no YAML{where}: {getattr(error, 'problem', None) or 'it is no text'}") from error
+    if any(map(_is_endless, documents)):
+        raise YamlError(f"{path}: an alias stands for what it is part of, or for far too much; write it out")
+    return documents
+
+
+def _is_endless(document: Any) -> bool:
+    """Whether aliases make more of it than anybody could read: whoever walks through it would not come back."""
+    left, waiting = _MAX_VALUES, [document]
+    while waiting:
+        value = waiting.pop()
+        inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+        left -= len(inner)
+        if left < 0:
+            return True
+        waiting.extend(inner)
+    return False
