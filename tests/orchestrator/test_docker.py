@@ -132,7 +132,7 @@ def test_a_container_reaches_nobody(
     network = json.loads(docker("network", "inspect", docker_site.network))[0]
     gateway = network["IPAM"]["Config"][0]["Gateway"]
     neighbour = network["Containers"][other]["IPv4Address"].partition("/")[0]
-    tried = [(host, host_ports["tcp"]) for host in {gateway, *addresses()}] + [(neighbour, 22), ("192.0.2.1", 80)]
+    tried = [(host, host_ports["tcp"]) for host in (gateway, *addresses())] + [(neighbour, 22), ("192.0.2.1", 80)]
     # The same question from a container on the engine's own network shows that it is a good one.
     asked = _TRY.replace("TRIED", repr(tried[:1]))
     free = docker("run", "--rm", "--entrypoint", PYTHON, docker_site.images.toy, "-c", asked)
