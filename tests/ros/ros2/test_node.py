@@ -54,6 +54,31 @@ def test_a_message_goes_to_ros2_and_shows_in_its_graph(stage):
     stage.until(lambda: not rmw.sees("MP", "/chatter"), "the token stayed")
 
 
+def test_a_publisher_may_be_closed_while_messages_are_put(stage):
+    rmw = stage.rmw("listener")
+    node = stage.ours()
+    for _ in range(5):
+        publication, ended = node.publish(chatter(Kind.PUBLISHER)), threading.Event()
+        putting = [threading.Thread(target=put_until, args=(publication, ended)) for _ in range(3)]
+        stage.until(lambda: rmw.sees("MP", "/chatter"), "no token")
+        for thread in putting:
+            thread.start()
+        try:
+            time.sleep(0.02)
+            publication.close()
+            stage.until(lambda: not rmw.sees("MP", "/chatter"), "the token stayed")
+        finally:
+            ended.set()
+            for thread in putting:
+                thread.join()
+    assert not node.troubles
+
+
+def put_until(publication, ended):
+    while not ended.is_set():
+        publication.put(bytes(50_000))
+
+
 def test_a_message_comes_from_ros2(stage):
     got = []
     node = stage.ours()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import logging
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -95,6 +96,11 @@ class Publication(Handle):
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 
+    def __init__(self, host: Host, endpoint: Endpoint) -> None:
+        super().__init__(host, endpoint)
+        self._using = threading.RLock()
+        """A publisher of Zenoh's must not be undeclared while another thread puts something."""
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         if self.endpoint.qos.transient_local:
@@ -108,13 +114,13 @@ class Publication(Handle):
         return sent
 
     def _send(self, payload: bytes | memoryview) -> bool:
-        publisher = self._publisher
-        if publisher is None:
-            return False
-        try:
-            publisher.put(bytes(payload), attachment=self._attachment())
-        except zenoh.ZError:  # being undeclared
-            return False
+        with self._using:
+            if self._publisher is None:
+                return False
+            try:
+                self._publisher.put(bytes(payload), attachment=self._attachment())
+            except zenoh.ZError:  # the session is gone
+                return False
         return True
 
     def _declare(self, session: zenoh.Session) -> list[Any]:
@@ -142,7 +148,8 @@ class Publication(Handle):
         return [self._publisher]
 
     def retract(self) -> None:
-        self._publisher = None
+        with self._using:
+            self._publisher = None
 
 
 class Subscription(Handle):
