@@ -9,7 +9,7 @@ import pytest
 from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.api.rest import Session, TopicReport
-from skytether.bridge import BridgeError
+from skytether.bridge import BridgeError, topics_from_api
 from skytether.messages import WrenchStamped, type_hash
 from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.arbiter import Reason
@@ -162,6 +162,53 @@ def test_while_the_cloud_drives_another_session_takes_over_with_its_first_comman
     rig.agent.watch(rig.now)
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
     assert len(rig.agent.status().driver.transitions) == 2  # the start, and the cloud: no hand-over in between
+
+
+class OneAtATime:
+    """A graph whose topics go to the session that was opened last."""
+
+    encoding = "cdr"
+
+    def __init__(self):
+        self.opened = 0
+
+    def open(self, specs, _command_topic):
+        self.opened += 1
+        return topics_from_api(specs), self
+
+    def attach(self, publisher):
+        pass
+
+    def deliver(self, message):
+        pass
+
+    def notify(self, event):
+        pass
+
+
+def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orchestrator, make_cloud):
+    def drive():
+        cloud = make_cloud(rig.agent._driver.session)
+        for _ in range(500):
+            cloud.send(rig.now)
+            rig.tick()
+        assert rig.agent.source is Source.CLOUD
+
+    rig.agent._graph = graph = OneAtATime()
+    rig.ask()
+    kept, old = rig.agent.status().instance, rig.agent._driver.session
+    drive()
+    orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
+    rig.ask()
+    rig.agent._stayed(kept, "the other one never commanded")
+    assert [endpoint.running for endpoint in rig.bridges] == [False, False]
+    rig.tick()
+    assert rig.agent.source is Source.FALLBACK
+    orchestrator.session = SESSION
+    rig.ask()
+    assert (rig.agent._driver.session.id, graph.opened) == (old.id, 3)
+    assert rig.bridges[-1].running
+    drive()
 
 
 def test_a_bridge_that_cannot_be_opened_is_said_once_and_tried_again(rig, monkeypatch, caplog, make_bridge):

@@ -348,6 +348,11 @@ class Agent:
     def _stayed(self, instance: rest.Instance, reason: str) -> None:
         """What was to take over does not."""
         serving = self._driver.session
+        if self._graph is not None and len(self._open_sessions) > 1:
+            # The graph's topics went to the session that is given up: the one that serves is joined anew.
+            self._drop_sessions()
+            self._served = ""
+            serving = None
         if serving is not None:
             self._driver.let_go()
             self._driver.session = serving
