@@ -46,7 +46,7 @@ class ZenohTransport(Transport):
         self._publishers: dict[int, zenoh.Publisher] = {}
 
     def start(self) -> None:
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or("off")  # it writes to standard output, where rows are printed
         self._session = session = zenoh.open(self._config())
         for index in self.spec.receives:
             session.declare_subscriber(f"bench/{index}", self._receiver(index))
