@@ -3,8 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-# A busy machine can make a test on real sockets or processes miss its moment: it is run again, and reported as such.
+# A busy machine can make a test on real sockets or processes miss its moment: what failed is run again, and reported as such.
 AGAIN := --reruns 2 --reruns-delay 3
+UNIT := $(BIN)/pytest -m "not slow"
 
 .PHONY: demo test unit images fuzz check fmt docs lock clean
 
@@ -12,11 +13,11 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
-	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile $(AGAIN)
+	$(UNIT) -n 2 --dist loadfile || { echo "once more, those that failed:"; $(UNIT) --last-failed; }
 	$(BIN)/pytest -m slow $(AGAIN)
 
 unit: $(READY) ## the quick part, under a minute
-	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+	$(UNIT) -n 2 --dist loadfile
 
 images: $(READY) ## the container images, on the Docker engine of this machine; prints build time and size of each
 	$(BIN)/python images/build.py
