@@ -56,6 +56,7 @@ def run(tmp_path):
         signal.signal(number, handler)
 
 
+@pytest.mark.slow
 def test_both_ends_in_one_process_measure_each_other(run):
     result = run(BOTH | {"link": {"up": {"delay_ms": 20}, "down": {"delay_ms": 10}}}, "--seconds", "1.2", "--json")
     assert result.exit_code == 0, result.output

@@ -34,6 +34,7 @@ def run(tmp_path):
         signal.signal(number, handler)
 
 
+@pytest.mark.slow
 def test_json_lines_tell_what_is_forwarded(run):
     config = {
         "listen": {"host": "127.0.0.1"},

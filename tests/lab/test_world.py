@@ -75,6 +75,7 @@ def unguided(seed: int) -> Measures:
     return measure(simulate(World(TRAIL, seed=seed), Unguided(), duration=60.0), TRAIL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_person_finishes_without_guidance_but_less_exactly(seed: int) -> None:
     result = unguided(seed)

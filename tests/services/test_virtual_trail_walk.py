@@ -54,6 +54,7 @@ def test_guides_along_the_trail(rtt: float, loss: float) -> None:
     assert math.dist(world.pose[:2], TRAIL.end[:2]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
     class Restarting(Remote):
         def step(self, now: float) -> Twist | None:
@@ -69,6 +70,7 @@ def test_a_restarted_service_goes_on_where_the_walker_is() -> None:
     assert result.kte_m < 0.03
 
 
+@pytest.mark.slow
 def test_finds_back_from_beside_the_trail() -> None:
     world = World(TRAIL, seed=3)
     world.walker.pose = world.walker.odometry = world.pose._replace(y=0.4, heading=0.3)

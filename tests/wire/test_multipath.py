@@ -216,6 +216,7 @@ def test_a_false_path_number_opens_nothing(two):
     assert all(p.address != "thief" for p in link.sessions[SERVICE].stats(link.now).paths)
 
 
+@pytest.mark.slow
 def test_more_paths_than_an_end_keeps(two):
     link = two()
     for path in range(2, 20):

@@ -131,6 +131,7 @@ def check_accounts(link, settled):
                 assert row.bytes_sent == theirs[name].bytes_sent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     "bad",

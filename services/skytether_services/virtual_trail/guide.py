@@ -24,6 +24,8 @@ _JUMP = 0.25
 _STRONGEST = 500.0
 """No person pushes harder, N; a broken sensor must not charge the filter for seconds."""
 
+_MOST_ANGLE = 1e9
+"""Of a wheel [rad]: it would have rolled round the earth more than once."""
 _LONGEST_STEP = 0.05
 """A step that comes later than this after the last one counts as this, s: a stalled machine makes no leap."""
 
@@ -90,8 +92,9 @@ class Guide:
             self._force = (min(max(total / 2, -_STRONGEST), _STRONGEST), now)
 
     def wheels(self, sample: Wheels, now: float) -> None:
-        """Take new wheel angles that arrived now; what is not finite or not new is ignored."""
-        if all(map(math.isfinite, sample)) and self._odometry.wheels(sample):
+        """Take new wheel angles that arrived now; what is no angle of a wheel, or not new, is ignored."""
+        rolled = all(abs(angle) <= _MOST_ANGLE for angle in (sample.left, sample.right))  # false for NaN, too
+        if math.isfinite(sample.stamp) and rolled and self._odometry.wheels(sample):
             self._wheels_at = now
 
     def odometry(self, stamp: float, pose: Pose) -> None:
