@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import json
+import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from orchestrator_program import Program, until, with_toy
 
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import InstanceCreate, RobotCreate
+from skytether.orchestrator.logs import TextFormatter
 
 pytestmark = pytest.mark.slow
 
@@ -129,3 +131,10 @@ def test_a_robot_that_asks_too_often_is_told_to_wait(program: Callable[..., Prog
         assert int(refused[0].headers["retry-after"]) >= 1
         assert "too many requests" in refused[0].json()["detail"]
         assert len([operator.sites() for _ in range(20)]) == 20  # an operator is not limited
+
+
+def test_what_others_send_is_no_line_of_its_own() -> None:
+    path = "/api/v1/sites/x\n2026-11-22 operator 10.0.0.1 DELETE /api/v1/sites/edge 204\x1b[2J"
+    record = logging.LogRecord("skytether.audit", logging.INFO, "", 0, "%s", (path,), None)
+    text = TextFormatter("%(levelname)s: %(message)s").format(record)
+    assert text == "INFO: /api/v1/sites/x\\n2026-11-22 operator 10.0.0.1 DELETE /api/v1/sites/edge 204\\x1b[2J"

@@ -94,3 +94,17 @@ def test_a_schema_that_is_none_names_the_key() -> None:
     with pytest.raises(InvalidError) as caught:
         check_schema({"properties": {"mass": {"type": "nmber"}}}, "spec.params")
     assert caught.value.faults[0].key == "spec.params.properties.mass.type"
+
+
+@pytest.mark.parametrize("reference", ["#/nope", "http://127.0.0.1:1/s.json", "#nothing"])
+def test_a_reference_to_nothing_names_the_key(reference: str) -> None:
+    check_schema({"properties": {"a": {"$ref": "#/$defs/b"}}, "$defs": {"b": {"$anchor": "c"}}, "$ref": "#c"}, "p")
+    with pytest.raises(InvalidError) as caught:
+        check_schema({"properties": {"a": {"$ref": reference}}}, "spec.params")
+    text = f"there is no '{reference}' in this schema, and nothing is fetched from elsewhere"
+    assert str(caught.value) == f"spec.params.properties.a.$ref: {text}"
+
+
+def test_a_schema_that_refers_to_itself_without_end_is_refused() -> None:
+    with pytest.raises(InvalidError, match=r"s: spec\.params: the schema refers to itself without end"):
+        check_params({"a": 1}, {"$ref": "#"}, "s")

@@ -27,7 +27,7 @@ RESULT_LIFESPAN_MS = 3_600_000
 class Strict(BaseModel):
     """Base of everything that people or programs send us: no unknown keys, no silent changes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
 
 class TopicSpec(Strict):

@@ -31,9 +31,9 @@ class State(StrEnum):
 class Measurement(Strict):
     """What a robot measured towards one site."""
 
-    rtt_ms: Annotated[float, Field(ge=0)] | None = None
+    rtt_ms: Annotated[float, Field(ge=0, le=3_600_000)] | None = None
     """Median round trip."""
-    jitter_ms: Annotated[float, Field(ge=0)] | None = None
+    jitter_ms: Annotated[float, Field(ge=0, le=3_600_000)] | None = None
     """How much longer a slow one takes than the median."""
     loss: Annotated[float, Field(ge=0, le=1)] | None = None
     preferred: bool = False

@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from .plain import oddity
+
 _MAX_BYTES = 1 << 20
 _MAX_VALUES = _MAX_BYTES
 """Of a document with its aliases written out. Without aliases there are never so many: each takes a byte at least."""
@@ -35,16 +37,20 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> list[Any]:
-    """All documents of a file that hold anything.
+    """All documents of a file that hold anything, of what can be sent as JSON.
 
     Raises:
-        YamlError: It cannot be read, is too large, or is no YAML.
+        YamlError: It cannot be read, is too large, is no YAML, or holds what JSON has no word for.
     """
     try:
         text = read_bounded(path)
     except OSError as error:
         raise YamlError(f"{path}: cannot be read: {error.strerror}") from error
-    return parse_yaml(text, path)
+    documents = parse_yaml(text, path)
+    fault = next(filter(None, map(oddity, documents)), None)
+    if fault is not None:
+        raise YamlError(f"{path}: {fault}")
+    return documents
 
 
 def read_bounded(path: Path) -> bytes:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 import os
 from dataclasses import fields
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from skytether.api.manifest import Name, Strict
+from skytether.api.plain import oddity
 from skytether.messages import type_of
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.status import DEFAULT_PORT
@@ -26,16 +26,11 @@ from .ros2_config import Ros2Graph
 DEFAULT_MASTER = "http://localhost:11311"
 
 
-def _plain(value: Any, place: str = "") -> Any:
-    """Refuse what JSON has no word for: a NaN would reach the service as null."""
-    if isinstance(value, dict | list):
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            _plain(inner, f"{place}{key}.")
-    elif isinstance(value, float) and not isfinite(value):
-        raise ValueError(f"{place[:-1]}: must be a finite number, not {value}")
-    elif value is not None and not isinstance(value, bool | int | float | str):
-        raise ValueError(f"{place[:-1]}: must be text, a number, true or false, not {value!r:.40}; quote what is text")
-    return value
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    fault = oddity(values)
+    if fault is not None:
+        raise ValueError(str(fault))
+    return values
 
 
 PlainValues = Annotated[dict[str, Any], AfterValidator(_plain)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 
 import skytether
 
@@ -10,6 +10,7 @@ from . import problems
 from .core import Orchestrator
 from .logs import Audit
 from .routers import catalog, health, instances, robots, sites, tokens
+from .routers.deps import plain_request
 
 
 def create_app(core: Orchestrator) -> FastAPI:
@@ -18,6 +19,7 @@ def create_app(core: Orchestrator) -> FastAPI:
         title="Skytether",
         version=skytether.__version__,
         description="Ask for services for robots; see what runs where, and how well.",
+        dependencies=[Depends(plain_request)],
     )
     app.state.core = core
     problems.install(app, core.settings.limits.body_bytes)

@@ -23,6 +23,14 @@ _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)
 
 
+class TextFormatter(logging.Formatter):
+    """One line each, and an exception's lines after it: what others sent cannot look like a line of its own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 (logging's name)
+        """The line, with control characters as escapes."""
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in super().formatMessage(record))
+
+
 class JsonFormatter(logging.Formatter):
     """One object a line."""
 
@@ -47,7 +55,7 @@ def set_up(logs: Logs) -> None:
         OSError: The audit file cannot be written.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if logs.format == "json" else logging.Formatter(_TEXT))
+    handler.setFormatter(JsonFormatter() if logs.format == "json" else TextFormatter(_TEXT))
     logging.basicConfig(level=logs.level.upper(), handlers=[handler], force=True)
     for chatty in _CHATTY:
         logging.getLogger(chatty).setLevel(logging.WARNING)

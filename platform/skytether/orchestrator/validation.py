@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from jsonschema import Draft202012Validator
@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from pydantic import ValidationError as PydanticError
 from referencing import Registry
 from referencing.exceptions import Unresolvable
+from referencing.jsonschema import DRAFT202012
 
 from skytether.api.faults import Fault, explain, unknown
 
@@ -43,6 +44,22 @@ def check_schema(schema: Mapping[str, Any], prefix: str) -> None:
         Draft202012Validator.check_schema(schema)
     except SchemaError as error:
         raise InvalidError([Fault(_join(prefix, error.absolute_path), error.message)]) from None
+    here = Registry().with_resource("", DRAFT202012.create_resource(dict(schema))).resolver()
+    for path, reference in _references(schema):
+        try:
+            here.lookup(reference)
+        except Unresolvable:
+            text = f"there is no '{reference}' in this schema, and nothing is fetched from elsewhere"
+            raise InvalidError([Fault(_join(prefix, path), text)]) from None
+
+
+def _references(schema: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    for key, inner in schema.items() if isinstance(schema, Mapping) else enumerate(schema):
+        here = (*path, str(key))
+        if key in ("$ref", "$dynamicRef") and isinstance(inner, str):
+            yield here, inner
+        elif isinstance(inner, Mapping | list):
+            yield from _references(inner, here)
 
 
 def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: str) -> None:
@@ -58,6 +75,9 @@ def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: 
         errors = sorted(validator.iter_errors(params), key=lambda e: [str(p) for p in e.absolute_path])
     except Unresolvable as error:
         raise InvalidError([Fault("spec.params", f"cannot resolve the reference {error.ref}")], service) from None
+    except RecursionError:
+        text = "the schema refers to itself without end: correct the manifest"
+        raise InvalidError([Fault("spec.params", text)], service) from None
     if errors:
         raise InvalidError([f for e in errors for f in _params_faults(e)][:_MAX_FAULTS], f"service '{service}'")
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from skytether.api.plain import oddity
 from skytether.api.rest import Problem, Scope
 
 from ..access import Principal
 from ..core import Orchestrator
+from ..errors import InvalidError, NotFoundError
 
 PREFIX = "/api/v1"
+_LARGE = 16_384
+"""Bytes of a body that is not looked through between other requests, but beside them."""
 
 bearer = HTTPBearer(auto_error=False, description="An operator's token, or a robot's")
 
@@ -68,3 +73,23 @@ def says(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """For the API's description: the errors that a route can answer, each a problem document."""
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"model": Problem, "content": content} for status in statuses}
+
+
+async def plain_request(request: Request) -> None:
+    """Refuse what could be stored but never given back, and what a database does not take, wherever it is.
+
+    Raises:
+        InvalidError: It is in the body.
+        NotFoundError: It is in the path.
+    """
+    for name, value in request.path_params.items():
+        if "\0" in value:
+            raise NotFoundError(f"there is no {name} of that name: it holds a NUL character")
+    body = await request.body()
+    try:
+        document = await request.json() if body else None
+    except ValueError:
+        return  # whoever wants it says what it should have been
+    fault = oddity(document) if len(body) < _LARGE else await asyncio.to_thread(oddity, document)
+    if fault is not None:
+        raise InvalidError([fault])

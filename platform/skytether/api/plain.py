@@ -1,0 +1,56 @@
+"""What documents may hold: what every JSON reader and every database can keep, and give back as it was."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any
+
+from .faults import Fault
+
+DEPTH = 64
+"""Levels of a document: what is deeper would exhaust the stack of some reader. People need ten."""
+_WHOLE = 1 << 63
+
+
+def oddity(document: Any) -> Fault | None:
+    """What JSON, a database or UTF-8 has no word for; None: all is well.
+
+    A NaN would arrive as null, and half of a character or a number with a thousand digits could be stored, but never
+    read again.
+    """
+    waiting: list[tuple[Any, tuple[str, ...]]] = [(document, ())]
+    while waiting:
+        value, place = waiting.pop()
+        if isinstance(value, dict | list):
+            if len(place) >= DEPTH:
+                return Fault(".".join(place[:3]), f"is nested more than {DEPTH} levels deep")
+            for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+                trouble = _of_text(key) if isinstance(key, str) else None
+                if trouble:
+                    return Fault(".".join(place), f"one of its keys {trouble}")
+                waiting.append((inner, (*place, str(key))))
+        else:
+            trouble = _of_scalar(value)
+            if trouble:
+                return Fault(".".join(place), trouble)
+    return None
+
+
+def _of_scalar(value: Any) -> str | None:
+    if isinstance(value, str):
+        return _of_text(value)
+    if isinstance(value, float) and not isfinite(value):
+        return f"must be a finite number, not {value}"
+    if isinstance(value, int) and not -_WHOLE <= value < _WHOLE:
+        return "must be a whole number of at most 64 bits"
+    if value is not None and not isinstance(value, bool | int | float):
+        return f"must be text, a number, true or false, not {value!r:.40}; quote what is text"
+    return None
+
+
+def _of_text(text: str) -> str | None:
+    if "\0" in text:
+        return "holds a NUL character: leave it out"
+    if not text.isascii() and any("\ud800" <= c <= "\udfff" for c in text):
+        return "holds half a character (a lone surrogate): leave it out"
+    return None

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+from datetime import date
+from math import inf, nan
+from typing import Any
+
+import pytest
+
+from skytether.api.plain import DEPTH, oddity
+
+
+def nested(levels: int) -> Any:
+    value: Any = 1
+    for _ in range(levels):
+        value = [value]
+    return value
+
+
+@pytest.mark.parametrize(
+    "document", [{"a": [1, -1.5, True, None, "\u00e9 \U0001f4a5", {}], "": -(1 << 63)}, nested(DEPTH), 7, None]
+)
+def test_what_json_can_hold_is_left_alone(document: Any) -> None:
+    assert oddity(document) is None
+
+
+@pytest.mark.parametrize(
+    ("document", "sentence"),
+    [
+        ({"a": {"b": [0, nan]}}, "a.b.1: must be a finite number, not nan"),
+        ([-inf], "0: must be a finite number, not -inf"),
+        ({"a": 1 << 63}, "a: must be a whole number of at most 64 bits"),
+        ({"a": "x\0y"}, "a: holds a NUL character: leave it out"),
+        ({"a": "\ud800"}, "a: holds half a character (a lone surrogate): leave it out"),
+        ({"a": {"\udfff": 1}}, "a: one of its keys holds half a character (a lone surrogate): leave it out"),
+        (nested(DEPTH + 1), "0.0.0: is nested more than 64 levels deep"),
+        (nested(100_000), "0.0.0: is nested more than 64 levels deep"),
+        (
+            {"day": date(2026, 1, 2)},
+            "day: must be text, a number, true or false, not datetime.date(2026, 1, 2); quote what is text",
+        ),
+    ],
+)
+def test_what_it_cannot_is_named(document: Any, sentence: str) -> None:
+    assert str(oddity(document)) == sentence
