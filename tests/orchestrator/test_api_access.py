@@ -26,6 +26,7 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("GET", "/docs", None, (200, 200, 200, 200, 200)),
     ("GET", "/openapi.json", None, (200, 200, 200, 200, 200)),
     ("GET", "/metrics", None, (401, 401, 403, 403, 200)),
+    ("GET", f"{API}/prometheus/targets", None, (401, 401, 403, 403, 200)),
     ("GET", f"{API}/catalog", None, (401, 401, 200, 200, 200)),
     ("GET", f"{API}/catalog/toy", None, (401, 401, 200, 403, 200)),
     ("PUT", f"{API}/catalog/new", MANIFEST, (401, 401, 403, 403, 201)),

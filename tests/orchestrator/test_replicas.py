@@ -138,6 +138,25 @@ def test_one_leads_all_answer_and_when_the_leader_is_killed_another_adopts(
     until(lambda: second.get_instance(made.id).state is State.STOPPED)
 
 
+def test_prometheus_is_told_of_all_that_are_connected(replicas: Callable[..., Replica], tmp_path: Path) -> None:
+    made = []
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.yaml").write_text(f"advertise: http://{name}:8600\n")
+        made.append(replicas(name, "--config", str(tmp_path / f"{name}.yaml")))
+        made[-1].up()
+    one, two = made
+
+    def told() -> set[str]:
+        headers = {"Authorization": f"Bearer {one.token}"}
+        answer = httpx.get(f"{one.url}/api/v1/prometheus/targets", headers=headers, trust_env=False)
+        return {target for group in answer.json() for target in group["targets"]}
+
+    until(lambda: told() == {"one:8600", "two:8600"})
+    assert two.process is not None
+    two.process.kill()
+    until(lambda: told() == {"one:8600"})
+
+
 def test_orchestrators_with_different_secrets_do_not_share_a_database(
     replicas: Callable[..., Replica], tmp_path: Path
 ) -> None:

@@ -299,6 +299,15 @@ class TokenCreated(Token):
     token: Annotated[str, Field(repr=False)]
 
 
+class ScrapeTargets(Strict):
+    """One group of Prometheus' HTTP service discovery."""
+
+    targets: tuple[str, ...]
+    """``HOST:PORT`` of each."""
+    labels: dict[str, str] = {}
+    """What all of them get; ``__scheme__`` says how they are asked."""
+
+
 class Problem(Strict):
     """RFC 9457 problem document."""
 

@@ -6,10 +6,11 @@ import logging
 import time
 from collections.abc import Callable
 
-from skytether.api.rest import Report
+from skytether.api.rest import Report, ScrapeTargets
 
 from .access import Access
 from .catalogue import Catalogue
+from .discovery import advertised, named, targets
 from .events import Broker
 from .instances import Instances
 from .leader import Leadership
@@ -54,7 +55,8 @@ class Orchestrator:
         self.settings = settings
         self._clock = clock
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
-        self.store = Store(settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}")
+        database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
+        self.store = Store(database, named(settings.advertise))
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges, self._reports)
@@ -119,7 +121,7 @@ class Orchestrator:
             )
         self.elector.start()
         self.elector.wait_first(_FIRST_LOOK)
-        self.sites.start()
+        self.sites.start(self.settings.local_site)
         self.placer.start()
 
     def _elected(self) -> None:
@@ -158,6 +160,10 @@ class Orchestrator:
         if silent > self.settings.timing.lock_up:
             return f"the reconciler has made no pass for {silent:.0f} s"
         return ""
+
+    def scrape_targets(self, asked: str) -> list[ScrapeTargets]:
+        """For Prometheus: the orchestrators over this database; ``asked``: the address that the request was sent to."""
+        return targets(advertised(self.store.names()), self.settings.advertise, asked)
 
     def _running(self) -> list[Running]:
         if not self.leadership.leads:

@@ -7,6 +7,8 @@ from typing import Any
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
 
+from .discovery import NAME
+
 GONE = (OperationalError, InterfaceError)
 """What the drivers raise when the database does not answer (or, SQLite, its disk is full)."""
 
@@ -22,19 +24,20 @@ _POSTGRES = {
 """A server that is gone is noticed within seconds, and a statement that hangs is ended (milliseconds)."""
 
 
-def make_engine(url: str) -> Engine:
+def make_engine(url: str, name: str = NAME) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
     sync to disk (a power cut may lose the last moments, a crash of the program does not). Transactions on an engine
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
 
-    PostgreSQL: a connection is tried before it is used, for the server may have been restarted since.
+    PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
+    it under ``name``.
     """
     address = make_url(url)
     if address.get_backend_name() == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
-        return create_engine(address, pool_pre_ping=True, connect_args=dict(_POSTGRES))
+        return create_engine(address, pool_pre_ping=True, connect_args={**_POSTGRES, "application_name": name})
     engine = create_engine(address)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from skytether.api.manifest import Strict
 
 from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
+from .discovery import MAX_ADDRESS, is_address
 
 Seconds = Annotated[float, Field(gt=0, le=1e9)]
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
@@ -139,7 +140,12 @@ class Settings(Group):
     stop_instances: bool = False
     """At shutdown: true ends all instances; false leaves them running, to be adopted at the next start."""
     open_metrics: bool = False
-    """True: `/metrics` needs no token."""
+    """True: `/metrics` and `/api/v1/prometheus/targets` need no token."""
+    advertise: str | None = None
+    """`http://HOST:PORT` at which Prometheus reaches this orchestrator, one of several over one database; none: where
+    it asked for targets."""
+    local_site: bool = True
+    """Make the site `local` (processes on this machine) when there is no site at all."""
     echo: bool = True
     """Answer UDP echoes at the same address and port, for `skytether doctor`; never more than was asked."""
     proxies: tuple[str, ...] = ()
@@ -154,6 +160,13 @@ class Settings(Group):
     """Bounds of what is kept and taken."""
     weights: Weights = Weights()
     """What placement weighs."""
+
+    @field_validator("advertise")
+    @classmethod
+    def _reachable(cls, address: str | None) -> str | None:
+        if address is not None and not is_address(address):
+            raise ValueError(f"write http://HOST:PORT or https://HOST:PORT, at most {MAX_ADDRESS} characters")
+        return address
 
     @field_validator("state_dir", "secrets_dir", "catalogue_dir")
     @classmethod

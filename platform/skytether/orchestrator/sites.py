@@ -152,9 +152,9 @@ class Sites:
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
 
-    def start(self) -> None:
-        """Open every site of the store, the default one if there is none, and give them a moment to answer."""
-        if not self._store.sites():
+    def start(self, local: bool = True) -> None:
+        """Open every site of the store (``local``: make one, if there is none), and give them a moment to answer."""
+        if local and not self._store.sites():
             self._store.add_site(DEFAULT_SITE)
         self.refresh()
         deadline = time.monotonic() + _FIRST_LOOK

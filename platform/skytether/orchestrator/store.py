@@ -17,6 +17,7 @@ from sqlalchemy.exc import IntegrityError
 from skytether.api.rest import Scope, SiteCreate, State
 
 from .db import make_engine, migrate
+from .discovery import NAME
 from .leader import Lock, lock_of
 from .models import events, facts, idempotency, instances, reports, robots, services, sites, tokens
 from .records import Record, check_move
@@ -71,8 +72,9 @@ class KeyReusedError(Exception):
 class Store:
     """The database. Safe from any thread."""
 
-    def __init__(self, url: str) -> None:
-        self._engine = make_engine(url)
+    def __init__(self, url: str, name: str = NAME) -> None:
+        """``name`` is what a database server lists its connections under."""
+        self._engine = make_engine(url, name)
         self._writer = self._engine.execution_options(immediate=True)
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
@@ -83,6 +85,15 @@ class Store:
     def lock(self) -> Lock:
         """The lock of whoever leads over this database."""
         return lock_of(self._engine)
+
+    def names(self) -> list[str]:
+        """Of all connections to this database by this user, whoever's; none with SQLite, which has no server."""
+        if self._engine.dialect.name != "postgresql":
+            return []
+        ours = "datname = current_database() AND usename = current_user"
+        with self._engine.connect() as connection:
+            asked = connection.scalars(text(f"SELECT DISTINCT application_name FROM pg_stat_activity WHERE {ours}"))  # noqa: S608
+            return [name for name in asked if name]
 
     def agree(self, name: str, value: str) -> bool:
         """Note a fact at first, and from then on say whether it is still the same."""

@@ -6,8 +6,10 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from skytether.api.rest import ScrapeTargets
+
 from ..problems import answer
-from .deps import Bearer, Core, authenticated, says
+from .deps import PREFIX, Bearer, Core, authenticated, says
 
 router = APIRouter(tags=["health"])
 
@@ -25,9 +27,20 @@ def readyz(core: Core, request: Request) -> Response:
     return answer(request, 503, "Not ready", why) if why else PlainTextResponse("ready\n")
 
 
+@router.get(f"{PREFIX}/prometheus/targets", responses=says(401, 403))
+def prometheus_targets(core: Core, request: Request, token: Bearer) -> list[ScrapeTargets]:
+    """For the HTTP service discovery of Prometheus (`http_sd_configs`): the orchestrators over this database."""
+    _may_measure(core, request, token)
+    return core.scrape_targets(f"{request.url.scheme}://{request.url.netloc}")
+
+
 @router.get("/metrics", response_class=PlainTextResponse, responses=says(401, 403))
 def metrics(core: Core, request: Request, token: Bearer) -> Response:
     """Prometheus metrics; for the operator, or for all if the orchestrator was started with ``--open-metrics``."""
+    _may_measure(core, request, token)
+    return Response(core.metrics.text(), media_type=CONTENT_TYPE_LATEST)
+
+
+def _may_measure(core: Core, request: Request, token: Bearer) -> None:
     if not core.settings.open_metrics:
         authenticated(core, request, token).require_scope("metrics")
-    return Response(core.metrics.text(), media_type=CONTENT_TYPE_LATEST)
