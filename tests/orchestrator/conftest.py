@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import uvicorn
+from reconcile_bench import Bench
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
@@ -27,16 +28,26 @@ QUICK = Timing(observe=0.02, observe_changing=0.005, place=0.05, stop_grace=0.1,
 
 
 class Clock:
-    """Made-up wall clock."""
+    """Made-up wall clock, and beside it one that nobody can set."""
 
     def __init__(self, now: float = 1_700_000_000.0) -> None:
         self.now = now
+        self._set_by = 0.0
 
     def __call__(self) -> float:
         return self.now
 
     def forward(self, seconds: float) -> None:
+        """Time goes by."""
         self.now += seconds
+
+    def set_by(self, seconds: float) -> None:
+        """Somebody sets it; no time goes by."""
+        self.now += seconds
+        self._set_by += seconds
+
+    def steady(self) -> float:
+        return self.now - self._set_by
 
 
 @pytest.fixture
@@ -81,6 +92,16 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store.migrate()
     yield store
     store.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, store: Store, clock: Any) -> Callable[..., Bench]:
+    def make(kind: type[FakeRuntime] = FakeRuntime, **options: Any) -> Bench:
+        bench = Bench(tmp_path, store, clock, kind, **options)
+        bench.reconciler.site_step(bench.site)
+        return bench
+
+    return make
 
 
 @dataclass

@@ -7,22 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from reconcile_bench import add
 
-from skytether.api.rest import SiteCreate, State
-from skytether.orchestrator.catalogue import Catalogue
-from skytether.orchestrator.metrics import Metrics
-from skytether.orchestrator.moves import Moves
-from skytether.orchestrator.reconcile import Reconciler
+from skytether.api.rest import State
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Phase
-from skytether.orchestrator.security import Secrets
-from skytether.orchestrator.settings import Limits, Timing, Weights
-from skytether.orchestrator.sites import Site
+from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.store import Store
 from skytether.testing.runtimes import (
     CrashingRuntime,
-    FakeOptions,
-    FakeRuntime,
     NeverReadyRuntime,
     RefusingRuntime,
     SlowRuntime,
@@ -30,91 +23,6 @@ from skytether.testing.runtimes import (
 )
 
 NewRecord = Callable[..., Record]
-
-
-class FixedSites:
-    """Sites whose threads never run: the test makes the steps."""
-
-    def __init__(self, *sites: Site) -> None:
-        self._sites = {site.name: site for site in sites}
-
-    def all(self) -> list[Site]:
-        return list(self._sites.values())
-
-    def find(self, name: str | None) -> Site | None:
-        return self._sites.get(name or "")
-
-    def refresh(self) -> None:
-        """Nobody adds or deletes any."""
-
-
-class Bench:
-    """A reconciler over one site, ``lab``."""
-
-    def __init__(self, folder: Path, store: Store, clock: Any, kind: type[FakeRuntime] = FakeRuntime, **options: Any):
-        self.store, self.clock = store, clock
-        self.woken = 0
-        self.metrics = Metrics(list, 64)
-        self.reconciler = self._reconciler(folder)
-        self.runtime = kind("lab", folder, FakeOptions(**options))
-        self.site = self._site()
-
-    def _reconciler(self, folder: Path) -> Reconciler:
-        return Reconciler(
-            self.store,
-            Secrets(folder),
-            self.metrics,
-            Timing(),
-            Limits(ended_count=1),
-            Weights(),
-            self.clock,
-            self._wake,
-        )
-
-    def _site(self) -> Site:
-        asked = SiteCreate(name="lab", tier="edge", runtime="fake")
-        site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
-        sites = self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
-        weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
-        self.reconciler.moves = Moves(self.store, catalogue, lambda: sites, weigh, self.clock, Timing(), Weights())
-        return site
-
-    def _wake(self) -> None:
-        self.woken += 1
-
-    def restart(self, folder: Path) -> None:
-        """The orchestrator is killed and comes back; what runs runs on."""
-        self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
-        self.reconciler = self._reconciler(folder)
-        self.site = self._site()
-
-    def step(self, times: int = 1) -> float:
-        for _ in range(times):
-            self.reconciler.place_step()
-            delay = self.reconciler.site_step(self.site)
-        return delay
-
-    def record(self, name: str = "i1") -> Record:
-        found = self.store.get(name)
-        assert found is not None
-        return found
-
-    def reasons(self, name: str = "i1") -> list[tuple[str, str]]:
-        return [(e.state.value, e.reason) for e in self.store.events(name, 0)]
-
-
-@pytest.fixture
-def bench(tmp_path: Path, store: Store, clock: Any) -> Callable[..., Bench]:
-    def make(kind: type[FakeRuntime] = FakeRuntime, **options: Any) -> Bench:
-        bench = Bench(tmp_path, store, clock, kind, **options)
-        bench.reconciler.site_step(bench.site)
-        return bench
-
-    return make
-
-
-def add(bench: Bench, record: Record) -> None:
-    bench.store.add(record, "operator", None, "")
 
 
 def test_a_request_becomes_a_running_instance(bench: Any, new_record: NewRecord) -> None:
@@ -257,6 +165,23 @@ def test_a_silent_site_is_unreachable_and_what_runs_there_is_believed_to_run(ben
     b.step(3)
     assert b.site.unreachable == ""
     assert b.record("i2").state is State.RUNNING
+
+
+def test_nobody_is_late_while_a_site_is_silent(bench: Any, new_record: NewRecord) -> None:
+    b = bench(NeverReadyRuntime)
+    add(b, new_record(lease_expires_at=b.clock() + 1000))
+    b.step(2)
+    b.runtime.silent = True
+    b.step()
+    b.clock.forward(100)
+    b.runtime.silent = False
+    b.step()
+    b.clock.forward(29)
+    b.step()
+    assert b.record().restarts == 0
+    b.clock.forward(2)
+    b.step()
+    assert b.record().restarts == 1
 
 
 def test_a_restarted_orchestrator_adopts_what_runs(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:

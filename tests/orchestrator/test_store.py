@@ -12,6 +12,7 @@ from alembic.migration import MigrationContext
 from skytether.api.rest import SiteCreate, State
 from skytether.orchestrator.db import make_engine, migrate
 from skytether.orchestrator.models import metadata
+from skytether.orchestrator.moves import FOREVER
 from skytether.orchestrator.records import IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
 from skytether.orchestrator.store import KeyReusedError, RobotRow, Store, TokenRow
@@ -168,9 +169,11 @@ def test_what_ends_is_not_renewed(store: Store, new_record: NewRecord) -> None:
 
 def test_leases_are_whole_again_after_a_time_without_orchestrator(store: Store, new_record: NewRecord) -> None:
     store.add(new_record("short", lease_s=10, lease_expires_at=NOW + 1), "operator", None, "")
-    store.add(new_record("long", lease_s=10, lease_expires_at=NOW + 5000), "operator", None, "")
+    store.add(new_record("dated", lease_s=10, lease_expires_at=NOW + 5000), "operator", None, "")
+    store.add(new_record("nobody's", lease_s=10, lease_expires_at=FOREVER, spare=True), "operator", None, "")
     store.extend_leases(NOW + 1000)
-    assert {r.id: r.lease_expires_at for r in store.all()} == {"short": NOW + 1010, "long": NOW + 5000}
+    leases = {r.id: r.lease_expires_at for r in store.all()}
+    assert leases == {"short": NOW + 1010, "dated": NOW + 1010, "nobody's": FOREVER}
 
 
 def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_record: NewRecord) -> None:

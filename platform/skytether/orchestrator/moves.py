@@ -114,7 +114,7 @@ class Moves:
     def _stale(self, spare: Record, now: float) -> bool:
         """It has other parameters than the last request, and has had its time."""
         params = self._store.last_params(spare.service)
-        return params is not None and params != spare.params and now - spare.created_at > _SETTLED
+        return params is not None and params != spare.params and abs(now - spare.created_at) > _SETTLED
 
     def _add_spare(self, manifest: Manifest, live: Sequence[Record], now: float) -> None:
         name = manifest.metadata.name
@@ -145,6 +145,10 @@ class Moves:
         """Do not try another one at once."""
         self._not_before[record.service] = self._clock() + self._timing.backoff_max
 
+    def clock_was_set(self) -> None:
+        """Nothing is known any more of how long things have been as they are."""
+        self._not_before, self._bad_since = {}, {}
+
     def fail_over(self, record: Record, why: str) -> None:
         """Give the robot of an instance that does not serve a spare, if there is one."""
         if record.spare or self._store.successor(record.id) is not None:
@@ -171,7 +175,7 @@ class Moves:
                 self._replace(record, reports[record.id], live, now)
 
     def _replace(self, record: Record, report: Report, live: Sequence[Record], now: float) -> None:
-        if now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
+        if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
             return
         wanted = self.successor_of(record)
         others = [other for other in live if other is not record]

@@ -7,6 +7,7 @@ of an earlier one has been dealt with and only says what is still there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -95,7 +96,12 @@ Action = Place | Start | Progress | Ready | Crash | Expire | End | Stop | Remove
 
 
 def plan(
-    live: Iterable[Record], observed: Mapping[str, Observation], ended: Collection[str], now: float, timing: Timing
+    live: Iterable[Record],
+    observed: Mapping[str, Observation],
+    ended: Collection[str],
+    now: float,
+    timing: Timing,
+    seen_since: float = -math.inf,
 ) -> list[Action]:
     """Every action due at one site (or, with nothing observed, for what has no site yet).
 
@@ -105,12 +111,13 @@ def plan(
         ended: Those of the observed that the store knows as ended.
         now: Seconds since the epoch.
         timing: How patient to be.
+        seen_since: Since when the site has answered each time (seconds since the epoch): what nobody sees is not late.
     """
     actions: list[Action] = []
     expected = set()
     for record in live:
         expected.add(record.id)
-        action = decide(record, observed.get(record.id), now, timing)
+        action = decide(record, observed.get(record.id), now, timing, seen_since)
         if action is not None:
             actions.append(action)
     for instance, seen in observed.items():
@@ -123,13 +130,15 @@ def plan(
     return actions
 
 
-def decide(record: Record, seen: Observation | None, now: float, timing: Timing) -> Action | None:
-    """The next action for one instance; None: wait."""
+def decide(
+    record: Record, seen: Observation | None, now: float, timing: Timing, seen_since: float = -math.inf
+) -> Action | None:
+    """The next action for one instance; None: wait. See :func:`plan`."""
     there = seen is not None and seen.phase is not Phase.EXITED
     if record.state is State.STOPPING:
         if not there:
             return End(record)
-        return Stop(record.id, force=now - (record.stopping_at or 0) >= timing.stop_grace)
+        return Stop(record.id, force=_waited(record.stopping_at or 0.0, now, seen_since) >= timing.stop_grace)
     if record.state.final:
         return Stop(record.id, force=True) if there else None
     if now >= record.lease_expires_at:
@@ -141,20 +150,26 @@ def decide(record: Record, seen: Observation | None, now: float, timing: Timing)
             return Stop(record.id, force=True)  # what is left of an earlier run
         seen = None
     if record.state is State.STARTING:
-        return _starting(record, seen, now, timing)
+        return _starting(record, seen, now, timing, seen_since)
     return _running(record, seen)
 
 
-def _starting(record: Record, seen: Observation | None, now: float, timing: Timing) -> Action | None:
+def _waited(since: float, now: float, seen_since: float) -> float:
+    """Seconds in which something could be seen; a date that is still to come was another clock's."""
+    return now - (seen_since if since > now else max(since, seen_since))
+
+
+def _starting(record: Record, seen: Observation | None, now: float, timing: Timing, seen_since: float) -> Action | None:
     if seen is None:
-        return Start(record) if now >= record.start_at else None
+        # A wait longer than the longest was another clock's.
+        return Start(record) if not 0 < record.start_at - now <= timing.backoff_max else None
     if seen.phase is Phase.RUNNING:
         return Ready(record, seen.host, seen.port)
     if seen.phase is Phase.EXITED:
         return Crash(record, how_it_ended(seen), for_good=seen.exit_status == BAD_GRANT_STATUS)
     if seen.detail and seen.detail != record.reason:
         return Progress(record, seen.detail)
-    if record.started_at is not None and now - record.started_at > timing.start_timeout:
+    if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:
         return Crash(record, f"was not ready within {timing.start_timeout:g} s")
     return None
 

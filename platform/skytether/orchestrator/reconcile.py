@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import base64
 import logging
+import threading
 import time
 from collections.abc import Callable, Sequence
 
 from skytether.api.grant import Grant
 from skytether.api.rest import Measurement, Refusal, Report, State
 
+from .clocks import SetClock
 from .db import GONE
 from .metrics import Metrics
 from .moves import Moves
 from .placement import NOTHING, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
-from .runtimes.base import Capacity, Launch, RuntimeFailure
+from .runtimes.base import Capacity, Launch, RuntimeFailure, SiteSilentError
 from .security import Secrets
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
@@ -52,8 +54,9 @@ class Reconciler:
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
         leads: Callable[[], bool] = lambda: True,
+        steady: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``clock`` gives seconds since the epoch."""
+        """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets."""
         self._store = store
         self._secrets = secrets
         self._metrics = metrics
@@ -63,7 +66,12 @@ class Reconciler:
         self._clock = clock
         self._wake_placer = wake_placer
         self._leads = leads
-        self._pruned_at = 0.0
+        self._steady = steady
+        self._clock_lock = threading.Lock()
+        self._set_clock = SetClock(clock(), steady())
+        self._times_set = 0
+        """How often the clock was set: what was read before the last time is dated by another one."""
+        self._pruned_at = -_PRUNE
         self._database_gone = False
 
     def place_step(self) -> float:
@@ -92,14 +100,32 @@ class Reconciler:
             self._database_gone = True
             return self._timing.place
 
+    def _now(self) -> float:
+        """The time. Was the clock set, all leases count anew first: nobody can say how old they are."""
+        with self._clock_lock:
+            now, steady = self._clock(), self._steady()
+            by = self._set_clock.set_by(now, steady)
+            if by:
+                if self._leads():
+                    self._store.extend_leases(now)
+                self.moves.clock_was_set()
+                self._times_set += 1
+                text = "the clock was set %s by %.0f s, or this machine slept: leases and waits count anew"
+                log.warning(text, "forward" if by > 0 else "back", abs(by))
+            self._set_clock.accept(now, steady)
+            return now
+
     # What has no site yet
 
     def _place_pass(self) -> float:
         self.sites.refresh()
         if not self._leads():
             return self._timing.place
-        now = self._clock()
+        times_set = self._times_set
         live = self._store.live()
+        now = self._now()
+        if times_set != self._times_set:
+            return 0.0  # what was read is dated by another clock
         waiting = [record for record in live if record.site is None]
         placed = [record for record in live if record.site is not None]
         for action in plan(waiting, {}, (), now, self._timing):
@@ -112,8 +138,8 @@ class Reconciler:
         self.moves.keep_spares(live)
         reports = {instance: Report.model_validate(report) for instance, report in self._store.reports().items()}
         self.moves.watch(live, reports)
-        if now - self._pruned_at >= _PRUNE:
-            self._pruned_at = now
+        if self._steady() - self._pruned_at >= _PRUNE:
+            self._pruned_at = self._steady()
             self._prune(now)
         return self._timing.place
 
@@ -170,6 +196,7 @@ class Reconciler:
     # What is at a site
 
     def _site_pass(self, site: Site) -> float:
+        times_set = self._times_set
         live = self._store.live_at(site.name)  # before the look: nothing can be observed that is not in it
         try:
             if site.capacity is None:
@@ -182,13 +209,19 @@ class Reconciler:
                 log.warning("site %s: %s", site.name, error)
             site.failure = str(error)
             site.capacity = site.load = None  # it may come back as another machine
+            site.seen_since = None
             return self._timing.place
         site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
         if not self._leads():
             return self._timing.observe
+        now = self._now()
+        if times_set != self._times_set:
+            return 0.0  # what was read is dated by another clock
+        if site.seen_since is None or site.seen_since[0] != times_set:
+            site.seen_since = (times_set, now)
         strangers = observed.keys() - {record.id for record in live}
         ended = self._store.known(strangers) if strangers else set()
-        actions = plan(live, observed, ended, self._clock(), self._timing)
+        actions = plan(live, observed, ended, now, self._timing, site.seen_since[1])
         for action in actions:
             self._act(site, action)
         if due:
@@ -233,6 +266,8 @@ class Reconciler:
             return
         try:
             site.runtime.start(self._launch(noted))
+        except SiteSilentError:
+            raise  # no fault of the service: it is started when the site answers again
         except RuntimeFailure as error:
             self._crash(site, Crash(noted, f"could not be started: {error}"))
 

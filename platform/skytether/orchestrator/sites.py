@@ -105,6 +105,8 @@ class Site:
         self.observed: Mapping[str, Observation] = {}
         self.looked_at = -math.inf
         """Monotonic seconds of the last look that did not fail."""
+        self.seen_since: tuple[int, float] | None = None
+        """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
         self.tidied_at = -math.inf
         self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
         self._silent_after = silent_after

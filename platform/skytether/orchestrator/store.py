@@ -288,9 +288,12 @@ class Store:
             return {row.instance: row.report for row in rows}
 
     def extend_leases(self, now: float) -> None:
-        """Give every live instance its whole lease from now: nobody could renew while the orchestrator was down."""
+        """Give every live instance its whole lease from now, no less and no more; spares keep theirs, which never ends.
+
+        For nobody could renew, or nobody can say when they did.
+        """
         full = now + instances.c.lease_s
-        statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.lease_expires_at < full)
+        statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.spare.is_(False))
         with self._writer.begin() as connection:
             connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))
 

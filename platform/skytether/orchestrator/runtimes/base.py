@@ -104,6 +104,10 @@ class RuntimeFailure(Exception):  # noqa: N818 (not an error of ours)
     """The site did not do what it was asked, or does not answer; one sentence saying what to do."""
 
 
+class SiteSilentError(RuntimeFailure):
+    """The site does not answer: nothing is known of what runs there, and no service is to blame."""
+
+
 class Runtime(ABC):
     """One site's runtime."""
 

@@ -1,0 +1,94 @@
+"""A reconciler of which a test makes the steps: made-up time, a real store, a runtime that runs nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from skytether.api.rest import SiteCreate
+from skytether.orchestrator.catalogue import Catalogue
+from skytether.orchestrator.metrics import Metrics
+from skytether.orchestrator.moves import Moves
+from skytether.orchestrator.reconcile import Reconciler
+from skytether.orchestrator.records import Record
+from skytether.orchestrator.security import Secrets
+from skytether.orchestrator.settings import Limits, Timing, Weights
+from skytether.orchestrator.sites import Site
+from skytether.orchestrator.store import Store
+from skytether.testing.runtimes import FakeOptions, FakeRuntime
+
+
+class FixedSites:
+    """Sites whose threads never run: the test makes the steps."""
+
+    def __init__(self, *sites: Site) -> None:
+        self._sites = {site.name: site for site in sites}
+
+    def all(self) -> list[Site]:
+        return list(self._sites.values())
+
+    def find(self, name: str | None) -> Site | None:
+        return self._sites.get(name or "")
+
+    def refresh(self) -> None:
+        """Nobody adds or deletes any."""
+
+
+class Bench:
+    """A reconciler over one site, ``lab``."""
+
+    def __init__(self, folder: Path, store: Store, clock: Any, kind: type[FakeRuntime] = FakeRuntime, **options: Any):
+        self.store, self.clock = store, clock
+        self.woken = 0
+        self.metrics = Metrics(list, 64)
+        self.reconciler = self._reconciler(folder)
+        self.runtime = kind("lab", folder, FakeOptions(**options))
+        self.site = self._site()
+
+    def _reconciler(self, folder: Path) -> Reconciler:
+        return Reconciler(
+            self.store,
+            Secrets(folder),
+            self.metrics,
+            Timing(),
+            Limits(ended_count=1),
+            Weights(),
+            self.clock,
+            self._wake,
+            steady=self.clock.steady,
+        )
+
+    def _site(self) -> Site:
+        asked = SiteCreate(name="lab", tier="edge", runtime="fake")
+        site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
+        sites = self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
+        weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
+        self.reconciler.moves = Moves(self.store, catalogue, lambda: sites, weigh, self.clock, Timing(), Weights())
+        return site
+
+    def _wake(self) -> None:
+        self.woken += 1
+
+    def restart(self, folder: Path) -> None:
+        """The orchestrator is killed and comes back; what runs runs on."""
+        self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
+        self.reconciler = self._reconciler(folder)
+        self.site = self._site()
+
+    def step(self, times: int = 1) -> float:
+        for _ in range(times):
+            self.reconciler.place_step()
+            delay = self.reconciler.site_step(self.site)
+        return delay
+
+    def record(self, name: str = "i1") -> Record:
+        found = self.store.get(name)
+        assert found is not None
+        return found
+
+    def reasons(self, name: str = "i1") -> list[tuple[str, str]]:
+        return [(e.state.value, e.reason) for e in self.store.events(name, 0)]
+
+
+def add(bench: Bench, record: Record) -> None:
+    bench.store.add(record, "operator", None, "")
