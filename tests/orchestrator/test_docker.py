@@ -121,6 +121,14 @@ def addresses() -> list[str]:
     return [a["local"] for row in rows for a in row["addr_info"] if not a["local"].startswith("127.")]
 
 
+def reaches(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=1).close()
+    except OSError:
+        return False
+    return True
+
+
 def test_a_container_reaches_nobody(
     docker_site: DockerSite, runtime: DockerRuntime, host_ports: dict[str, int]
 ) -> None:
@@ -132,7 +140,11 @@ def test_a_container_reaches_nobody(
     network = json.loads(docker("network", "inspect", docker_site.network))[0]
     gateway = network["IPAM"]["Config"][0]["Gateway"]
     neighbour = network["Containers"][other]["IPv4Address"].partition("/")[0]
-    tried = [(host, host_ports["tcp"]) for host in (gateway, *addresses())] + [(neighbour, 22), ("192.0.2.1", 80)]
+    serve = "import socket, time; s = socket.create_server(('', 8080)); time.sleep(60)"
+    docker("exec", "-d", other, PYTHON, "-c", serve)
+    until(lambda: reaches(neighbour, 8080))  # from this machine, as whoever may
+    tried = [(host, host_ports["tcp"]) for host in (gateway, *addresses())]
+    tried += [(neighbour, 8080), ("169.254.169.254", 80), ("192.0.2.1", 80)]
     # The same question from a container on the engine's own network shows that it is a good one.
     asked = _TRY.replace("TRIED", repr(tried[:1]))
     free = docker("run", "--rm", "--entrypoint", PYTHON, docker_site.images.toy, "-c", asked)
@@ -234,6 +246,34 @@ def test_ends_are_told_apart(docker_site: DockerSite, runtime: DockerRuntime) ->
     assert missing.detail.startswith("could not be started: image 'skytether/no-such-thing:1' is not on the engine")
     bad = until_phase(runtime, Phase.EXITED, "bad")
     assert (bad.exit_status, bad.detail, bad.last_line) == (3, "", "boom")
+
+
+@pytest.fixture
+def device(docker_site: DockerSite) -> Iterator[tuple[str, int]]:
+    """A device file of this machine that a group may open and others may not, and the group's number."""
+    path, group = f"/dev/{docker_site.owner}", 44_444
+    root = ["run", "--rm", "-u", "0", "-v", "/dev:/dev", "--entrypoint", "sh"]
+    make = f"mknod -m 660 {path} c 1 3 && chown 0:{group} {path}"
+    docker(*root, docker_site.images.toy, "-c", make)
+    yield path, group
+    docker(*root, docker_site.images.toy, "-c", f"rm {path}")
+
+
+def test_devices_of_the_machine(docker_site: DockerSite, tmp_path: Path, device: tuple[str, int]) -> None:
+    path, group = device
+    there: dict[str, Any] = {"devices": [path, "/dev/unplugged"], "groups": [group], "gpu": 1}
+    with closing(docker_site.open(tmp_path, **there)) as runtime:
+        runtime.start(launch(docker_site, "with", needs={"devices": [path]}))
+        runtime.start(launch(docker_site, "missing", needs={"devices": ["/dev/unplugged"]}))
+        runtime.start(launch(docker_site, "gpu", needs={"gpu": 1}))
+        missing = until_phase(runtime, Phase.EXITED, "missing")
+        assert missing.detail.startswith("could not be started: error gathering device information")
+        assert missing.detail.endswith("plug it in, or take it out of the site's option 'devices'")
+        gpu = until_phase(runtime, Phase.EXITED, "gpu")  # no machine that runs tests has one
+        assert "the engine has no NVIDIA container toolkit" in gpu.detail
+        until_phase(runtime, Phase.RUNNING, "with")
+        (container,) = docker_site.containers()
+        assert inside(container, f"open('{path}', 'wb').write(b'x'); print(1)") == 1
 
 
 def test_a_log_is_followed_until_its_run_ends(docker_site: DockerSite, runtime: DockerRuntime) -> None:

@@ -24,6 +24,7 @@ from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
 from skytether.orchestrator.runtimes.docker.objects import (
     Seen,
+    advised,
     container,
     free_gpus,
     free_port,
@@ -56,7 +57,7 @@ def launch(**given: Any) -> Launch:
 
 
 def body(given: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    asked = {"image": "sha256:1", "port": None, "gpus": ()} | more
+    asked = {"image": "sha256:1", "port": None, "gpus": (), "cores": 4.0} | more
     return container(launch(**(given or {})), options(), "me", **asked)
 
 
@@ -79,6 +80,9 @@ def test_limits_come_from_the_manifest() -> None:
     host = body(given)["HostConfig"]
     assert (host["NanoCpus"], host["Memory"], host["PidsLimit"]) == (2_500_000_000, 300 << 20, 20)
     assert body({"needs": {"cpu": 2}})["HostConfig"]["NanoCpus"] == 2_000_000_000
+    # An engine refuses a limit above what its machine has, and the kernel one that is next to nothing.
+    assert body({"limits": {"cpu": 8}}, cores=2.0)["HostConfig"]["NanoCpus"] == 2_000_000_000
+    assert body({"needs": {"cpu": 0.001}, "limits": {"cpu": 0.001}})["HostConfig"]["NanoCpus"] == 10_000_000
 
 
 @pytest.mark.parametrize("limits", [{"cpu": 0.5}, {"memory_mb": 100}])
@@ -94,6 +98,21 @@ def test_devices_and_gpus_are_handed_over() -> None:
     ]
     assert host["DeviceRequests"] == [{"Driver": "nvidia", "DeviceIDs": ["1", "3"], "Capabilities": [["gpu"]]}]
     assert body()["HostConfig"]["DeviceRequests"] == []
+    asked = options(devices=["/dev/video0"], groups=[44])
+    for needs, groups in (({"devices": ["/dev/video0"]}, ["44"]), ({}, [])):
+        made = container(launch(needs=needs), asked, "me", "x", None, (), 4.0)
+        assert made["HostConfig"]["GroupAdd"] == groups
+
+
+def test_an_engines_refusal_comes_with_what_to_do() -> None:
+    said = 'could not select device driver "nvidia" with capabilities: [[gpu]]'
+    assert advised(said) == f"{said}; the engine has no NVIDIA container toolkit: install it, or set 'gpu' to 0"
+    assert advised("no space left on device") == "no space left on device"
+
+
+@pytest.mark.parametrize(("code", "status"), [(0, 0), (3, 3), (127, 127), (137, -9), (139, -11), (255, 255)])
+def test_a_signal_is_told_from_a_status_of_the_programs_own(code: int, status: int) -> None:
+    assert observation(Seen("c", "i1", 1, "exited", exit_code=code), options()).exit_status == status
 
 
 def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
@@ -114,7 +133,7 @@ def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
 
 def test_published_and_advertised_addresses_are_two_things() -> None:
     asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
-    bindings = container(launch(), asked, "me", "x", 7700, ())["HostConfig"]["PortBindings"]
+    bindings = container(launch(), asked, "me", "x", 7700, (), 4.0)["HostConfig"]["PortBindings"]
     assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
     seen = observation(Seen("c", "i1", 1, "running", host_port=7700, ready=True), asked)
     assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)
@@ -146,6 +165,14 @@ def test_where_robots_find_instances(given: dict[str, str], bound: str, advertis
         ({"engine": "tcp://edge:2375"}, "without it anyone is let in"),
         ({"tls": {"ca": "a", "cert": "b", "key": "c"}}, "tls"),
         ({"bind_host": "0.0.0.0"}, "advertise_host is needed"),
+        ({"bind_host": "::", "network": "own"}, "advertise_host is needed"),
+        ({"bind_host": "192.0.2.7", "advertise_host": "0.0.0.0"}, "advertise_host is needed"),
+        ({"bind_host": "localhost"}, "must be an address such as 192.0.2.7, not 'localhost'"),
+        ({"network": "host"}, "no published ports"),
+        ({"network": "container:orchestrator"}, "should match pattern"),
+        ({"environment": {"A=B": "c"}}, "should match pattern"),
+        ({"devices": ["video0"]}, "should match pattern"),
+        ({"groups": [0]}, "greater than or equal to 1"),
         ({"ports": [7700, 7600]}, "the first is above the last"),
         ({"ports": [0, 7600]}, "greater than or equal to 1"),
         ({"engin": "unix:///x"}, "Extra inputs"),

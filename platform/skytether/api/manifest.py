@@ -12,6 +12,7 @@ NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", description="lower-case letters, digits and '-'")]
 Tier = Literal["robot", "edge", "cloud"]
+Device = Annotated[str, Field(pattern=r"^/dev/[A-Za-z0-9._/-]+$")]
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
@@ -147,7 +148,7 @@ class Needs(Strict):
     """One step of the service on a core of its own; placement reckons delay with it."""
     architectures: tuple[Annotated[str, Field(pattern=r"^[a-z0-9_]+$")], ...] = ()
     """As container images name them (``amd64``, ``arm64``); empty: any."""
-    devices: tuple[Annotated[str, Field(pattern=r"^/dev/[A-Za-z0-9._/-]+$")], ...] = ()
+    devices: tuple[Device, ...] = ()
     """Device files, ``/dev/video0``; a container site must offer each."""
     max_rtt_ms: Annotated[float, Field(gt=0)] | None = None
     """Above this the robot's fallback takes over; None: any."""

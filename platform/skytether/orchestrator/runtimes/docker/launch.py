@@ -14,7 +14,7 @@ from ..base import Launch, RuntimeFailure
 from .engine import Engine, explain
 from .follow import Follower
 from .images import ensure_image
-from .objects import Seen, container, free_gpus, free_port, grant_archive, name_of
+from .objects import Seen, advised, container, free_gpus, free_port, grant_archive, name_of
 from .options import DockerOptions
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class Job:
         except StoppedError:
             self.failure = "was stopped before it ran"
         except RuntimeFailure as error:
-            self.failure = f"could not be started: {error}"
+            self.failure = f"could not be started: {advised(str(error))}"
         except Exception as error:
             log.exception("start of %s failed", self.launch.instance)
             self.failure = f"could not be started: {error}"
@@ -157,7 +157,8 @@ class Job:
                 taken.add(port)
 
     def _begin(self, image: str, port: int | None, gpus: tuple[int, ...]) -> Seen:
-        body = container(self.launch, self._options, self._owner, image, port, gpus)
+        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
+        body = container(self.launch, self._options, self._owner, image, port, gpus, cores)
         name = name_of(self._owner, self.launch.instance, self.attempt)
         with self._engine.asked():
             api = self._engine.api()

@@ -33,8 +33,16 @@ _TMPFS = "size=64m,mode=1777,nosuid,nodev"
 _PREFIX = "skytether.io"
 OWNER = f"{_PREFIX}/owner"
 _INSTANCE, _ATTEMPT, _GPUS = f"{_PREFIX}/instance", f"{_PREFIX}/attempt", f"{_PREFIX}/gpus"
-_SIGNALLED = 128
-"""An exit status above this means the signal that is left."""
+_SIGNALLED, _SIGNALS = 128, 64
+"""An exit status above the first means the signal that is left, as far as there are any: 255 is a program's own -1."""
+_LEAST_CORES = 0.01
+"""The kernel gives no less."""
+_ADVICE = (
+    ("could not select device driver", "the engine has no NVIDIA container toolkit: install it, or set 'gpu' to 0"),
+    ("error gathering device information", "plug it in, or take it out of the site's option 'devices'"),
+    ("cannot assign requested address", "the site's option 'bind_host' is no address of the engine's machine"),
+)
+"""What to do about what an engine says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +118,19 @@ def free_port(ports: tuple[int, int] | None, preferred: int | None, taken: Itera
     return next(port for port in range(ports[0], ports[1] + 1) if port not in used)
 
 
+def advised(refusal: str) -> str:
+    """An engine's refusal, with what to do about it where that is known."""
+    return next((f"{refusal}; {what}" for words, what in _ADVICE if words in refusal), refusal)
+
+
 def container(
-    launch: Launch, options: DockerOptions, owner: str, image: str, port: int | None, gpus: tuple[int, ...]
+    launch: Launch,
+    options: DockerOptions,
+    owner: str,
+    image: str,
+    port: int | None,
+    gpus: tuple[int, ...],
+    cores: float,
 ) -> dict[str, Any]:
     """The body of the engine's call that creates a container.
 
@@ -122,11 +141,12 @@ def container(
         image: The image's id: what a tag means may change between two runs.
         port: UDP port to publish; None: the engine's choice.
         gpus: Numbers of its GPUs.
+        cores: Of the engine's machine, which refuses a limit above them.
     """
     spec, grant = launch.spec, launch.grant
     inner = f"{INNER_PORT}/udp"
     memory = (spec.limits.memory_mb or spec.needs.memory_mb) << 20
-    cores = spec.limits.cpu or max(1.0, spec.needs.cpu)
+    limit = max(_LEAST_CORES, min(spec.limits.cpu or max(1.0, spec.needs.cpu), cores))
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     return {
         "Image": image,
@@ -154,7 +174,7 @@ def container(
             "SecurityOpt": ["no-new-privileges"],
             "Memory": memory,
             "MemorySwap": memory,  # none beyond it: a service that swaps is of no use to a robot
-            "NanoCpus": int(cores * 1e9),
+            "NanoCpus": int(limit * 1e9),
             "CpuShares": max(2, int(spec.needs.cpu * 1024)),
             "PidsLimit": spec.limits.pids,
             "Tmpfs": {"/tmp": _TMPFS},  # noqa: S108 (the container's own)
@@ -166,6 +186,7 @@ def container(
                 {"PathOnHost": device, "PathInContainer": device, "CgroupPermissions": "rw"}
                 for device in spec.needs.devices
             ],
+            "GroupAdd": [str(group) for group in options.groups] if spec.needs.devices else [],
             "DeviceRequests": _gpu_requests(gpus),
             "LogConfig": {"Type": "json-file", "Config": _LOG},
         },
@@ -266,10 +287,11 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
 def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None) -> Observation:
     """What the contract calls it."""
     if seen.ended:
+        signalled = _SIGNALLED < seen.exit_code <= _SIGNALLED + _SIGNALS
         return Observation(
             seen.attempt,
             Phase.EXITED,
-            exit_status=_SIGNALLED - seen.exit_code if seen.exit_code > _SIGNALLED else seen.exit_code,
+            exit_status=_SIGNALLED - seen.exit_code if signalled else seen.exit_code,
             last_line=seen.last_line,
             detail=_how_it_ended(seen),
         )

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Annotated, Literal
 from urllib.parse import SplitResult, urlsplit
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from skytether.api.manifest import Strict
+from skytether.api.manifest import Device, Strict
 
 LOCAL_SOCKET = "/var/run/docker.sock"
 Port = Annotated[int, Field(ge=1, le=65_535)]
+_WILDCARDS = ("0.0.0.0", "::")  # noqa: S104
+_NO_NETWORKS = ("host", "none", "default")
+"""Words of the engine that are no bridges: with the machine's network, a service could reach all of it."""
+
+
+def _ip_address(text: str) -> str:
+    """The engine takes a name for a wildcard, without a word."""
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
+        raise ValueError(f"must be an address such as 192.0.2.7, not '{text}'") from None
 
 
 class TlsOptions(Strict):
@@ -41,10 +53,10 @@ class DockerOptions(Strict):
     ``tcp://HOST:PORT`` with ``tls``."""
     tls: TlsOptions | None = None
     ssh: SshOptions = SshOptions()
-    bind_host: str | None = None
-    """Address of the engine's machine on which instances are reached; None: loopback of a local engine, all addresses
-    of a remote one."""
-    advertise_host: str | None = None
+    bind_host: Annotated[str, AfterValidator(_ip_address)] | None = None
+    """Address (a number, no name) of the engine's machine on which instances are reached; None: loopback of a local
+    engine, all addresses of a remote one."""
+    advertise_host: Annotated[str, Field(min_length=1, max_length=253)] | None = None
     """Address that robots are told; None: ``bind_host``, or the host of a remote engine."""
     ports: tuple[Port, Port] | None = None
     """First and last UDP port that instances may have, as a firewall lets them through; None: the engine chooses."""
@@ -54,20 +66,23 @@ class DockerOptions(Strict):
     """None: all of the engine's."""
     gpu: Annotated[int, Field(ge=0)] = 0
     """GPUs; each instance gets its own, by number. The engine needs NVIDIA's container toolkit."""
-    devices: tuple[str, ...] = ()
+    devices: tuple[Device, ...] = ()
     """Device files that services may ask for, such as /dev/video0."""
+    groups: tuple[Annotated[int, Field(ge=1, lt=1 << 31)], ...] = ()
+    """Numbers of the groups that own these files on the engine's machine (``stat -c %g /dev/video0``): a service that
+    asks for a device is in them, and may open it where it is not open to all."""
     pull: Literal["missing", "always", "never"] = "missing"
     """When to fetch a service's image from its registry."""
     pinned: bool = False
     """Take only images that are named with their digest, NAME@sha256:..."""
     registry_auth: str | None = None
     """File with the credentials of private registries, as ``docker login`` writes it (config.json); mode 0600."""
-    network: str = "skytether"
+    network: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")] = "skytether"
     """The instances' network. It is made if it is not there, and closed off: robots reach instances, these reach
     nobody. One that somebody else made is used as it is."""
-    guard_image: str = "skytether/guard:1"
+    guard_image: Annotated[str, Field(min_length=1)] = "skytether/guard:1"
     """Runs once to close the network off."""
-    environment: dict[str, str] = {}
+    environment: dict[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], str] = {}
     """More variables for the services. No secrets: whoever may ask the engine sees them."""
     owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
     """Under this name containers are found again; None: one is made up when the site is added."""
@@ -113,8 +128,10 @@ class DockerOptions(Strict):
 
     @model_validator(mode="after")
     def _robots_can_connect(self) -> DockerOptions:
-        if self.advertise_host is None and self.bind_host in ("0.0.0.0", "::") and self.local:  # noqa: S104
+        if self.advertised in _WILDCARDS:
             raise ValueError("advertise_host is needed: no robot can connect to a wildcard address")
+        if self.network in _NO_NETWORKS:
+            raise ValueError(f"network: '{self.network}' has no published ports, by which robots reach instances")
         if self.ports is not None and self.ports[0] > self.ports[1]:
             raise ValueError("ports: the first is above the last")
         return self
