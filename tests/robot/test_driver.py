@@ -95,6 +95,26 @@ def test_the_cloud_drives_and_gets_the_readings(driven, bridge):
     assert decode(WrenchStamped, bridge.published[0][1]).wrench.force.x == 12.0
 
 
+def test_a_change_of_session_loses_no_command_that_came_before_it(base, bridge, make_cloud):
+    seen = []
+    rig = Rig(base, make_cloud, observer=lambda command, objection: seen.append((command.linear, objection)))
+    rig.connect(bridge)
+    assert rig.run(1.5, linear=0.2).source is Source.CLOUD
+    other = LiveSession("2", frozenset(), "cmd_vel", rig._epochs)
+    rig.driver.offer(other)
+    rig.run(0.05, linear=0.2)
+    seen.clear()
+    rig.cloud.send(rig.now, linear=0.21)
+    make_cloud(other).send(rig.now, linear=0.22)
+    rig.now += TICK
+    rig.driver.tick(rig.now)
+    assert rig.driver.session is other
+    assert seen == [(0.21, None), (0.22, None)]
+    rig.cloud.send(rig.now, linear=0.23)
+    rig.run(TICK)
+    assert len(seen) == 2, "the one before has no say any more"
+
+
 def test_silence_hands_over_to_the_person_within_300_ms_without_a_jump_and_back(driven, caplog):
     caplog.set_level(logging.WARNING)
     silence = driven.now

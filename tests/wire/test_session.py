@@ -1,6 +1,8 @@
 """Two whole sessions over made-up links: delivery, priority, roaming, clocks, accounting."""
 
 import math
+import subprocess
+import sys
 from collections import Counter
 
 import pytest
@@ -381,3 +383,29 @@ def test_an_idle_session_is_cheap(world):
     before = sum(len(p) for _, p in link.sent[ROBOT])
     link.run(10)
     assert (sum(len(p) for _, p in link.sent[ROBOT]) - before) * 8 / 10 < 20_000
+
+
+SECONDS_OF_COMMANDS = """
+import os, sys
+from skytether.testing.link import LossyLink
+from skytether.wire import Role, Session
+from skytether.wire.topic import Direction, Topic
+
+topics = (Topic("cmd_vel", "geometry_msgs/msg/Twist", Direction.OUT), Topic("odom", "nav_msgs/msg/Odometry", Direction.IN))
+key = os.urandom(32)
+link = LossyLink(*(Session(role, 1, key, topics, entropy=os.urandom, now=0.0) for role in (Role.ROBOT, Role.SERVICE)))
+link.run(0.1)
+loaded = set(sys.modules)
+for _ in range(200):
+    for topic in topics:
+        assert link.publish(topic.direction.sender, topic.name, bytes(100))
+    link.run(0.01)
+print(*sorted(set(sys.modules) - loaded))
+"""
+
+
+@pytest.mark.slow
+def test_nothing_is_loaded_while_commands_flow():
+    """A module that the first seconds of a session load stands in the way of its commands, for 20 ms once."""
+    done = subprocess.run([sys.executable, "-c", SECONDS_OF_COMMANDS], capture_output=True, text=True, timeout=60)
+    assert (done.stdout.strip(), done.stderr) == ("", "")

@@ -226,38 +226,46 @@ class Driver:
                     except Exception as error:  # costs the cloud a reading; the robot's own control goes on
                         self._caught("publish", error)
 
-    def _change_over(self) -> None:
-        """Make before break: while the cloud drives, another session takes over with its first command."""
+    def _change_over(self) -> list[LiveSession]:
+        """Make before break: while the cloud drives, another session takes over with its first command.
+
+        Returns:
+            Whose commands are taken now: at a change also those that still wait of the session before, which came
+            first. Without them the change alone would cost up to a period of commands.
+        """
         while self._offered:
             if self._coming is not None:
                 self.left.append(self._coming)
             self._coming = self._offered.popleft()
-        coming = self._coming
+        before, coming = self.session, self._coming
         if coming is not None and (self._choice.source is not Source.CLOUD or coming.commands):
-            if self.session is not None:
-                self.left.append(self.session)
+            if before is not None:
+                self.left.append(before)
             self.session, self._coming = coming, None
+            return [before, coming] if before is not None else [coming]
+        return [before] if before is not None else []
 
     def _take_commands(self, now: float) -> None:
-        self._change_over()
-        if self.session is None:
+        for session in self._change_over():
+            for epoch, message in session.take():
+                self._take(epoch, message, session.encoding, now)
+
+    def _take(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:
+        try:
+            command = _command(epoch, message, encoding)
+        except DecodeError as error:
+            self._caught("decode", error)
             return
-        for epoch, message in self.session.take():
+        objection = self._admit(command, now)
+        if objection is None:
+            self._patience.arrived(command.received_at)
+            if self._first_command_at is None:
+                self._first_command_at = command.received_at
+        if self._observer is not None:
             try:
-                command = _command(epoch, message, self.session.encoding)
-            except DecodeError as error:
-                self._caught("decode", error)
-                continue
-            objection = self._admit(command, now)
-            if objection is None:
-                self._patience.arrived(command.received_at)
-                if self._first_command_at is None:
-                    self._first_command_at = command.received_at
-            if self._observer is not None:
-                try:
-                    self._observer(command, objection)
-                except Exception as error:  # measuring must not stop the robot
-                    self._caught("observer", error)
+                self._observer(command, objection)
+            except Exception as error:  # measuring must not stop the robot
+                self._caught("observer", error)
 
     def _choose(self, now: float) -> None:
         held = self._supervised.held.get(Source.CLOUD)

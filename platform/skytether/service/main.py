@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
@@ -121,6 +122,8 @@ def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant) -> in
         service.start()
         started = True
         warm_up(service, grant)
+        # What is there now stays: looking through it for garbage would cost a step or two (20 ms) now and then.
+        gc.freeze()
         write_ready_file(grant, bridge.address[1])
         with beating(grant.ready_file, loop.in_step_for):
             loop.run()
