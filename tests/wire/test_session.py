@@ -393,7 +393,8 @@ from skytether.wire.topic import Direction, Topic
 
 topics = (Topic("cmd_vel", "geometry_msgs/msg/Twist", Direction.OUT), Topic("odom", "nav_msgs/msg/Odometry", Direction.IN))
 key = os.urandom(32)
-link = LossyLink(*(Session(role, 1, key, topics, entropy=os.urandom, now=0.0) for role in (Role.ROBOT, Role.SERVICE)))
+robot, service = (Session(role, 1, key, topics, entropy=os.urandom, now=0.0) for role in (Role.ROBOT, Role.SERVICE))
+link = LossyLink(robot, service)
 link.run(0.1)
 loaded = set(sys.modules)
 for _ in range(200):
