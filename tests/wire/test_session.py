@@ -391,7 +391,7 @@ from skytether.testing.link import LossyLink
 from skytether.wire import Role, Session
 from skytether.wire.topic import Direction, Topic
 
-topics = (Topic("cmd_vel", "geometry_msgs/msg/Twist", Direction.OUT), Topic("odom", "nav_msgs/msg/Odometry", Direction.IN))
+topics = (Topic("cmd_vel", "geometry_msgs/msg/Twist", Direction.OUT), Topic("odom", "nav_msgs/Odometry", Direction.IN))
 key = os.urandom(32)
 robot, service = (Session(role, 1, key, topics, entropy=os.urandom, now=0.0) for role in (Role.ROBOT, Role.SERVICE))
 link = LossyLink(robot, service)
