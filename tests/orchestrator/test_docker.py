@@ -342,6 +342,24 @@ def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntim
         docker("image", "rm", "-f", image)
 
 
+def test_a_network_that_was_pruned_is_made_again_and_goes_with_its_site(
+    docker_site: DockerSite, runtime: DockerRuntime
+) -> None:
+    runtime.start(launch(docker_site))
+    until_phase(runtime, Phase.RUNNING)
+    runtime.dismantle()  # in use: it stays, and so does its filter
+    runtime.remove("i1")
+    docker("network", "rm", docker_site.network)  # as `docker system prune` does
+    runtime.start(launch(docker_site, attempt=2))
+    until_phase(runtime, Phase.RUNNING)
+    runtime.remove("i1")
+    assert docker_site.filtered()
+    runtime.dismantle()
+    runtime.dismantle()
+    assert docker_site.network not in docker("network", "ls", "--format", "{{.Name}}").split()
+    assert not docker_site.filtered()
+
+
 def test_what_is_not_ours_is_left_alone(docker_site: DockerSite, runtime: DockerRuntime) -> None:
     labels = ["--label", "skytether.io/instance=i1", "--label", "skytether.io/attempt=1"]
     toy, sleep = docker_site.images.toy, ["--entrypoint", "sleep"]

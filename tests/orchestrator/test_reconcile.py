@@ -286,3 +286,17 @@ def test_starts_and_refusals_are_measured(bench: Any, new_record: NewRecord) -> 
     assert f"skytether_instance_start_seconds_count{labels} 1.0" in text
     assert f"skytether_instance_start_seconds_sum{labels} 0.5" in text
     assert 'skytether_placement_refusals_total{reason="cpu",service="toy",site="lab"} 1.0' in text
+
+
+@pytest.mark.parametrize(("state", "after"), [(State.STARTING, State.FAILED), (State.STOPPING, State.STOPPED)])
+def test_what_was_placed_while_its_site_was_deleted_is_given_up(
+    bench: Any, new_record: NewRecord, state: State, after: State
+) -> None:
+    b = bench()
+    add(b, new_record())
+    b.store.change(b.record(), b.clock(), state=State.PLACING)
+    b.store.change(b.record(), b.clock(), state=State.STARTING, site="deleted")
+    if state is not State.STARTING:
+        b.store.change(b.record(), b.clock(), state=state)
+    b.step()
+    assert (b.record().state, b.record().reason) == (after, "site 'deleted' was deleted: ask again")

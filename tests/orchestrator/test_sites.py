@@ -11,13 +11,13 @@ import pytest
 from skytether.api.rest import SiteCreate
 from skytether.orchestrator import sites as module
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.errors import InvalidError
-from skytether.orchestrator.runtimes.base import Runtime
+from skytether.orchestrator.errors import ConflictError, InvalidError
+from skytether.orchestrator.runtimes.base import Observation, Phase, Runtime
 from skytether.orchestrator.runtimes.process import ProcessRuntime
 from skytether.orchestrator.settings import Settings, Timing
 from skytether.orchestrator.sites import load_runtime
 from skytether.orchestrator.store import Store
-from skytether.testing.runtimes import FakeRuntime
+from skytether.testing.runtimes import FakeOptions, FakeRuntime
 
 Start = Callable[..., Orchestrator]
 
@@ -80,6 +80,44 @@ def test_a_site_whose_runtime_is_gone_is_listed_with_the_reason_and_can_be_delet
     assert "site old cannot be used" in caplog.text
     core.sites.delete("old")
     assert core.sites.all() == []
+
+
+def test_what_ended_instances_left_goes_with_their_site(start: Start) -> None:
+    did: list[str] = []
+
+    class Tidy(FakeRuntime):
+        def observe(self) -> Any:
+            return {"ended": Observation(1, Phase.EXITED)}
+
+        def remove(self, instance: str) -> None:
+            did.append(f"removed {instance}")
+
+        def dismantle(self) -> None:
+            did.append("dismantled")
+
+    core = start(find=lambda _: Tidy)
+    core.sites.add(SiteCreate(name="mine", tier="cloud", runtime="tidy"))
+    core.sites.get("mine").loop.stop(5)  # the reconciler knows no such instance, and would remove it too
+    did.clear()
+    core.sites.delete("mine")
+    assert did == ["removed ended", "dismantled"]
+
+
+class OwnedOptions(FakeOptions):
+    owner: str = ""
+
+
+class OwningRuntime(FakeRuntime):
+    Options = OwnedOptions
+    unique = "owner"
+
+
+def test_two_sites_with_the_same_instances_are_refused(start: Start) -> None:
+    core = start(find=lambda _: OwningRuntime)
+    for name, owner in (("a", "me"), ("b", "other")):
+        core.sites.add(SiteCreate(name=name, tier="edge", runtime="owning", options={"owner": owner}))
+    with pytest.raises(ConflictError, match="site 'a' has the same option 'owner': each would end the other's"):
+        core.sites.add(SiteCreate(name="c", tier="edge", runtime="owning", options={"owner": "me"}))
 
 
 def test_a_site_that_hangs_is_unreachable_and_holds_up_no_other(start: Start, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
-from skytether.orchestrator.runtimes.docker.network import bridge_of
+from skytether.orchestrator.runtimes.docker.network import table_of
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,12 @@ class DockerSite:
         """Remove the network and its filter too."""
         self.clean()
         subprocess.run(["docker", "network", "rm", self.network], capture_output=True)
-        table = f"skytether_{bridge_of(self.network)[4:]}"
+        self._nft(f"delete table {table_of(self.network)}")
+
+    def filtered(self) -> bool:
+        """Whether the network's filter is there."""
+        return self._nft(f"list table {table_of(self.network)}") == 0
+
+    def _nft(self, script: str) -> int:
         command = ["docker", "run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", self.images.name("guard")]
-        subprocess.run([*command, f"delete table inet {table}"], capture_output=True)
+        return subprocess.run([*command, script], capture_output=True).returncode

@@ -128,6 +128,7 @@ class Reconciler:
             return 0.0  # what was read is dated by another clock
         waiting = [record for record in live if record.site is None]
         placed = [record for record in live if record.site is not None]
+        self._give_up_siteless(placed, now)
         for action in plan(waiting, {}, (), now, self._timing):
             if isinstance(action, Place):
                 chosen = self._place(action.record, placed)
@@ -142,6 +143,15 @@ class Reconciler:
             self._pruned_at = self._steady()
             self._prune(now)
         return self._timing.place
+
+    def _give_up_siteless(self, placed: Sequence[Record], now: float) -> None:
+        """End what was placed at a site in the moment when that was deleted: nobody else looks at it ever again."""
+        missing = [record for record in placed if self.sites.find(record.site) is None]
+        there = {site.name for site in self._store.sites()} if missing else set()  # those here may just be opened anew
+        for record in missing:
+            if record.site not in there:
+                to = State.STOPPED if record.state is State.STOPPING else State.FAILED
+                self._store.change(record, now, state=to, reason=f"site '{record.site}' was deleted: ask again")
 
     def weigh(self, record: Record, placed: Sequence[Record] | None = None) -> Decision:
         """Where it would run now, beside what is placed; looks only."""

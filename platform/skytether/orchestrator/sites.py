@@ -201,8 +201,9 @@ class Sites:
                 raise ConflictError(
                     f"there is a site '{asked.name}' already: choose another name, or delete that first"
                 )
-            options = self._find_runtime(asked.runtime).completed(asked.options)
-            asked = asked.model_copy(update={"options": options})
+            kind = self._find_runtime(asked.runtime)
+            asked = asked.model_copy(update={"options": kind.completed(asked.options)})
+            self._must_be_unique(asked, kind.unique)
             runtime = self._make_runtime(asked)
             if not self._store.add_site(asked):  # by way of another orchestrator
                 runtime.close()
@@ -213,8 +214,17 @@ class Sites:
         site.loop.wait_first(_FIRST_LOOK)
         return site
 
+    def _must_be_unique(self, asked: SiteCreate, key: str) -> None:
+        value = asked.options.get(key)
+        for other in self._sites.values() if value is not None else ():
+            if other.asked.runtime == asked.runtime and other.asked.options.get(key) == value:
+                raise ConflictError(
+                    f"site '{other.name}' has the same option '{key}': each would end the other's instances; "
+                    "give another, or leave it out"
+                )
+
     def delete(self, name: str) -> None:
-        """Forget a site.
+        """Forget a site, with what ended instances left there.
 
         Raises:
             NotFoundError: There is none of that name.
@@ -229,7 +239,14 @@ class Sites:
                 )
             self._store.delete_site(name)
             del self._sites[name]
-        self._close(site)
+        site.loop.stop(timeout=_CLOSE_TIMEOUT)
+        try:
+            for instance in site.runtime.observe():
+                site.runtime.remove(instance)
+            site.runtime.dismantle()
+        except RuntimeFailure as error:
+            log.warning("site %s was deleted, but what it left there stays: %s", name, error)
+        site.runtime.close()
 
     def get(self, name: str) -> Site:
         """One site.

@@ -114,6 +114,9 @@ class Runtime(ABC):
     Options: ClassVar[type[Strict]]
     """The site's ``options``, validated; unknown keys are refused by name before the runtime is made."""
 
+    unique: ClassVar[str] = ""
+    """Option by which the site's instances are found: two sites with the same would end each other's."""
+
     @abstractmethod
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
         """Take charge of what is there already, also what an earlier orchestrator started.
@@ -201,6 +204,13 @@ class Runtime(ABC):
 
     def tidy(self) -> None:  # noqa: B027 (most need none)
         """Keep what grows within bounds (logs). Called about once a second."""
+
+    def dismantle(self) -> None:  # noqa: B027 (most make none)
+        """Remove what was made for the site as such; before ``close``, when it is deleted and nothing runs there.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
 
     def close(self) -> None:  # noqa: B027 (most need none)
         """Let go of the site; what runs there runs on."""

@@ -88,6 +88,7 @@ class ProcessRuntime(Runtime):
     """Runs ``python -m ENTRYPOINT`` with the same interpreter."""
 
     Options = ProcessOptions
+    unique = "folder"
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:

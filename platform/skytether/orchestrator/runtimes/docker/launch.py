@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from typing import Protocol
 
 from docker.errors import APIError, NotFound
 
@@ -29,6 +29,12 @@ _ONE_AT_A_TIME = threading.Lock()
 """From the choice of a port or a GPU until its container is seen: two starts must not choose the same."""
 
 
+class Prepare(Protocol):
+    """Has the network ready, or raises; with ``anew`` also where it was once."""
+
+    def __call__(self, *, anew: bool = False) -> None: ...
+
+
 class StoppedError(RuntimeFailure):
     """It was asked to end before it ran."""
 
@@ -43,10 +49,10 @@ class Job:
         options: DockerOptions,
         owner: str,
         follower: Follower,
-        prepare: Callable[[], None],
+        prepare: Prepare,
         before: Job | None,
     ) -> None:
-        """``prepare`` has the network ready, or raises; ``before`` is an earlier start of the instance."""
+        """``before`` is an earlier start of the instance."""
         self.launch = launch
         self.failure = ""
         """Why nothing runs, when it has ended that way."""
@@ -111,7 +117,11 @@ class Job:
         chooses = self._options.ports is not None or self.launch.spec.needs.gpu > 0
         with _ONE_AT_A_TIME if chooses else nullcontext():
             self._go_on()
-            made = self._create(image)
+            try:
+                made = self._create(image)
+            except _NetworkGoneError:
+                self._prepare(anew=True)
+                made = self._create(image)
         if self._cancelled.is_set():
             with suppress(RuntimeFailure):
                 kill(self._engine, made.id, "KILL")
@@ -168,13 +178,20 @@ class Job:
                 api.start(made)
             except BaseException as error:
                 remove(self._engine, self._follower, made)
-                if isinstance(error, APIError) and any(words in explain(error) for words in _TAKEN):
-                    raise _PortTakenError(explain(error)) from error
+                said = explain(error) if isinstance(error, APIError) else ""
+                if any(words in said for words in _TAKEN):
+                    raise _PortTakenError(said) from error
+                if said == f"network {self._options.network} not found":
+                    raise _NetworkGoneError(said) from error
                 raise
         seen = self._follower.look(made)
         if seen is None:
             raise RuntimeFailure("its container was removed by somebody else")
         return seen
+
+
+class _NetworkGoneError(RuntimeFailure):
+    """Somebody removed the network while no container was in it: ``docker system prune`` does."""
 
 
 class _PortTakenError(Exception):

@@ -8,14 +8,17 @@ the machine and the right to configure it, and ends.
 from __future__ import annotations
 
 import hashlib
+import logging
 from contextlib import suppress
 
 from docker.errors import APIError, NotFound
 
 from ..base import RuntimeFailure
-from .engine import Engine, status_of
+from .engine import Engine, explain, status_of
 from .images import ensure_image
 from .options import DockerOptions
+
+log = logging.getLogger(__name__)
 
 _OURS = "skytether.io/network"
 _GUARD = "skytether.io/guard"
@@ -27,13 +30,17 @@ def bridge_of(network: str) -> str:
     return f"sky-{hashlib.sha256(network.encode()).hexdigest()[:10]}"
 
 
+def table_of(network: str) -> str:
+    """The filter's table."""
+    return f"inet skytether_{bridge_of(network)[4:]}"
+
+
 def rules(network: str) -> str:
     """What the filter is told. Setting it again changes nothing.
 
     Answers to whom called first are let through: to robots, and to the engine's own proxy of published ports.
     """
-    bridge = bridge_of(network)
-    table = f"inet skytether_{bridge[4:]}"
+    bridge, table = bridge_of(network), table_of(network)
     chains = "".join(
         f"add chain {table} {hook} {{ type filter hook {hook} priority -5; policy accept; }}; "
         f'add rule {table} {hook} iifname "{bridge}" ct state established,related accept; '
@@ -50,8 +57,8 @@ def ensure_network(engine: Engine, options: DockerOptions) -> None:
         EngineGoneError: The engine does not answer.
         RuntimeFailure: It cannot be made.
     """
+    found = _labels(engine, options.network)
     with engine.asked():
-        found = _labels(engine, options.network)
         if found is None:
             try:
                 engine.api().create_network(
@@ -68,16 +75,33 @@ def ensure_network(engine: Engine, options: DockerOptions) -> None:
             except Exception as error:
                 if status_of(error) != 409:  # another orchestrator was faster
                     raise
-            found = _labels(engine, options.network) or {}
-    if _OURS in found:
+    if _OURS in (found if found is not None else _labels(engine, options.network) or {}):
         _guard(engine, options)
 
 
+def remove_network(engine: Engine, options: DockerOptions) -> None:
+    """Remove network and filter, if they are ours and nobody is in there: another site may use the same.
+
+    Raises:
+        EngineGoneError: The engine does not answer.
+    """
+    if _OURS not in (_labels(engine, options.network) or {}):
+        return
+    with engine.asked():
+        try:
+            engine.api().remove_network(options.network)
+        except APIError as error:
+            log.info("network %s stays: %s", options.network, explain(error))
+            return
+    run_guard(engine, options.guard_image, f"delete table {table_of(options.network)}")
+
+
 def _labels(engine: Engine, network: str) -> dict[str, str] | None:
-    try:
-        return dict(engine.api().inspect_network(network)["Labels"] or {})
-    except NotFound:
-        return None
+    with engine.asked():
+        try:
+            return dict(engine.api().inspect_network(network)["Labels"] or {})
+        except NotFound:
+            return None
 
 
 def _guard(engine: Engine, options: DockerOptions) -> None:

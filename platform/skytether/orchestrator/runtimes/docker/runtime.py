@@ -20,7 +20,7 @@ from .follow import Follower
 from .images import check_credentials
 from .launch import Job, kill, remove
 from .logs import ContainerLog
-from .network import ensure_network
+from .network import ensure_network, remove_network
 from .objects import Seen, observation, refusal
 from .options import DockerOptions
 
@@ -33,6 +33,7 @@ class DockerRuntime(Runtime):
     """
 
     Options = DockerOptions
+    unique = "owner"
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
@@ -70,9 +71,9 @@ class DockerRuntime(Runtime):
         with suppress(RuntimeFailure):  # the first start will say it
             self._prepare()
 
-    def _prepare(self) -> None:
+    def _prepare(self, *, anew: bool = False) -> None:
         with self._network_lock:
-            if not self._network_ready:
+            if anew or not self._network_ready:
                 ensure_network(self._engine, self._options)
                 self._network_ready = True
 
@@ -167,6 +168,10 @@ class DockerRuntime(Runtime):
     def follow(self, instance: str, lines: int) -> LogStream | None:
         newest = self._newest(instance)
         return ContainerLog(self._engine, newest.id, lines) if newest is not None and newest.runs else None
+
+    @override
+    def dismantle(self) -> None:
+        remove_network(self._engine, self._options)
 
     @override
     def close(self) -> None:
