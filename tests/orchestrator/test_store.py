@@ -74,6 +74,30 @@ def test_lists_are_by_robot_by_site_and_without_the_ended(store: Store, new_reco
     assert store.known(["a", "c", "nobody"]) == {"a", "c"}
 
 
+def test_looking_again_reads_only_what_changed(store: Store, new_record: NewRecord) -> None:
+    for name in ("a", "b", "c"):
+        store.add(new_record(name, site="lab", state=State.RUNNING), "operator", None, "")
+    before = store.live()
+    assert [old is new for old, new in zip(before, store.live_at("lab"), strict=True)] == [True] * 3
+    store.renew("b", NOW + 1, 60)
+    store.change(before[2], NOW, state=State.STOPPING)
+    now = store.live()
+    assert [old is new for old, new in zip(before, now, strict=True)] == [True, False, False]
+    assert now == [store.get(name) for name in ("a", "b", "c")]
+
+
+def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("warm", spare=True, state=State.RUNNING), "", None, "")
+    store.add(new_record("cold", spare=True, state=State.STARTING), "", None, "")
+    store.add(new_record("other", spare=True, state=State.RUNNING, service="other"), "", None, "")
+    assert [r.id for r in store.spares("toy")] == ["warm"]
+    for name, source in (("a", "cloud"), ("b", "stop"), ("c", None)):
+        store.add(new_record(name, state=State.RUNNING), "operator", None, "")
+        store.renew(name, NOW, None, report=lambda _, source=source: {"control_source": source})  # type: ignore[misc]
+    assert store.reports() == {n: {"control_source": s} for n, s in (("a", "cloud"), ("b", "stop"), ("c", None))}
+    assert store.reports(("stop", "fallback")) == {"b": {"control_source": "stop"}}
+
+
 def test_a_change_needs_to_have_seen_the_last_one(store: Store, new_record: NewRecord) -> None:
     first = store.add(new_record(), "operator", None, "")
     second = store.change(first, NOW + 1, state=State.PLACING)

@@ -106,6 +106,8 @@ class Catalogue:
         self._store = store
         self._fixed: dict[str, Manifest] = {}
         self._broken: Mapping[str, str] = {}
+        self._parsed: dict[str, tuple[dict[str, Any], Manifest]] = {}
+        """By name, what was stored when it was read last: the reconciler reads all again and again."""
 
     def load(self, folder: Path | None) -> None:
         """Read what is installed, and the folder.
@@ -120,8 +122,16 @@ class Catalogue:
 
     def all(self) -> list[Manifest]:
         """By name."""
-        stored = {name: Manifest.model_validate(m) for name, m in self._store.services().items()}
-        return [manifest for _, manifest in sorted((self._fixed | stored).items())]
+        return [manifest for _, manifest in sorted((self._fixed | self._stored()).items())]
+
+    def _stored(self) -> dict[str, Manifest]:
+        """Those that were put; parsed anew where they changed."""
+        before, now = self._parsed, {}
+        for name, document in self._store.services().items():
+            known = before.get(name)
+            now[name] = known if known and known[0] == document else (document, Manifest.model_validate(document))
+        self._parsed = now
+        return {name: manifest for name, (_, manifest) in now.items()}
 
     def get(self, name: str) -> Manifest:
         """One service.
@@ -129,9 +139,9 @@ class Catalogue:
         Raises:
             NotFoundError: There is none of that name; the text names those there are.
         """
-        stored = self._store.services().get(name)
+        stored = self._stored().get(name)
         if stored is not None:
-            return Manifest.model_validate(stored)
+            return stored
         if name in self._fixed:
             return self._fixed[name]
         if name in self._broken:

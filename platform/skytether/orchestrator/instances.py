@@ -96,7 +96,7 @@ class Instances:
             params=asked.params,
             measurements={site: m.model_dump(exclude_none=True) for site, m in asked.measurements.items()},
         )
-        decision = self._reconciler.weigh(record)
+        decision = self._reconciler.weigh(record, ())  # whether it could ever run does not depend on what is there
         if decision.hopeless:
             raise self._no_site(record, decision)
         return record
@@ -136,7 +136,7 @@ class Instances:
             )
         coming = self._store.successor(instance)
         if coming is not None:
-            return coming
+            return self.get(principal, coming)
         if asked.site is not None:
             self._sites.get(asked.site)
             if asked.site == record.site:
@@ -248,7 +248,7 @@ class Instances:
             placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
             session=self._session(record) if with_session else None,
             replaces=record.replaces,
-            successor=self._store.successor_id(record.id) if with_session else None,
+            successor=self._store.successor(record.id) if with_session else None,
             restarts=record.restarts,
             created_at=utc(record.created_at),
             updated_at=utc(record.updated_at),

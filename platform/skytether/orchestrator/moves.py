@@ -8,7 +8,7 @@ runs, so whatever goes wrong with a successor costs the robot nothing.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 FOREVER = 2.5e11
 """End of a spare's lease: a date that can be written (the year 9892)."""
+_BY_ITSELF = ("fallback", "stop")
+"""What controls a robot whose service is not good enough for it."""
 _SETTLED = 30.0
 """Seconds that a spare with other parameters is kept: robots that ask for different ones must not wear it out."""
 
@@ -80,11 +82,10 @@ class Moves:
 
     def spares_for(self, record: Record) -> list[Record]:
         """Warm instances that could be this one, the best site's first; none at a site that is much worse."""
-        live = self._store.live()
-        same = [spare for spare in live if spare.spare and spare.state is State.RUNNING and _alike(spare, record)]
+        same = [spare for spare in self._store.spares(record.service) if _alike(spare, record)]
         if not same:
             return []
-        decision = self._weigh(record, [other for other in live if other not in same])
+        decision = self._weigh(record, [other for other in self._store.live() if other not in same])
         scores = {score.site: score.total_ms for score in decision.scores}
         limit = min(scores.values(), default=0.0) + self._weights.migrate_ms
         good = [s for s in same if s.site in scores and scores[s.site] <= limit and self._reachable(s)]
@@ -162,17 +163,18 @@ class Moves:
                 log.warning("%s for %s: %s; standby %s takes over", record.service, record.robot, why, spare.id)
                 return
 
-    def watch(self, live: Sequence[Record], reports: Mapping[str, Report]) -> None:
+    def watch(self, live: Sequence[Record]) -> None:
         """Fail over from sites that do not answer, and move what has not been good enough for its robot for long."""
         now = self._clock()
         for record in live:
             if record.state is State.RUNNING and not record.spare and not self._reachable(record):
                 self.fail_over(record, f"site {record.site} does not answer")
-        bad = {r.id for r in live if r.state is State.RUNNING and _by_itself(reports.get(r.id))}
+        reports = self._store.reports(_BY_ITSELF)
+        bad = {r.id for r in live if r.state is State.RUNNING and r.id in reports}
         self._bad_since = {i: self._bad_since.get(i, now) for i in bad}
         for record in live:
             if now - self._bad_since.get(record.id, now) >= self._timing.replace_after:
-                self._replace(record, reports[record.id], live, now)
+                self._replace(record, Report.model_validate(reports[record.id]), live, now)
 
     def _replace(self, record: Record, report: Report, live: Sequence[Record], now: float) -> None:
         if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
@@ -205,7 +207,3 @@ def _alike(spare: Record, record: Record) -> bool:
 
 def _document(manifest: Manifest) -> dict[str, Any]:
     return manifest.model_dump(mode="json", by_alias=True)
-
-
-def _by_itself(report: Report | None) -> bool:
-    return report is not None and report.control_source in ("fallback", "stop")

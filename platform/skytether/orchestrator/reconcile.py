@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from skytether.api.grant import Grant
-from skytether.api.rest import Measurement, Refusal, Report, State
+from skytether.api.rest import Measurement, Refusal, State
 
 from .clocks import SetClock
 from .db import GONE
@@ -137,8 +137,7 @@ class Reconciler:
             elif isinstance(action, Expire):
                 self._expire(action.record)
         self.moves.keep_spares(live)
-        reports = {instance: Report.model_validate(report) for instance, report in self._store.reports().items()}
-        self.moves.watch(live, reports)
+        self.moves.watch(live)
         if self._steady() - self._pruned_at >= _PRUNE:
             self._pruned_at = self._steady()
             self._prune(now)

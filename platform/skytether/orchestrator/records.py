@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import secrets
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 from skytether.api.manifest import Manifest, ServiceSpec
@@ -40,9 +40,9 @@ def check_move(old: State, new: State) -> None:
         raise IllegalMoveError(f"an instance cannot go from {old} to {new}")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Record:
-    """One instance."""
+    """One instance. Nobody changes what its dictionaries and lists hold: others may have the same record."""
 
     id: str
     robot: str
@@ -88,7 +88,7 @@ class Record:
     version: int = 1
     """Counts changes: who changes a record must have seen the last one."""
 
-    @property
+    @cached_property
     def spec(self) -> ServiceSpec:
         return _spec(json.dumps(self.manifest))
 

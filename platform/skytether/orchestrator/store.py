@@ -7,11 +7,11 @@ seen the last change gets None and looks again. Each change of state or reason l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, RowMapping, delete, func, insert, select, text, update
+from sqlalchemy import ColumnElement, Connection, Row, RowMapping, delete, func, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
 from skytether.api.rest import Scope, SiteCreate, State
@@ -25,6 +25,10 @@ from .security import TokenHash
 
 _FINAL = [state for state in State if state.final]
 _REASON_LENGTH = 1024
+_SEEN = 4096
+"""Records that are remembered, so that looking at many instances again and again reads only those that changed."""
+_FETCHED = 500
+"""Rows that one query names at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +82,7 @@ class Store:
         self._writer = self._engine.execution_options(immediate=True)
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
+        self._seen: dict[str, Record] = {}
 
     def migrate(self) -> None:
         migrate(self._engine)
@@ -163,12 +168,15 @@ class Store:
 
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
-        query = select(instances).where(instances.c.state.not_in(_FINAL))
-        return self._records(query.order_by(instances.c.created_at, instances.c.id))
+        return self._look(instances.c.state.not_in(_FINAL))
 
     def live_at(self, site: str) -> list[Record]:
-        """All at one site that has not ended."""
-        return self._records(select(instances).where(instances.c.state.not_in(_FINAL), instances.c.site == site))
+        """All at one site that has not ended, oldest first."""
+        return self._look(instances.c.state.not_in(_FINAL), instances.c.site == site)
+
+    def spares(self, service: str) -> list[Record]:
+        """Those of a service that run and are nobody's, oldest first."""
+        return self._look(instances.c.spare, instances.c.service == service, instances.c.state == State.RUNNING)
 
     def known(self, ids: Iterable[str]) -> set[str]:
         """Those that the store has a row of, ended or not."""
@@ -219,14 +227,8 @@ class Store:
         self.on_change(new.id)
         return new
 
-    def successor(self, instance: str) -> Record | None:
-        """The one that replaces an instance and has not ended."""
-        mine = (instances.c.replaces == instance) & instances.c.state.not_in([*_FINAL, State.STOPPING])
-        found = self._records(select(instances).where(mine).order_by(instances.c.created_at.desc()).limit(1))
-        return found[0] if found else None
-
-    def successor_id(self, instance: str) -> str | None:
-        """Its id alone, for every answer about an instance."""
+    def successor(self, instance: str) -> str | None:
+        """The id of the one that replaces an instance and has not ended."""
         mine = (instances.c.replaces == instance) & instances.c.state.not_in([*_FINAL, State.STOPPING])
         with self._engine.connect() as connection:
             return connection.scalar(select(instances.c.id).where(mine).order_by(instances.c.created_at.desc()))
@@ -280,11 +282,13 @@ class Store:
                     connection.execute(insert(reports).values(instance=instance, **values))
         return record
 
-    def reports(self) -> dict[str, dict[str, Any]]:
-        """The last report on each instance that has not ended."""
-        query = select(reports.c.instance, reports.c.report).join(instances)
+    def reports(self, control: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+        """The last report on each instance that has not ended; only of robots that one of these controls, if given."""
+        query = select(reports.c.instance, reports.c.report).join(instances).where(instances.c.state.not_in(_FINAL))
+        if control is not None:
+            query = query.where(reports.c.report["control_source"].as_string().in_(control))
         with self._engine.connect() as connection:
-            rows = connection.execute(query.where(instances.c.state.not_in(_FINAL)))
+            rows = connection.execute(query)
             return {row.instance: row.report for row in rows}
 
     def extend_leases(self, now: float) -> None:
@@ -318,6 +322,21 @@ class Store:
             newest = connection.scalar(select(func.max(events.c.id))) or 0
             connection.execute(delete(events).where(events.c.id <= newest - events_count))
         return gone
+
+    def _look(self, *conditions: ColumnElement[bool]) -> list[Record]:
+        """Oldest first. Of those that have not changed since they were seen last, only the version is read."""
+        newest = select(instances.c.id, instances.c.version).where(*conditions)
+        with self._engine.connect() as connection:
+            rows = connection.execute(newest.order_by(instances.c.created_at, instances.c.id)).all()
+            found = {id_: self._seen.get(id_) for id_, _ in rows}
+            changed = [id_ for id_, version in rows if (seen := found[id_]) is None or seen.version != version]
+            for start in range(0, len(changed), _FETCHED):
+                these = select(instances).where(instances.c.id.in_(changed[start : start + _FETCHED]))
+                found |= {row["id"]: _record(row) for row in connection.execute(these).mappings()}
+        if len(self._seen) > _SEEN:
+            self._seen = {}
+        self._seen |= {id_: record for id_ in changed if (record := found[id_]) is not None}
+        return [record for record in found.values() if record is not None]
 
     def _records(self, query: Any) -> list[Record]:
         with self._engine.connect() as connection:

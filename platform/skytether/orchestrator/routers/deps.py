@@ -22,7 +22,7 @@ _LARGE = 16_384
 bearer = HTTPBearer(auto_error=False, description="An operator's token, or a robot's")
 
 
-def _core(request: Request) -> Orchestrator:
+async def _core(request: Request) -> Orchestrator:
     core: Orchestrator = request.app.state.core
     return core
 
@@ -51,7 +51,7 @@ Authenticated = Annotated[Principal, Depends(authenticated)]
 
 
 def _holder(scope: Scope, *, robots: bool = False) -> Any:
-    def check(caller: Authenticated) -> Principal:
+    async def check(caller: Authenticated) -> Principal:  # what does not wait needs no thread to wait in
         caller.require_scope(scope, robots=robots)
         return caller
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import platform
 import shutil
@@ -21,7 +22,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,6 +40,9 @@ _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
+_MEASURE = 1.0
+"""Seconds between two readings of processor time, memory and ready file of a child that runs; whether it still does is
+looked at each time."""
 _LAST_LINE = 300
 """Characters of a log's last line that are told."""
 
@@ -81,7 +85,18 @@ class _Run:
     child: subprocess.Popen[bytes] | None = None
     """None for one that an earlier orchestrator started."""
     asked_to_end: bool = False
-    ended: Observation | None = field(default=None)
+    seen: Observation | None = None
+    """As it was when it was read last."""
+
+    @property
+    def ended(self) -> Observation | None:
+        """Its end, which cannot change any more; nothing on the machine does. None: it has not."""
+        return self.seen if self.seen and self.seen.phase is Phase.EXITED else None
+
+    @property
+    def runs_on(self) -> bool:
+        """A child that was running, and has not ended since: one system call tells."""
+        return bool(self.seen and self.seen.phase is Phase.RUNNING and self.child and self.child.poll() is None)
 
 
 class ProcessRuntime(Runtime):
@@ -101,6 +116,7 @@ class ProcessRuntime(Runtime):
         self._folder = folder / "instances"
         self._data = folder / "data"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._measured_at = -math.inf
         self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
 
     def _adopt(self, folder: Path) -> _Run:
@@ -187,20 +203,22 @@ class ProcessRuntime(Runtime):
             )
 
     def observe(self) -> Mapping[str, Observation]:
-        return {instance: self._look(instance, run) for instance, run in self._runs.items()}
+        now = time.monotonic()
+        if measure := now - self._measured_at >= _MEASURE:
+            self._measured_at = now
+        for instance, run in self._runs.items():
+            if not run.ended and (measure or not run.runs_on):
+                run.seen = self._look(instance, run)
+        return {instance: run.seen for instance, run in self._runs.items() if run.seen}
 
     def _look(self, instance: str, run: _Run) -> Observation:
-        if run.ended is not None:
-            return run.ended
         folder = self._folder / instance
         stat = run.process and stat_of(run.process)
         if not stat or stat.zombie:
             status = run.child.poll() if run.child else None
             if run.child and status is None:
                 return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
-            # Remembered, for it cannot change any more; nothing on the machine does.
-            run.ended = Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(folder / "log"))
-            return run.ended
+            return Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(folder / "log"))
         port = _port(folder / "ready.json")
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None

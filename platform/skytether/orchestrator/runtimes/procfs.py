@@ -48,7 +48,8 @@ class ProcessStat:
     def read(cls, pid: int) -> ProcessStat | None:
         """None if there is no such process."""
         try:
-            text = (_PROC / str(pid) / "stat").read_bytes()
+            with open(f"{_PROC}/{pid}/stat", "rb", buffering=0) as file:  # often read: thrice as quick as by a Path
+                text = file.read()
         except (FileNotFoundError, ProcessLookupError):
             return None
         # The second field is the program's name in brackets, and may hold anything; those after it are numbers.
