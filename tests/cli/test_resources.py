@@ -38,7 +38,7 @@ def run(orchestrator: EmbeddedOrchestrator, monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setenv("SKYTETHER_URL", orchestrator.url)
     monkeypatch.setenv("SKYTETHER_TOKEN", orchestrator.operator_token)
     monkeypatch.setenv("HOME", str(tmp_path))
-    return lambda *arguments: CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+    return lambda *arguments, stdin="": CliRunner().invoke(app, list(arguments), input=stdin, catch_exceptions=False)
 
 
 def good(result: Result) -> Any:
@@ -82,6 +82,67 @@ def test_a_service_from_file_to_log(run: Run, tmp_path: Path) -> None:
     assert "there is no service 'toy'" in bad(run("instance", "create", "toy", "--robot", "walker"))
 
 
+def written(path: Path, *documents: Any) -> str:
+    path.write_text(yaml.safe_dump_all(documents))
+    return str(path)
+
+
+def named(name: str, **spec: Any) -> dict[str, Any]:
+    return {**MANIFEST, "metadata": {"name": name}, "spec": {**MANIFEST["spec"], **spec}}
+
+
+@pytest.mark.slow
+def test_files_are_applied_all_or_none_and_as_often_as_one_likes(run: Run, tmp_path: Path) -> None:
+    def results(*arguments: str, stdin: str = "") -> dict[str, str]:
+        rows = good(run("apply", *arguments, "--json", stdin=stdin))
+        return {row["metadata"]["name"]: row["result"] for row in rows}
+
+    folder = tmp_path / "services"
+    folder.mkdir()
+    written(folder / "one.yaml", named("a1"), named("a2"))
+    written(folder / "two.yml", named("a3"))
+    (folder / "notes.txt").write_text("no manifest")
+    new = dict.fromkeys(["a1", "a2", "a3"], "created")
+    assert results("-f", str(folder), "--dry-run") == new
+    assert results("-f", str(folder)) == new
+    assert results("-f", str(folder)) == dict.fromkeys(new, "unchanged")
+    changed = yaml.safe_dump_all([named("a3", needs={"cpu": 0.5}), named("a4")])
+    assert results("-f", "-", "-f", str(folder / "one.yaml"), stdin=changed) == {
+        "a3": "changed",
+        "a4": "created",
+        "a1": "unchanged",
+        "a2": "unchanged",
+    }
+    shown = run("apply", "-f", str(folder / "one.yaml"))
+    assert (shown.stdout, shown.stderr.split()[:3]) == ("", ["unchanged", "service", "a1,"])
+
+    wrong = written(tmp_path / "wrong.yaml", named("b1"), named("b2", entrpoint="x"), named("b3", params={"type": 3}))
+    refused = run("apply", "-f", wrong)
+    assert refused.exit_code == 1
+    first, second = refused.stderr.splitlines()
+    assert first == f"error: {wrong}, document 2: spec.entrpoint: unknown key, did you mean 'entrypoint'?"
+    assert second.startswith(f"error: {wrong}, document 3: spec.params.type: ")
+    assert "there is no service 'b1'" in bad(run("service", "show", "b1"))
+    twice = written(tmp_path / "twice.yaml", named("a1"))
+    assert f"service 'a1' is in {twice} already" in bad(run("apply", "-f", twice, "-f", twice), 2)
+    assert "'A/1' is no name" in bad(run("apply", "-f", written(tmp_path / "name.yaml", named("A/1"))), 2)
+    (tmp_path / "empty").mkdir()
+    assert "holds no *.yaml" in bad(run("apply", "-f", str(tmp_path / "empty")), 2)
+    assert bad(run("apply", "-f", "-", stdin=": ["), 2).startswith("standard input: is no YAML")
+    assert yaml.safe_load(run("service", "show", "a3").stdout)["spec"]["needs"]["cpu"] == 0.5
+    for name in ("a1", "a2", "a3", "a4"):
+        assert run("service", "delete", name).exit_code == 0
+
+
+@pytest.mark.slow
+def test_a_table_in_a_pipe_has_one_line_for_each_row(run: Run, tmp_path: Path) -> None:
+    topics = [{"name": f"topic_{i:02}", "type": "std_msgs/msg/String", "direction": "in"} for i in range(30)]
+    run("apply", "-f", written(tmp_path / "x.yaml", named("wide", topics=topics)))
+    (row,) = [line for line in run("service", "list").stdout.splitlines() if line.startswith("wide")]
+    assert "topic_29" in row
+    assert run("service", "delete", "wide").exit_code == 0
+
+
 @pytest.mark.slow
 def test_a_robot_gets_its_token_on_standard_output_alone(run: Run, tmp_path: Path) -> None:
     added = run("robot", "add", "newcomer", "--service", "toy")
@@ -102,8 +163,11 @@ def test_a_robot_gets_its_token_on_standard_output_alone(run: Run, tmp_path: Pat
 def test_a_service_that_ends_at_once_is_told(run: Run, tmp_path: Path) -> None:
     (tmp_path / "toy.yaml").write_text(yaml.safe_dump(MANIFEST))
     run("apply", "-f", str(tmp_path / "toy.yaml"))
-    sentence = bad(run("instance", "create", "toy", "--robot", "r", "--params", '{"exit_status": 2, "say": "no mass"}'))
+    result = run("instance", "create", "toy", "--robot", "r", "--params", '{"exit_status": 2, "say": "no mass"}')
+    assert (result.exit_code, result.stdout) == (1, "")
+    *steps, sentence = result.stderr.splitlines()
     assert 'is failed: the service ended with exit status 2; its last line: "no mass"' in sentence
+    assert [step.split(": ")[1] for step in steps] == ["pending", "placing", "starting", "failed"]
 
 
 @pytest.mark.slow
@@ -128,6 +192,11 @@ def test_a_wrong_file_is_one_sentence(run: Run, tmp_path: Path, text: str | None
     ("arguments", "status", "sentence"),
     [
         (["instance", "show", "x"], 1, "there is no instance 'x'"),
+        (["service", "show", "recoder"], 1, "there is no service 'recoder'"),
+        (["service", "delete", "recoder"], 1, "did you mean 'recorder'?"),
+        (["site", "delete", "locl"], 1, "there is no site 'locl'; known are: local; did you mean 'local'?"),
+        (["robot", "delete", "nobody"], 1, "there is no robot 'nobody'; known are: "),
+        (["token", "delete", "0"], 1, "there is no token '0'; known are: "),
         (["instance", "create", "toy", "--robot", "R!"], 2, "robot: "),
         (["instance", "create", "toy", "--robot", "r", "--params", "{"], 2, "--params is no JSON"),
         (["instance", "create", "toy", "--robot", "r", "--params", "[]"], 2, "params: "),

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
+from skytether.api.rest import Change
 from skytether.orchestrator.catalogue import Catalogue, parse_manifest, read_builtin, read_folder
 from skytether.orchestrator.errors import ConflictError, InvalidError, NotFoundError
 from skytether.orchestrator.store import Store
@@ -90,8 +91,14 @@ def test_what_was_put_goes_before_the_folder_and_uncovers_it_when_deleted(
     (tmp_path / "a.yaml").write_text(yaml.safe_dump(manifest("a", entrypoint="folder")))
     catalogue = Catalogue(store)
     catalogue.load(tmp_path)
-    assert not catalogue.put("a", parse_manifest(manifest("a", entrypoint="put")))
-    assert catalogue.put("b", parse_manifest(manifest("b")))
+    assert catalogue.put("a", parse_manifest(manifest("a", entrypoint="folder"))) is Change.UNCHANGED
+    changed = parse_manifest(manifest("a", entrypoint="put"))
+    assert catalogue.put("a", changed, dry_run=True) is Change.CHANGED
+    assert catalogue.get("a").spec.entrypoint == "folder"
+    assert catalogue.put("a", changed) is Change.CHANGED
+    assert catalogue.put("a", changed) is Change.UNCHANGED
+    assert catalogue.put("b", parse_manifest(manifest("b")), dry_run=True) is Change.CREATED
+    assert catalogue.put("b", parse_manifest(manifest("b"))) is Change.CREATED
     assert catalogue.get("a").spec.entrypoint == "put"
     assert {"a", "b"} <= {m.metadata.name for m in catalogue.all()}
     catalogue.delete("a")

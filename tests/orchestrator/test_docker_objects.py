@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
+from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
@@ -308,13 +309,16 @@ def test_the_last_line_that_can_be_read() -> None:
 def test_a_pull_tells_how_far_it_is() -> None:
     progress = Progress("x:1")
     said = [
-        progress.text(message)
+        str(progress.after(message))
         for message in (
             {"status": "Pulling from x", "id": "1"},
             {"status": "Downloading", "id": "a", "progressDetail": {"current": 5_000_000, "total": 10_000_000}},
             {"status": "Downloading", "id": "b", "progressDetail": {"current": 1_000_000, "total": 30_000_000}},
             {"status": "Download complete", "id": "a"},
-            {"status": "Pull complete", "id": "b"},
+            {"status": "Extracting", "id": "a", "progressDetail": {"current": 2_000_000, "total": 10_000_000}},
+            {"status": "Download complete", "id": "b"},
+            {"status": "Pull complete", "id": "a"},
+            {"status": "Extracting", "id": "b", "progressDetail": {"current": 99_000_000}},
         )
     ]
     assert said == [
@@ -322,8 +326,15 @@ def test_a_pull_tells_how_far_it_is() -> None:
         "pulling x:1: 5 of 10 MB",
         "pulling x:1: 6 of 40 MB",
         "pulling x:1: 11 of 40 MB",
-        "unpacking x:1",
+        "pulling x:1: 11 of 40 MB",
+        "unpacking x:1: 2 of 40 MB",
+        "unpacking x:1: 10 of 40 MB",
+        "unpacking x:1: 40 of 40 MB",
     ]
+    assert read_pull(said[1]) == Pull("x:1", done=5_000_000, total=10_000_000)
+    assert read_pull(said[-1]) == Pull("x:1", unpacking=True, done=40_000_000, total=40_000_000)
+    assert read_pull("pulling h:5000/a/b@sha256:0f") == Pull("h:5000/a/b@sha256:0f")
+    assert read_pull("waiting for a site: pulling x:1") is None
 
 
 def test_credentials_must_be_private(tmp_path: Path) -> None:

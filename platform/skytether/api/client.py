@@ -6,7 +6,7 @@ import json
 import ssl
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -16,6 +16,8 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from .manifest import Manifest
 from .rest import (
+    CHANGE,
+    Change,
     Instance,
     InstanceCreate,
     InstanceEvent,
@@ -180,8 +182,15 @@ class Client:
                 if deadline is not None and time.monotonic() >= deadline:
                     return
 
-    def wait_running(self, instance_id: str, timeout: float = 30.0) -> Instance:
+    def wait_running(
+        self, instance_id: str, timeout: float = 30.0, on_event: Callable[[InstanceEvent], None] = lambda _: None
+    ) -> Instance:
         """Wait until an instance is running, and give it with its session.
+
+        Args:
+            instance_id: Which.
+            timeout: Seconds.
+            on_event: Called with each of its changes, the past ones first.
 
         Raises:
             NotRunning: It ended, or it took too long.
@@ -189,6 +198,7 @@ class Client:
         state, reason = State.PENDING, ""
         for event in self.watch(instance_id, timeout=timeout):
             state, reason = event.state, event.reason
+            on_event(event)
             if state is State.RUNNING:
                 instance = self.get_instance(instance_id)
                 if instance.state is State.RUNNING:
@@ -210,6 +220,17 @@ class Client:
     def put_service(self, name: str, manifest: Manifest | dict[str, Any]) -> Manifest:
         """Add or change a service. A plain document is validated by the orchestrator."""
         return self._one(Manifest, "PUT", f"/catalog/{name}", manifest)
+
+    def apply_service(
+        self, name: str, manifest: Manifest | dict[str, Any], *, dry_run: bool = False
+    ) -> tuple[Manifest, Change]:
+        """The same, and what it did; with ``dry_run`` what it would do, and nothing is stored."""
+        response = self._request("PUT", f"/catalog/{name}?dry_run={str(dry_run).lower()}", manifest)
+        try:
+            change = Change(response.headers.get(CHANGE, ""))
+        except ValueError as error:
+            raise ApiError(_strange(f"no {CHANGE}")) from error
+        return _parse(Manifest, _json(response)), change
 
     def delete_service(self, name: str) -> None:
         """Remove a service that was put."""

@@ -70,6 +70,13 @@ def unknown(key: str, known: Iterable[str]) -> str:
     return f"unknown key; known are {', '.join(candidates)}" if candidates else "unknown key; there are none"
 
 
+def known(names: Iterable[str], wrong: str) -> str:
+    """How a sentence on a name that there is not goes on: those there are, and the one that was meant perhaps."""
+    there = sorted(names)
+    near = difflib.get_close_matches(wrong, there, n=1)
+    return f"known are: {', '.join(there) or 'none'}" + (f"; did you mean '{near[0]}'?" if near else "")
+
+
 def _keys(schema: Mapping[str, Any], path: Sequence[Any]) -> list[str]:
     """Known keys at a place in a document, by its JSON schema."""
     places = [schema]

@@ -28,6 +28,17 @@ class State(StrEnum):
         return self in (State.STOPPED, State.FAILED)
 
 
+class Change(StrEnum):
+    """What a document that was put did, in the header ``Skytether-Change`` of the answer."""
+
+    CREATED = "created"
+    CHANGED = "changed"
+    UNCHANGED = "unchanged"
+
+
+CHANGE = "Skytether-Change"
+
+
 class Measurement(Strict):
     """What a robot measured towards one site."""
 

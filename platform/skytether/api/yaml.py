@@ -10,8 +10,8 @@ import yaml
 
 from .plain import oddity
 
-_MAX_BYTES = 1 << 20
-_MAX_VALUES = _MAX_BYTES
+MAX_BYTES = 1 << 20
+_MAX_VALUES = MAX_BYTES
 """Of a document with its aliases written out. Without aliases there are never so many: each takes a byte at least."""
 
 
@@ -60,7 +60,7 @@ def read_bounded(path: Path) -> bytes:
         OSError: It cannot be read.
     """
     with path.open("rb") as file:
-        return file.read(_MAX_BYTES + 1)
+        return file.read(MAX_BYTES + 1)
 
 
 def parse_yaml(text: bytes, path: Path) -> list[Any]:
@@ -73,8 +73,8 @@ def parse_yaml(text: bytes, path: Path) -> list[Any]:
     Raises:
         YamlError: It is too large, or is no YAML.
     """
-    if len(text) > _MAX_BYTES:
-        raise YamlError(f"{path}: is larger than {_MAX_BYTES} bytes: that is nothing people write")
+    if len(text) > MAX_BYTES:
+        raise YamlError(f"{path}: is larger than {MAX_BYTES} bytes: that is nothing people write")
     try:
         documents = [document for document in yaml.load_all(text, _Loader) if document is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:

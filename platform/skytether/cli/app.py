@@ -9,6 +9,7 @@ import typer
 from skytether import __version__
 
 from . import (
+    apply,
     bridge,
     demo,
     doctor,
@@ -37,7 +38,7 @@ app.command()(bridge.bridge)
 app.command()(relay.relay)
 app.command()(echo.echo)
 app.command()(doctor.doctor)
-app.command()(resources.apply)
+app.command()(apply.apply)
 resources.robot_app.command("status")(robot_status.status)
 app.add_typer(orchestrator.app, name="orchestrator")
 app.add_typer(resources.service_app, name="service")

@@ -45,7 +45,7 @@ def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
     from skytether.api.client import ApiError, Client, NotRunning, Unreachable
 
     try:
-        with Client(url or _local_url(), _token(token_file), ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
+        with Client(url or local_url(), _token(token_file), ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
             yield client
     except (ApiError, NotRunning, Unreachable) as error:
         fail(str(error))
@@ -53,7 +53,8 @@ def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
         fail("interrupted", 130)
 
 
-def _local_url() -> str:
+def local_url() -> str:
+    """Of the orchestrator of this machine and user."""
     try:
         return (default_state_dir() / "address").read_text().strip()
     except OSError:
@@ -61,15 +62,24 @@ def _local_url() -> str:
 
 
 def _token(given: Path | None) -> str:
-    """A file named on the command line goes before the environment, and that before this machine's."""
-    if given is None and os.environ.get("SKYTETHER_TOKEN"):
-        return os.environ["SKYTETHER_TOKEN"].strip()
     path = given or default_state_dir() / "operator.token"
     try:
-        return path.read_text(encoding="ascii").strip()
+        return local_token(given)
     except FileNotFoundError:
         if given is None:
             return ""  # nothing runs here, or it is another user's: the answer will say which
         fail(f"there is no token file {path}", 2)
     except (OSError, UnicodeDecodeError) as error:
         fail(f"cannot read the token file {path}: {getattr(error, 'strerror', None) or 'it is no text'}", 2)
+
+
+def local_token(given: Path | None) -> str:
+    """A file named on the command line goes before the environment, and that before this machine's.
+
+    Raises:
+        OSError: It cannot be read.
+        UnicodeDecodeError: It is no text.
+    """
+    if given is None and os.environ.get("SKYTETHER_TOKEN"):
+        return os.environ["SKYTETHER_TOKEN"].strip()
+    return (given or default_state_dir() / "operator.token").read_text(encoding="ascii").strip()

@@ -6,6 +6,7 @@ import json
 import logging
 import sys
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
@@ -15,6 +16,8 @@ from rich.markup import escape
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
+_WIDE = 10_000
+"""Columns of a table that goes to a pipe or a file: more than any row has."""
 _PRIVATE = {"session": {"key"}}
 console = Console(stderr=True, highlight=False)
 """For people: progress, tables, notes. Standard output is kept for what programs read."""
@@ -27,9 +30,20 @@ def fail(sentence: str, status: int = 1) -> NoReturn:
         sentence: Without "error:" in front.
         status: Exit status; 2 for wrong usage or configuration, 1 for everything else.
     """
+    _complain(sentence)
+    raise typer.Exit(status)
+
+
+def fail_all(sentences: Sequence[str], status: int = 1) -> NoReturn:
+    """The same for several things that are wrong at once, a line each."""
+    for sentence in sentences[:-1]:
+        _complain(sentence)
+    fail(sentences[-1], status)
+
+
+def _complain(sentence: str) -> None:
     console.print("error: ", style="bold red", end="")
     console.print(sentence, markup=False, soft_wrap=True)
-    raise typer.Exit(status)
 
 
 def print_json(document: Any) -> None:
@@ -41,11 +55,15 @@ def print_json(document: Any) -> None:
 
 def plain(model: BaseModel) -> Any:
     """A model as JSON, without session keys: the output of a command ends up in logs and bug reports."""
-    return model.model_dump(mode="json", exclude=_PRIVATE if "session" in type(model).model_fields else None)
+    return model.model_dump(
+        mode="json", by_alias=True, exclude=_PRIVATE if "session" in type(model).model_fields else None
+    )
 
 
 def or_dash(value: Any) -> Any:
-    """For a cell of a table."""
+    """For a cell of a table; times to the second, in UTC."""
+    if isinstance(value, datetime):
+        return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%SZ")
     return "-" if value is None else value
 
 
@@ -59,7 +77,9 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
-    Console(highlight=False).print(table)
+    out = Console(highlight=False)
+    # A program that reads lines must not find one row on two of them.
+    out.print(table) if out.is_terminal else Console(highlight=False, width=_WIDE).print(table)
 
 
 def log_to_console() -> None:

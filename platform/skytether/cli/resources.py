@@ -1,15 +1,17 @@
-"""``skytether apply, service, site, instance, robot``: small verbs over the REST client."""
+"""``skytether service, site, instance, robot``: small verbs over the REST client."""
 
 from __future__ import annotations
 
 import json as json_module
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from . import names
 from .connection import Json, TokenFile, Url, connected
 from .output import console, fail, or_dash, plain, print_json, print_table
+from .waiting import until_running
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -19,41 +21,13 @@ site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
 instance_app = typer.Typer(help="What runs, for whom.", no_args_is_help=True)
 robot_app = typer.Typer(help="Who may ask; and what runs on a robot: its agent and its gate.", no_args_is_help=True)
 
-
-def apply(
-    file: Annotated[Path, typer.Option("--file", "-f", help="YAML file with one or more manifests.")],
-    url: Url = None,
-    token_file: TokenFile = None,
-    json: Json = False,
-) -> None:
-    """Add the services of a file to the catalogue, or change them."""
-    documents = _documents(file)
-    with connected(url, token_file) as client:
-        done = [client.put_service(_name(document, file), document) for document in documents]
-    if json:
-        print_json([manifest.model_dump(mode="json", by_alias=True) for manifest in done])
-    for manifest in done:
-        console.print(f"service {manifest.metadata.name}, version {manifest.metadata.version}: applied")
-
-
-def _documents(file: Path) -> list[Any]:
-    from skytether.api.yaml import YamlError, read_yaml
-
-    try:
-        documents = read_yaml(file)
-    except YamlError as error:
-        fail(str(error), 2)
-    if not documents:
-        fail(f"{file} holds no manifest", 2)
-    return documents
-
-
-def _name(document: Any, file: Path) -> str:
-    metadata = document.get("metadata") if isinstance(document, dict) else None
-    name = metadata.get("name") if isinstance(metadata, dict) else None
-    if not isinstance(name, str):
-        fail(f"{file}: metadata.name: is missing", 2)
-    return name
+ServiceName = Annotated[str, typer.Argument(help="Its name.", autocompletion=names.services)]
+SiteName = Annotated[str, typer.Argument(help="Its name.", autocompletion=names.sites)]
+InstanceId = Annotated[str, typer.Argument(help="Its id.", autocompletion=names.instances)]
+Wait = Annotated[bool, typer.Option(help="Wait until it runs, and show how far it is.")]
+Timeout = Annotated[float, typer.Option("--timeout-s", min=0.1, help="How long to wait.")]
+_TIMEOUT_S = 600.0
+"""A large image is pulled in that time."""
 
 
 @service_app.command("list")
@@ -71,10 +45,19 @@ def list_services(url: Url = None, token_file: TokenFile = None, json: Json = Fa
     print_table(("service", "version", "tiers", "topics"), rows)
 
 
+@service_app.command("show")
+def show_service(name: ServiceName, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+    """Show a service's manifest."""
+    with connected(url, token_file) as client:
+        found = client.get_service(name)
+    _show(found, json)
+
+
 @service_app.command("delete")
-def delete_service(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_service(name: ServiceName, url: Url = None, token_file: TokenFile = None) -> None:
     """Remove a service that was applied; its instances run on."""
     with connected(url, token_file) as client:
+        need("service", name, lambda: [manifest.metadata.name for manifest in client.services()])
         client.delete_service(name)
 
 
@@ -91,7 +74,7 @@ def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False
 
 
 @site_app.command("show")
-def show_site(name: str, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+def show_site(name: SiteName, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
     """Show one site."""
     with connected(url, token_file) as client:
         found = client.get_site(name)
@@ -148,7 +131,7 @@ def _value(text: str) -> Any:
 
 
 @site_app.command("delete")
-def delete_site(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_site(name: SiteName, url: Url = None, token_file: TokenFile = None) -> None:
     """Forget a site that has no instances."""
     with connected(url, token_file) as client:
         client.delete_site(name)
@@ -179,13 +162,14 @@ def list_instances(url: Url = None, token_file: TokenFile = None, json: Json = F
 
 @instance_app.command("create")
 def create_instance(
-    service: Annotated[str, typer.Argument(help="What to run.")],
-    robot: Annotated[str, typer.Option(help="For whom.")],
+    service: Annotated[str, typer.Argument(help="What to run.", autocompletion=names.services)],
+    robot: Annotated[str, typer.Option(help="For whom.", autocompletion=names.robots)],
     params: Annotated[str, typer.Option(help="Parameters as a JSON object.")] = "{}",
     lease_s: Annotated[
         float, typer.Option(min=1, max=86_400, help="Ends when not renewed for so many seconds.")
     ] = 3600,
-    wait: Annotated[bool, typer.Option(help="Wait until it runs.")] = True,
+    wait: Wait = True,
+    timeout_s: Timeout = _TIMEOUT_S,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
@@ -205,12 +189,12 @@ def create_instance(
         fail(f"--params is no JSON: {error}", 2)
     with connected(url, token_file) as client:
         made = client.create_instance(request)
-        made = client.wait_running(made.id) if wait else made
+        made = until_running(client, made.id, timeout_s) if wait else made
     _show(made, json)
 
 
 @instance_app.command("show")
-def show_instance(instance: str, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
+def show_instance(instance: InstanceId, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
     """Show one instance, but for its session's key."""
     with connected(url, token_file) as client:
         found = client.get_instance(instance)
@@ -219,7 +203,7 @@ def show_instance(instance: str, url: Url = None, token_file: TokenFile = None, 
 
 @instance_app.command("logs")
 def show_logs(
-    instance: str,
+    instance: InstanceId,
     tail: Annotated[int, typer.Option(min=1, help="Lines.")] = 200,
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Of its present run, and what that writes until it ends.")
@@ -245,9 +229,13 @@ def show_logs(
 
 @instance_app.command("migrate")
 def migrate_instance(
-    instance: str,
-    site: Annotated[str | None, typer.Option(help="Where to; without it the best of the other sites.")] = None,
-    wait: Annotated[bool, typer.Option(help="Wait until the new one runs.")] = True,
+    instance: InstanceId,
+    site: Annotated[
+        str | None,
+        typer.Option(help="Where to; without it the best of the other sites.", autocompletion=names.sites),
+    ] = None,
+    wait: Wait = True,
+    timeout_s: Timeout = _TIMEOUT_S,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
@@ -255,13 +243,13 @@ def migrate_instance(
     """Move an instance: another one is started, its robot changes to that, and lets this one go."""
     with connected(url, token_file) as client:
         made = client.migrate_instance(instance, site)
-        made = client.wait_running(made.id) if wait else made
+        made = until_running(client, made.id, timeout_s) if wait else made
     _show(made, json)
 
 
 @instance_app.command("events")
 def watch_events(
-    instance: str,
+    instance: InstanceId,
     follow: Annotated[bool, typer.Option("--follow", help="Go on until the instance has ended.")] = False,
     url: Url = None,
     token_file: TokenFile = None,
@@ -277,7 +265,7 @@ def watch_events(
 
 
 @instance_app.command("delete")
-def delete_instance(instance: str, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_instance(instance: InstanceId, url: Url = None, token_file: TokenFile = None) -> None:
     """End an instance."""
     with connected(url, token_file) as client:
         client.delete_instance(instance)
@@ -291,7 +279,7 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
     if json:
         print_json([plain(robot) for robot in found])
         return
-    rows = [(r.name, ", ".join(r.services), r.created_at, or_dash(r.last_seen_at)) for r in found]
+    rows = [(r.name, ", ".join(r.services), or_dash(r.created_at), or_dash(r.last_seen_at)) for r in found]
     print_table(("robot", "may ask for", "registered", "last seen"), rows)
 
 
@@ -299,7 +287,8 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
 def add_robot(
     name: str,
     service: Annotated[
-        list[str] | None, typer.Option(help="What it may ask for; may be given again; all else.")
+        list[str] | None,
+        typer.Option(help="What it may ask for; may be given again; all else.", autocompletion=names.services),
     ] = None,
     url: Url = None,
     token_file: TokenFile = None,
@@ -324,16 +313,39 @@ def add_robot(
 
 
 @robot_app.command("delete")
-def delete_robot(name: str, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_robot(
+    name: Annotated[str, typer.Argument(help="Its name.", autocompletion=names.robots)],
+    url: Url = None,
+    token_file: TokenFile = None,
+) -> None:
     """Revoke a robot's token and end what it holds."""
     with connected(url, token_file) as client:
+        need("robot", name, lambda: [robot.name for robot in client.robots()])
         client.delete_robot(name)
 
 
-def _show(instance: BaseModel, json: bool) -> None:
+def _show(model: BaseModel, json: bool) -> None:
     import yaml
 
     if json:
-        print_json(plain(instance))
+        print_json(plain(model))
     else:
-        typer.echo(yaml.safe_dump(plain(instance), sort_keys=False), nl=False)
+        typer.echo(yaml.safe_dump(plain(model), sort_keys=False), nl=False)
+
+
+def need(kind: str, name: str, there: Callable[[], list[str]]) -> None:
+    """End with the name that was meant where there is none of this one: a slip must not look like something done.
+
+    ``there`` asks for those there are; a token that may not see them does without.
+    """
+    from skytether.api.client import ApiError
+    from skytether.api.faults import known
+
+    try:
+        found = there()
+    except ApiError as error:
+        if error.problem.status != 403:
+            raise
+        return
+    if name not in found:
+        fail(f"there is no {kind} '{name}'; {known(found, name)}")

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from . import names
 from .connection import Json, TokenFile, Url, connected
 from .output import console, fail, or_dash, plain, print_json, print_table
+from .resources import need
 
 if TYPE_CHECKING:
     from skytether.api.rest import TokenCreated
@@ -38,10 +40,15 @@ def list_tokens(url: Url = None, token_file: TokenFile = None, json: Json = Fals
 @app.command("create")
 def create_token(
     name: Annotated[str, typer.Argument(help="To tell it from others.")],
-    robot: Annotated[str | None, typer.Option(help="For this robot; without it for an operator.")] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="For this robot; without it for an operator.", autocompletion=names.robots)
+    ] = None,
     scope: Annotated[
         list[str] | None,
-        typer.Option(help="read, instances, catalog, sites, robots, tokens or metrics; may be given again."),
+        typer.Option(
+            help="read, instances, catalog, sites, robots, tokens or metrics; may be given again.",
+            autocompletion=names.scopes,
+        ),
     ] = None,
     days: Days = None,
     url: Url = None,
@@ -65,7 +72,10 @@ def create_token(
 
 @app.command("rotate")
 def rotate_token(
-    token: Annotated[str | None, typer.Argument(help="Its id; without it the one that this command uses.")] = None,
+    token: Annotated[
+        str | None,
+        typer.Argument(help="Its id; without it the one that this command uses.", autocompletion=names.tokens),
+    ] = None,
     grace_s: Annotated[float, typer.Option(min=0, max=30 * _DAY, help="How long the old one is good still.")] = 300,
     url: Url = None,
     token_file: TokenFile = None,
@@ -79,9 +89,14 @@ def rotate_token(
 
 
 @app.command("delete")
-def delete_token(token: str, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_token(
+    token: Annotated[str, typer.Argument(help="Its id.", autocompletion=names.tokens)],
+    url: Url = None,
+    token_file: TokenFile = None,
+) -> None:
     """Revoke a token by its id."""
     with connected(url, token_file) as client:
+        need("token", token, lambda: [row.id for row in client.tokens()])
         client.delete_token(token)
 
 

@@ -9,7 +9,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+from skytether.api.faults import known
 from skytether.api.manifest import Manifest
+from skytether.api.rest import Change
 from skytether.api.yaml import YamlError, read_yaml
 
 from .errors import ConflictError, Fault, InvalidError, NotFoundError
@@ -146,11 +148,10 @@ class Catalogue:
             return self._fixed[name]
         if name in self._broken:
             raise NotFoundError(f"service '{name}' is installed but cannot be used: {self._broken[name]}")
-        known = ", ".join(m.metadata.name for m in self.all()) or "none"
-        raise NotFoundError(f"there is no service '{name}'; known are: {known}")
+        raise NotFoundError(f"there is no service '{name}'; {known((m.metadata.name for m in self.all()), name)}")
 
-    def put(self, name: str, manifest: Manifest) -> bool:
-        """Add a service or change it for instances to come; True if it is new.
+    def put(self, name: str, manifest: Manifest, *, dry_run: bool = False) -> Change:
+        """Add a service or change it for instances to come; with ``dry_run`` only say what that would do.
 
         Raises:
             InvalidError: Its name is another one, or its parameters' schema is none.
@@ -160,9 +161,13 @@ class Catalogue:
                 [Fault("metadata.name", f"is '{manifest.metadata.name}', but the address says '{name}'")]
             )
         check_schema(manifest.spec.params, "spec.params")
-        new = name not in self._fixed and name not in self._store.services()
-        self._store.put_service(name, manifest.model_dump(mode="json", by_alias=True))
-        return new
+        document = manifest.model_dump(mode="json", by_alias=True)
+        stored, fixed = self._store.services().get(name), self._fixed.get(name)
+        if document == stored or (stored is None and manifest == fixed):
+            return Change.UNCHANGED
+        if not dry_run:
+            self._store.put_service(name, document)
+        return Change.CREATED if stored is None and fixed is None else Change.CHANGED
 
     def delete(self, name: str) -> None:
         """Remove a service that was put; what runs of it runs on. One that is gone already is no error.

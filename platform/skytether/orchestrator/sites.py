@@ -12,6 +12,7 @@ from pathlib import Path
 
 from typing_extensions import override
 
+from skytether.api.faults import known
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
@@ -45,8 +46,8 @@ def load_runtime(name: str) -> type[Runtime]:
     """
     found = {point.name: point for point in entry_points(group=RUNTIMES)}
     if name not in found:
-        known = ", ".join(sorted(found)) or "none"
-        raise InvalidError([Fault("runtime", f"there is no runtime '{name}'; installed are: {known}")])
+        there = ", ".join(sorted(found)) or "none"
+        raise InvalidError([Fault("runtime", f"there is no runtime '{name}'; installed are: {there}")])
     try:
         loaded = found[name].load()
     except ImportError as error:
@@ -256,8 +257,7 @@ class Sites:
         """
         site = self._sites.get(name)
         if site is None:
-            known = ", ".join(sorted(self._sites)) or "none"
-            raise NotFoundError(f"there is no site '{name}'; known are: {known}")
+            raise NotFoundError(f"there is no site '{name}'; {known(self._sites, name)}")
         return site
 
     def find(self, name: str | None) -> Site | None:

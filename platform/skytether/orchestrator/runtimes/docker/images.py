@@ -6,10 +6,12 @@ import json
 import os
 import stat
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from docker.auth import AuthConfig, load_config, resolve_authconfig, resolve_repository_name
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
+
+from skytether.api.pull import Pull
 
 from ..base import RuntimeFailure
 from .engine import Engine, explain
@@ -19,29 +21,35 @@ _PULL_SILENCE_S = 120.0
 """A registry that sends nothing for so long is given up."""
 
 
+class _Layer(NamedTuple):
+    """One of an image's layers: bytes, as they are sent."""
+
+    size: int
+    here: int
+    unpacked: int = 0
+
+
 class Progress:
     """How far a pull is, from the engine's messages. Pure."""
 
     def __init__(self, image: str) -> None:
         self._image = image
-        self._layers: dict[str, tuple[int, int]] = {}
+        self._layers: dict[str, _Layer] = {}
 
-    def text(self, message: Mapping[str, Any]) -> str:
-        """In words, after one more message."""
-        layer, detail = message.get("id"), message.get("progressDetail") or {}
-        status = str(message.get("status", ""))
-        if layer and status == "Downloading" and detail.get("total"):
-            self._layers[layer] = (int(detail.get("current", 0)), int(detail["total"]))
+    def after(self, message: Mapping[str, Any]) -> Pull:
+        """After one more message."""
+        layer, detail = str(message.get("id")), message.get("progressDetail") or {}
+        status, current = str(message.get("status", "")), int(detail.get("current") or 0)
+        if status == "Downloading" and detail.get("total"):
+            self._layers[layer] = _Layer(int(detail["total"]), current)
         elif layer in self._layers and status in ("Download complete", "Extracting", "Pull complete"):
-            total = self._layers[layer][1]
-            self._layers[layer] = (total, total)
-        done = sum(current for current, _ in self._layers.values())
-        total = sum(total for _, total in self._layers.values())
-        if not total:
-            return f"pulling {self._image}"
-        if done >= total:
-            return f"unpacking {self._image}"
-        return f"pulling {self._image}: {done / 1e6:.0f} of {total / 1e6:.0f} MB"
+            size = self._layers[layer].size
+            unpacked = {"Extracting": min(current, size), "Pull complete": size}.get(status, 0)
+            self._layers[layer] = _Layer(size, size, unpacked)
+        layers = self._layers.values()
+        total, here = sum(one.size for one in layers), sum(one.here for one in layers)
+        unpacking = total > 0 and here >= total
+        return Pull(self._image, unpacking, sum(one.unpacked for one in layers) if unpacking else here, total)
 
 
 def check_credentials(path: str) -> None:
@@ -101,14 +109,14 @@ def _find(engine: Engine, image: str) -> str | None:
 def _pull(engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None]) -> None:
     trouble = ""
     progress = Progress(image)
-    tell(progress.text({}))
+    tell(str(progress.after({})))
     with engine.asked():
         try:
             api = engine.api(_PULL_SILENCE_S)
             pinned = "@" in image or ":" in image.rpartition("/")[2]
             name = image if pinned else f"{image}:latest"  # or the engine would fetch every tag there is
             for message in api.pull(name, stream=True, decode=True, auth_config=_credentials(options, image)):
-                tell(progress.text(message))
+                tell(str(progress.after(message)))
                 trouble = str(message["error"]) if "error" in message else trouble
         except APIError as error:
             trouble = explain(error)

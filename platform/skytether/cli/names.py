@@ -1,0 +1,54 @@
+"""Names that a shell completes: asked of the orchestrator, quickly or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from typer import Context
+
+if TYPE_CHECKING:
+    from skytether.api.client import Client
+
+_PATIENCE_S = 1.0
+"""Whoever pressed the key is waiting."""
+Names = Callable[[Context, str], list[tuple[str, str]]]
+
+
+def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
+    """Of what ``ask`` gives, names with a word on each, those that begin so."""
+
+    def complete(ctx: Context, incomplete: str) -> list[tuple[str, str]]:
+        given: dict[str, Any] = ctx.params
+        try:
+            from skytether.api.client import Client
+
+            from .connection import local_token, local_url
+
+            url = given.get("url") or os.environ.get("SKYTETHER_URL") or local_url()
+            file = given.get("token_file") or os.environ.get("SKYTETHER_TOKEN_FILE")
+            token = local_token(Path(file) if file else None)
+            with Client(url, token, timeout=_PATIENCE_S, ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
+                return [row for row in ask(client) if row[0].startswith(incomplete)]
+        except (Exception, SystemExit):  # a key that was pressed must not be answered with a complaint
+            return []
+
+    return complete
+
+
+services = _complete(lambda client: [(m.metadata.name, f"version {m.metadata.version}") for m in client.services()])
+sites = _complete(lambda client: [(s.name, f"{s.tier}, {s.state}") for s in client.sites()])
+robots = _complete(lambda client: [(r.name, ", ".join(r.services)) for r in client.robots()])
+tokens = _complete(lambda client: [(t.id, t.name) for t in client.tokens()])
+instances = _complete(
+    lambda client: [(i.id, f"{i.service} for {i.robot or 'nobody'}, {i.state}") for i in client.instances()]
+)
+
+
+def scopes(incomplete: str) -> list[str]:
+    """What a token may."""
+    from skytether.api.rest import SCOPES
+
+    return [scope for scope in SCOPES if scope.startswith(incomplete)]

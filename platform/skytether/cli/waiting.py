@@ -1,0 +1,96 @@
+"""Waiting for an instance to run: a progress bar on a terminal, elsewhere a line for each step. On standard error."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from .output import console
+
+if TYPE_CHECKING:
+    from skytether.api.client import Client
+    from skytether.api.rest import Instance, InstanceEvent
+
+
+def until_running(client: Client, instance: str, timeout_s: float) -> Instance:
+    """Wait until it runs, and show how far it is.
+
+    Raises:
+        NotRunning: It ended, or it took too long.
+        ApiError: As of every request.
+        Unreachable: As of every request.
+    """
+    if not console.is_terminal:
+        return client.wait_running(instance, timeout_s, Lines().show)
+    with _Bar(instance) as bar:
+        return client.wait_running(instance, timeout_s, bar.show)
+
+
+class Display(Protocol):
+    """Shows what happens to an instance."""
+
+    def show(self, event: InstanceEvent) -> None:
+        """One more change."""
+        ...
+
+
+class Lines:
+    """One line for each state and reason; of a pull one for each tenth."""
+
+    def __init__(self) -> None:
+        self._last = ""
+        self._tenth = -1
+
+    def show(self, event: InstanceEvent) -> None:
+        """Print it, unless it says nothing new."""
+        line = self.line(event)
+        if line:
+            console.print(line, markup=False, soft_wrap=True)
+
+    def line(self, event: InstanceEvent) -> str:
+        """What to print; empty: nothing."""
+        from skytether.api.pull import read_pull
+
+        line = f"{event.instance}: {event.state}" + (f": {event.reason}" if event.reason else "")
+        pull = read_pull(event.reason)
+        if pull is not None and pull.total:
+            tenth = 10 * pull.done // pull.total + 11 * pull.unpacking
+            if tenth == self._tenth:
+                return ""
+            self._tenth = tenth
+        if line == self._last:
+            return ""
+        self._last = line
+        return line
+
+
+class _Bar:
+    """One line of a terminal, overwritten, and gone at the end."""
+
+    def __init__(self, instance: str) -> None:
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.table import Column
+
+        text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+        columns = (SpinnerColumn(), text, BarColumn(20), TextColumn("{task.fields[amount]}"), TimeElapsedColumn())
+        self._progress = Progress(*columns, console=console, transient=True)
+        self._task = self._progress.add_task(f"{instance}", total=None, amount="")
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, event: InstanceEvent) -> None:
+        """Overwrite what was shown."""
+        from skytether.api.pull import read_pull
+
+        pull = read_pull(event.reason)
+        text = f"{event.state}: {event.reason}" if event.reason else str(event.state)
+        amount, done, total = "", 0, None
+        if pull is not None and pull.total:
+            done, total = pull.done, pull.total
+            amount = f"{done / 1e6:.0f} of {total / 1e6:.0f} MB, {done / total:.0%}"
+            text = f"{event.state}: {'unpacking' if pull.unpacking else 'pulling'} {pull.image}"
+        self._progress.update(self._task, description=text, completed=done, total=total, amount=amount)
