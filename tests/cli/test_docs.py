@@ -42,16 +42,18 @@ def commands() -> list[tuple[str, str]]:
 def test_a_command_of_the_documentation_is_there(page: str, line: str) -> None:
     words = shlex.split(re.split(r"\\\||[|&>]", line)[0], comments=True)[1:]
     command: Any = typer.main.get_command(app)
-    while words and hasattr(command, "commands"):
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
         name = words.pop(0)
         if name == "...":
             return
         assert name in command.commands, f"{page}: {line}"
         command = command.commands[name]
     known = {"-h", "--help", "--install-completion"}  # every command has these, the last of them the first only
-    options = known | {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    options = known | {
+        option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)
+    }
     for word in words:
-        assert not word.startswith("-") or word.partition("=")[0] in options, f"{page}: {line}"
+        assert not word.startswith("-") or word.partition("=")[0] in {*options, "-h", "--help"}, f"{page}: {line}"
 
 
 def blocks() -> list[tuple[str, str]]:
