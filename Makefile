@@ -4,6 +4,9 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 # A busy machine can make a test on real sockets or processes miss its moment: what failed is run again, and reported as such.
+# The tests start hundreds of programs: without this each compiles the platform anew where the environment forbids to keep it.
+export PYTHONDONTWRITEBYTECODE :=
+
 AGAIN := --reruns 2 --reruns-delay 3
 UNIT := $(BIN)/pytest -m "not slow"
 

@@ -17,9 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from docker_site import DockerSite, Images
+
+# How long an example takes says nothing on a machine that others use too. `make fuzz` is where to look for more.
+settings.register_profile("skytether", deadline=None, max_examples=30)
+settings.load_profile("skytether")
 
 
 def pytest_configure() -> None:

@@ -276,12 +276,12 @@ class RelayMachine(RuleBasedStateMachine):
         assert not set(legs) & set(self.relay.closed)
 
 
-RelayMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+RelayMachine.TestCase.settings = settings(max_examples=25, stateful_step_count=40, deadline=None)
 test_any_packets_in_any_order = RelayMachine.TestCase
 
 
 @given(data=st.binary(max_size=600), segment=st.none() | st.integers(1, 700))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_batches_are_split_into_what_belongs_together(data, segment):
     parts = list(same_session(memoryview(data), segment))
     assert b"".join(part for part, _, _ in parts) == data

@@ -168,7 +168,7 @@ def test_a_key_that_comes_twice_and_a_second_document_are_refused(run):
         assert says in " ".join(result.stderr.split())
 
 
-@pytest.mark.parametrize("text", ["", "- a\n- b", "a: [1", "\x00", "[" * 5000])
+@pytest.mark.parametrize("text", ["", "- a\n- b", "a: [1", "\x00"])
 def test_what_is_no_configuration_is_refused(run, text):
     result = run(None, text=text)
     assert result.exit_code == 2

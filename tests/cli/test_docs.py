@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,15 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
+@cache
+def root() -> Any:
+    return typer.main.get_command(app)
+
+
 @pytest.mark.parametrize(("page", "line"), commands())
 def test_a_command_of_the_documentation_is_there(page: str, line: str) -> None:
     words = shlex.split(re.split(r"\\\||[|&>]", line)[0], comments=True)[1:]
-    command: Any = typer.main.get_command(app)
+    command = root()
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         name = words.pop(0)
         if name == "...":

@@ -110,7 +110,7 @@ def oracle_bytes(message: Any, typename: str, encoding: Encoding) -> bytes:
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("cls", all_types(), ids=lambda cls: cls.__name__)
 def test_bytes_of_rosbags_come_back_identical(cls: type[Message], encoding: Encoding) -> None:
-    @settings(max_examples=8)
+    @settings(max_examples=4)
     @given(random_messages(cls.TYPE, encoding))
     def check(theirs: Any) -> None:
         data = oracle_bytes(theirs, cls.TYPE, encoding)
@@ -154,7 +154,7 @@ def test_every_recorded_scan_comes_back_identical(data_dir: Any, bag: str, count
     assert seen == count
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.sampled_from(all_types()), st.sampled_from(ENCODINGS), st.binary(max_size=200))
 def test_any_bytes_give_a_message_or_a_decode_error(cls: type[Message], encoding: Encoding, data: bytes) -> None:
     with suppress(DecodeError):

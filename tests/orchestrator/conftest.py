@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from reconcile_bench import Bench
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
+from skytether.orchestrator import catalogue
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.records import Record
@@ -86,10 +89,29 @@ def new_record(clock: Clock) -> Callable[..., Record]:
     return make
 
 
+@cache
+def migrated() -> bytes:
+    """A database of the newest schema: to make one takes far longer than most tests do with it."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(f"sqlite:///{folder}/state.db")
+        store.migrate()
+        store.close()
+        return (Path(folder) / "state.db").read_bytes()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def installed_services_are_read_once() -> Iterator[None]:
+    """They stay what they are while the tests run, and hundreds of orchestrators want to know."""
+    read = cache(catalogue.read_builtin)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalogue, "read_builtin", lambda points: read(tuple(points)))
+        yield
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
+    (tmp_path / "state.db").write_bytes(migrated())
     store = Store(f"sqlite:///{tmp_path}/state.db")
-    store.migrate()
     yield store
     store.close()
 
@@ -175,6 +197,7 @@ class Server:
 
 def served_in(folder: Path, server: Server, **settings: Any) -> Iterator[Served]:
     fleet = Fleet()
+    (folder / "state.db").write_bytes(migrated())
     core = Orchestrator(Settings(state_dir=folder, **{"timing": QUICK, **settings}), find_runtime=fleet)
     core.start()
     core.sites.delete("local")

@@ -100,7 +100,7 @@ candidates = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(candidates, st.dictionaries(st.sampled_from("abcdef"), st.builds(Measurement, rtt_ms=st.floats(0, 200))))
 def test_every_site_is_chosen_or_refused_in_any_order(sites: list[Candidate], measured: dict[str, Measurement]) -> None:
     decision = place(NEEDS, measured, sites)

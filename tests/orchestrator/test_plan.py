@@ -248,7 +248,7 @@ happenings = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(happenings)
 def test_whatever_happens_there_is_one_run_at_most_and_quiet_brings_what_is_wanted(
     story: list[tuple[str, float, bool]],

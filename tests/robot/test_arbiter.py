@@ -153,7 +153,7 @@ spells = st.lists(st.tuples(links, st.floats(0.001, 2.5)), max_size=12)
 
 @pytest.mark.slow
 @given(spells)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_it_never_goes_to_the_cloud_faster_than_the_hysteresis_and_never_on_stale_commands(spells):
     choice, now, last_change = start(NEEDS, 0.0), 0.0, 0.0
     for link, seconds in spells:

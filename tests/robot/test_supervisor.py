@@ -175,7 +175,7 @@ events = st.lists(
 
 @pytest.mark.slow
 @given(events)
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_no_input_whatever_exceeds_a_limit_jumps_or_moves_on_stale_data(inputs):
     state, now, previous = Supervised(), 100.0, None
     for elapsed, commands, charge in inputs:

@@ -3,14 +3,9 @@
 from random import Random
 
 import pytest
-from hypothesis import settings
 
 from skytether.testing.link import LossyLink
 from skytether.wire import Config, Direction, Role, Session, Topic
-
-# How long an example takes says nothing on a machine that others use too.
-settings.register_profile("wire", deadline=None)
-settings.load_profile("wire")
 
 KEY = bytes(range(32))
 SESSION_ID = 0x1122334455667788

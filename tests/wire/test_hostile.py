@@ -67,7 +67,7 @@ def live(make_world):
 
 
 @given(data=st.binary(max_size=2000), segment=st.none() | st.integers(-1, 2000), path=st.integers(0, 1))
-@settings(max_examples=200)
+@settings(max_examples=80)
 def test_any_bytes(live, data, segment, path):
     for role in Role:
         before = state(live, role)

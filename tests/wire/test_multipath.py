@@ -72,9 +72,9 @@ def test_both_ends_know_both_paths_and_use_the_better_one(two):
 @pytest.mark.parametrize(("topic", "role"), [("safe", ROBOT), ("safe_out", SERVICE)])
 def test_losing_one_of_two_paths_loses_nothing_of_a_redundant_topic(two, gone, topic, role):
     link = two(second=LinkConditions(delay=0.007))
-    fate = stream(link, topic, 3.0, role=role)
-    link.at(link.now + 1.0, lambda: link.roads[gone].set(CUT))
-    link.run(3.5)
+    fate = stream(link, topic, 1.5, role=role)
+    link.at(link.now + 0.5, lambda: link.roads[gone].set(CUT))
+    link.run(2.0)
     missing, gap = fate()
     assert missing == set()
     assert gap <= PERIOD + 0.003
@@ -83,9 +83,9 @@ def test_losing_one_of_two_paths_loses_nothing_of_a_redundant_topic(two, gone, t
 @pytest.mark.parametrize(("topic", "role"), [("plain", ROBOT), ("plain_out", SERVICE)])
 def test_a_broken_path_costs_the_others_its_detection(two, topic, role):
     link = two()
-    fate = stream(link, topic, 4.0, role=role)
-    link.at(link.now + 1.0, lambda: link.roads[0].set(CUT))
-    link.run(4.5)
+    fate = stream(link, topic, 2.0, role=role)
+    link.at(link.now + 0.5, lambda: link.roads[0].set(CUT))
+    link.run(2.5)
     missing, gap = fate()
     assert missing == set()  # sent again by the other path as soon as answers were missed
     assert gap < 0.25

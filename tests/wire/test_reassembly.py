@@ -116,7 +116,7 @@ def test_what_stays_incomplete_is_dropped_at_its_age():
 
 
 @given(st.integers(0, 2**32))
-@settings(max_examples=20)
+@settings(max_examples=6)
 def test_a_flood_never_exceeds_the_bound(seed):
     random = Random(seed)
     limit = 100_000

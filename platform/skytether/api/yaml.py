@@ -95,5 +95,5 @@ def _is_endless(document: Any) -> bool:
         left -= len(inner)
         if left < 0:
             return True
-        waiting.extend(inner)
+        waiting.extend(v for v in inner if isinstance(v, dict | list))
     return False

@@ -108,7 +108,7 @@ speeds = st.one_of(st.just(0.0), st.floats(-1, 1).filter(lambda v: abs(v) > 1e-3
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(shapes, st.tuples(st.floats(-2, 2), st.floats(-2, 2)), speeds, speeds)
 def test_contact_is_where_a_simulation_with_small_steps_finds_it(shape: Footprint, point, linear, angular):
     found = shape.time_to_contact(at(point), linear, angular)

@@ -130,7 +130,7 @@ def test_a_sonar_without_an_echo_is_an_ordinary_sonar(value, sight, points):
 wild = st.floats(allow_nan=True, allow_infinity=True, width=32)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(wild, max_size=40), wild, wild, wild, wild, st.booleans())
 def test_any_scan_gives_finite_points_and_never_raises(ranges, angle_min, increment, near, far, free):
     message = scan(ranges, angle_min=angle_min, angle_increment=increment, range_min=near, range_max=far)

@@ -339,7 +339,7 @@ buttons = st.tuples(st.just("estop"), st.booleans())
 times = st.tuples(st.just("time"), st.one_of(st.just(PERIOD), st.floats(-1, 1), wild))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.one_of(commands, scans, pads, buttons, times), max_size=60))
 def test_whatever_comes_in_and_whatever_the_clock_does_the_output_is_a_number_within_the_limits(events):
     gate, now, before = Gate(RULES), 10.0, STANDSTILL
@@ -379,7 +379,7 @@ things = st.lists(st.tuples(st.floats(0.42, 2.0), st.floats(-math.pi, math.pi)),
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(legs, things)
 def test_no_sequence_of_commands_drives_the_robot_into_anything(legs, things):
     """A robot that does what it is told among things that stand still; whatever the agent wants, none is touched."""
