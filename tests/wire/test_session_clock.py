@@ -26,6 +26,9 @@ MICRO = 2e-6
 @example(
     offset=0.0, drift=-4.406879510045998e-05, up=0.125, down=0.0, jitter=0.048828125, loss=0.0, seed=26
 )  # drift during the delay counts
+@example(
+    offset=0.0, drift=-3.911481891887072e-05, up=0.2, down=0.0, jitter=0.0, loss=0.0, seed=0
+)  # so does what is not known of when it was sent
 def test_every_message_at_both_ends(make_world, offset, drift, up, down, jitter, loss, seed):
     link = make_world(seed).link(
         connect=False,

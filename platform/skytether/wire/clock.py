@@ -30,8 +30,8 @@ class ClockOffset:
         """The true offset is within ``offset +- error``, as of the last exchange; inf before the first."""
 
     def error_at(self, when: float) -> float:
-        """The same for another moment, before or after: the clocks drift in between."""
-        return self.error + abs(when - self._updated) * MAX_DRIFT
+        """The same for a moment of the peer's, before or after, that is known as well as the offset: clocks drift."""
+        return self.error + (abs(when - self._updated) + self.error) * MAX_DRIFT
 
     def exchange(self, t1: float, t2: float, t3: float, t4: float) -> None:
         """Take one exchange: t1, t4 on our clock, t2, t3 on the peer's."""
