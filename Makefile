@@ -17,7 +17,7 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) -n 2 --dist loadfile || { echo "once more, those that failed:"; $(UNIT) --last-failed; }
-	$(BIN)/pytest -m slow $(AGAIN)
+	$(BIN)/pytest -m slow $(AGAIN) --durations 30
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile
