@@ -175,7 +175,7 @@ def context(name: str) -> bytes:
     """What an image is built from, as a tar file: its folder, its wheels. Times are left out, for the cache."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
-        tar.add(IMAGES / name / "Dockerfile", "Dockerfile", filter=_plain)
+        tar.add(IMAGES / name, ".", filter=_plain)
         if name in EXTRAS:
             tar.add(WORK / f"{name}.txt", f"{name}.txt", filter=_plain)
             tar.add(WORK / "wheels" / name, f"wheels/{name}", filter=_plain)

@@ -175,6 +175,16 @@ def sshd() -> str:
 
 
 @pytest.fixture(scope="session")
+def compose_programs() -> None:
+    """What starts ``compose.yaml``, and what stands in for the images that no registry here has."""
+    for program, package in (("docker-compose", "docker-compose"), ("prometheus", "prometheus")):
+        if shutil.which(program) is None:
+            require("compose", f"the program '{program}' is missing: install {package}")
+    if not list(Path("/usr/lib/postgresql").glob("*/bin/initdb")):
+        require("compose", "there is no PostgreSQL server: install postgresql")
+
+
+@pytest.fixture(scope="session")
 def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Images]:
     """The base image, the network's guard, one service and the toy, built from this very code."""
     from docker_site import TOY, Images

@@ -207,6 +207,21 @@ def test_a_database_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
     assert "Traceback" not in text
 
 
+def test_a_database_without_an_encoding_can_be_used(postgres: str) -> None:
+    plain = f"{postgres}_plain"
+    engine = make_engine(postgres).execution_options(isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        how = "TEMPLATE template0 ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'"
+        connection.exec_driver_sql(f"CREATE DATABASE {plain.rpartition('/')[2]} {how}")
+        store = Store(plain)
+        store.migrate()
+        assert store.agree("name", "Käthe")
+        assert store.agree("name", "Käthe")
+        store.close()
+        connection.exec_driver_sql(f"DROP DATABASE {plain.rpartition('/')[2]} WITH (FORCE)")
+    engine.dispose()
+
+
 def test_two_that_migrate_at_once_do_not_collide(postgres: str) -> None:
     pids = []
     for _ in range(2):

@@ -15,13 +15,15 @@ GONE = (OperationalError, InterfaceError)
 MIGRATING, LEADING = 0x736B7901, 0x736B7902
 """Keys of PostgreSQL's advisory locks: who migrates, who leads."""
 _POSTGRES = {
+    "client_encoding": "utf8",
     "connect_timeout": 5,
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
     "options": "-c statement_timeout=10000 -c idle_in_transaction_session_timeout=30000",
 }
-"""A server that is gone is noticed within seconds, and a statement that hangs is ended (milliseconds)."""
+"""A server that is gone is noticed within seconds, and a statement that hangs is ended (milliseconds). In a database
+without an encoding (``SQL_ASCII``) text would come back as bytes."""
 
 
 def make_engine(url: str, name: str = NAME) -> Engine:
