@@ -114,7 +114,7 @@ def test_a_missing_parameter_names_the_key(shared: Any, manifest: Any) -> None:
 
 def test_no_site_at_all(served: Any) -> None:
     status, text = refused(served.operator.create_instance, ASK)
-    assert (status, text) == (409, "no site can run 'toy': there is no site")
+    assert (status, text) == (409, "no site can run 'toy': there is none: add one with `skytether site add`")
 
 
 def test_no_site_that_ever_could_says_each_ones_number(served: Any, manifest: Any) -> None:

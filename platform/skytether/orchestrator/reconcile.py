@@ -340,4 +340,4 @@ def _used(records: Sequence[Record]) -> dict[str, Capacity]:
 
 def told(refused: Sequence[Refusal]) -> str:
     """All refusals in one sentence."""
-    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or "there is no site"
+    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or "there is none: add one with `skytether site add`"
