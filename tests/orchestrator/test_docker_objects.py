@@ -33,7 +33,6 @@ from skytether.orchestrator.runtimes.docker.objects import (
     last_line,
     observation,
     parse,
-    ready_port,
     refusal,
 )
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
@@ -272,32 +271,6 @@ def test_what_a_container_uses() -> None:
     assert usage_of({**message, "memory_stats": {"usage": 1, "stats": {"total_inactive_file": 7}}}) == Usage(
         1.5, 0, 11, 22
     )
-
-
-def tar_of(content: bytes) -> bytes:
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w") as tar:
-        entry = tarfile.TarInfo("ready.json")
-        entry.size = len(content)
-        tar.addfile(entry, io.BytesIO(content))
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("archive", "port"),
-    [
-        (tar_of(b'{"port": 7600, "pid": 7}'), 7600),
-        (tar_of(b'{"port": "7600"}'), None),
-        (tar_of(b'{"port": 70000}'), None),
-        (tar_of(b"[7600]"), None),
-        (tar_of(b'{"port"'), None),
-        (tar_of(b"[" * 100_000), None),
-        (b"no tar", None),
-        (b"", None),
-    ],
-)
-def test_a_service_may_write_anything_into_its_ready_file(archive: bytes, port: int | None) -> None:
-    assert ready_port(archive) == port
 
 
 def test_the_last_line_that_can_be_read() -> None:

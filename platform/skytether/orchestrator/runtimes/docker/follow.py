@@ -12,15 +12,16 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from http import HTTPStatus
 from typing import Any
 
 import urllib3
-from docker.errors import APIError, NotFound
+from docker.errors import NotFound
 
 from ..base import RuntimeFailure
 from .engine import Engine
 from .meter import Meter
-from .objects import OWNER, READY, Seen, carried_over, last_line, parse, ready_port
+from .objects import OWNER, READY, Seen, carried_over, last_line, parse
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +29,8 @@ _QUIET_S = 10.0
 """A stream without events for so long is opened anew: in between, an engine that went away in silence is noticed."""
 _AGAIN_S = 1.0
 """Between two attempts to reach an engine that does not answer."""
-_READY_S = 0.05
-"""Between two looks for the ready file of a container that starts; each costs the engine some 40 ms."""
+_READY_S = 0.02
+"""Between two looks for the ready file of a container that starts; each costs the engine some 3 ms."""
 _TAIL = 20
 """Lines of a log among which the last one that can be read is looked for."""
 _TOLD = frozenset({"create", "start", "die", "oom", "pause", "unpause", "stop", "restart", "rename", "update"})
@@ -233,12 +234,12 @@ class Follower:
 
     def _look_ready(self, container: str) -> None:
         with self._engine.asked():
-            try:
-                chunks, _ = self._engine.api().get_archive(container, READY)
-                archive = b"".join(chunks)
-            except APIError:
-                return  # not yet, or not any more
-        if ready_port(archive) is not None:
+            api = self._engine.api()
+            # The SDK only knows how to fetch the file, which takes the engine 50 to 100 ms. It is put there in one
+            # piece, and the port in it is always the same.
+            url = f"{api.base_url}/v{api.api_version}/containers/{container}/archive"
+            there = api.head(url, params={"path": READY}, timeout=api.timeout).status_code == HTTPStatus.OK
+        if there:
             with self._lock:
                 if container in self._seen:
                     self._seen[container] = replace(self._seen[container], ready=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import tarfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -221,19 +220,6 @@ def _owned(path: str, mode: int, kind: bytes) -> tarfile.TarInfo:
     entry = tarfile.TarInfo(path)
     entry.type, entry.mode, entry.uid, entry.gid = kind, mode, USER, USER
     return entry
-
-
-def ready_port(archive: bytes) -> int | None:
-    """The port that a ready file names, out of the tar file in which the engine hands it over; None: not yet one."""
-    try:
-        with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-            entry = tar.next()
-            file = tar.extractfile(entry) if entry is not None and entry.isfile() else None
-            document = json.loads(file.read()) if file else None
-    except (tarfile.TarError, ValueError, RecursionError, EOFError):
-        return None  # services write what they like into their folders
-    port = document.get("port") if isinstance(document, dict) else None
-    return port if type(port) is int and 0 < port < 65_536 else None
 
 
 def parse(inspected: Mapping[str, Any]) -> Seen | None:
