@@ -42,6 +42,8 @@ from skytether.messages import (
     type_of,
     warm,
 )
+from skytether.messages.codec import typestore
+from skytether.messages.definitions import definitions
 from skytether.messages.services import BOTH, service_types
 
 ENCODINGS: tuple[Encoding, ...] = ("cdr", "ros1")
@@ -224,6 +226,14 @@ def test_unknown_names_say_what_there_is() -> None:
         encode(Twist(), "json")
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_definitions_kept_here_are_those_of_rosbags(encoding: Encoding) -> None:
+    every = typestore(encoding).fielddefs
+    kept = definitions(encoding)
+    assert kept == {name: every[name] for name in kept}
+    assert kept.keys() == {cls.TYPE for cls in all_types()}, "each class needs its row in definitions.py"
+
+
 def test_hashes_are_those_that_ros_uses() -> None:
     """MD5 as `rosmsg md5` of Noetic prints them, RIHS01 as `ros2 topic info -v` of Jazzy does."""
     assert type_hash(LaserScan, "ros1") == "90c7ef2dc6895d81024acba2ac42f369"
@@ -256,7 +266,7 @@ def test_warm_leaves_nothing_to_compile() -> None:
 
     for encoding in ENCODINGS:
         warm(all_types(), encoding)
-        store = codec.typestore(encoding)
+        store = codec._own_store(encoding)
         before = set(store.cache)
         for cls in all_types():
             decode(cls, encode(cls(), encoding), encoding)

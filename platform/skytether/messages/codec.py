@@ -1,8 +1,8 @@
 """Messages to and from the bytes of ROS 1 (``ros1``) and ROS 2 (``cdr``), through `rosbags`; no ROS needed.
 
 Our classes are put into the type stores of `rosbags` in place of its own, so its generated code reads and fills
-them directly. The stores are loaded at first use: 60 ms each, and a few milliseconds more for each type, which
-`warm` takes out of a control loop's way.
+them directly. At its first use a type takes a few milliseconds, which `warm` takes out of a control loop's way; types
+that have no class here are loaded when the first of them is needed, which takes 100 ms and more.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from .base import Message, all_types, type_of
+from .definitions import definitions
 from .services import BOTH, ROS2_ONLY, service_types, without_char
 from .std import Header, Time
 
@@ -44,7 +45,7 @@ def encode(message: Message, encoding: Encoding = "cdr") -> bytes:
         EncodeError: A field holds the wrong kind of value, or a number that does not fit.
         ValueError: There is no such encoding.
     """
-    store = typestore(encoding)
+    store = _store_of(message.TYPE, encoding)
     write = store.serialize_cdr if encoding == "cdr" else store.serialize_ros1
     try:
         return bytes(write(message, message.TYPE))
@@ -67,7 +68,7 @@ def decode(what: type[Message] | str, data: bytes | memoryview, encoding: Encodi
     name = what if isinstance(what, str) else what.TYPE
     if isinstance(what, str):
         type_of(what)
-    store = typestore(encoding)
+    store = _store_of(name, encoding)
     read = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
     try:
         message = read(memoryview(data), name)
@@ -147,7 +148,9 @@ def hash_of(typename: str, encoding: Encoding) -> str:
 
     Of services the name without ``_Request`` or ``_Response`` has a hash, in ROS 2 only.
     """
-    store = typestore(encoding) if encoding == "ros1" else _hashing_store()
+    store = _store_of(typename, encoding)
+    if encoding == "cdr":
+        store = _hashing_store(store)
     if typename not in store.fielddefs:
         return ""
     if encoding == "cdr":
@@ -161,14 +164,14 @@ def definition_of(typename: str, encoding: Encoding) -> str:
     if "/msg/" not in typename:
         return ""
     try:
-        return typestore(encoding).generate_msgdef(typename, ros_version=1 if encoding == "ros1" else 2)[0]
+        return _store_of(typename, encoding).generate_msgdef(typename, ros_version=1 if encoding == "ros1" else 2)[0]
     except TypesysError:
         return ""
 
 
 @cache
 def typestore(encoding: Encoding) -> Typestore:
-    """Load the definitions of one ROS generation and put our classes in."""
+    """Load all definitions of one ROS generation and put our classes in."""
     if encoding == "cdr":
         store = get_typestore(Stores.ROS2_JAZZY)
     elif encoding == "ros1":
@@ -176,9 +179,30 @@ def typestore(encoding: Encoding) -> Typestore:
         transforms = "geometry_msgs/TransformStamped[] transforms"
         store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
     else:
-        raise ValueError(f"no encoding '{encoding}'; there are 'cdr' (ROS 2) and 'ros1'")
+        raise _unknown(encoding)
     for name, (request, response) in (BOTH | ROS2_ONLY if encoding == "cdr" else BOTH).items():
         store.register(service_types(name, request, response, hashed=encoding == "cdr"))
+    return _with_ours(store, encoding)
+
+
+@cache
+def _own_store(encoding: Encoding) -> Typestore:
+    """Only the types that have a class here."""
+    if encoding not in ("cdr", "ros1"):
+        raise _unknown(encoding)
+    store = Typestore()
+    store.fielddefs.update(definitions(encoding))
+    return _with_ours(store, encoding)
+
+
+@cache
+def _store_of(typename: str, encoding: Encoding) -> Typestore:
+    """The small store if it has the type, else the one of all."""
+    own = _own_store(encoding)
+    return own if typename in own.fielddefs else typestore(encoding)
+
+
+def _with_ours(store: Typestore, encoding: Encoding) -> Typestore:
     ours: dict[str, Any] = {cls.TYPE: cls for cls in all_types()}
     if encoding == "ros1":
         ours[Header.TYPE] = _ros1_header
@@ -186,12 +210,16 @@ def typestore(encoding: Encoding) -> Typestore:
     return store
 
 
+def _unknown(encoding: str) -> ValueError:
+    return ValueError(f"no encoding '{encoding}'; there are 'cdr' (ROS 2) and 'ros1'")
+
+
 @cache
-def _hashing_store() -> Typestore:
+def _hashing_store(store: Typestore) -> Typestore:
     """Definitions of ROS 2 as they are hashed."""
-    store = copy.copy(typestore("cdr"))
-    store.fielddefs = {name: without_char(definition) for name, definition in store.fielddefs.items()}
-    return store
+    hashing = copy.copy(store)
+    hashing.fielddefs = {name: without_char(definition) for name, definition in store.fielddefs.items()}
+    return hashing
 
 
 def _ros1_header(seq: int, stamp: Time, frame_id: str) -> Header:
