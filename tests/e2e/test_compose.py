@@ -141,6 +141,10 @@ def test_the_configuration_is_good_for_prometheus(stack: Stack) -> None:
     stack.inside("prometheus", "promtool", "check", "config", "/etc/prometheus/prometheus.yml")
 
 
+def test_alerts_are_raised_by_what_they_say(compose_programs: None) -> None:
+    run("promtool", "test", "rules", str(SUPPORT / "rules_test.yml"))
+
+
 def test_what_is_missing_is_told(compose_programs: None) -> None:
     for name, variable in (("engine-local", "DOCKER_GID"), ("engine-remote", "SKYTETHER_ENGINES")):
         command = [
