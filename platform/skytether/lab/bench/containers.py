@@ -59,10 +59,12 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str) -> Iterator[Ser
         yield ServiceImage(image, manifest.spec.topics)
     finally:
         orchestrator.stop()
-        _clean(owner, options["network"])
+        _clean(owner, options["network"], options["guard_image"])
 
 
-def _clean(owner: str, network: str) -> None:
+def _clean(owner: str, network: str, guard: str) -> None:
+    from skytether.orchestrator.runtimes.docker.network import table_of
+
     containers = docker("ps", "-aq", "--filter", f"label=skytether.io/owner={owner}").split()
     if containers:
         docker("rm", "-f", "-v", *containers)
@@ -70,6 +72,7 @@ def _clean(owner: str, network: str) -> None:
     if volumes:
         docker("volume", "rm", *volumes)
     docker("network", "rm", network)
+    docker("run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", guard, f"delete table {table_of(network)}")
 
 
 def docker_run(service: ServiceImage) -> float:

@@ -1,0 +1,45 @@
+"""Starts on this machine's real engine, as the benchmark does them: its rows, and that nothing is left of it."""
+
+import subprocess
+
+import pytest
+from docker_site import Images
+
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.start import bench_start
+from skytether.orchestrator.runtimes.docker.network import table_of
+
+
+def docker(*arguments: str) -> list[str]:
+    return subprocess.run(["docker", *arguments], capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_a_runtime_that_is_none_is_refused():
+    with pytest.raises(BenchError, match="no runtime 'dokker' to measure; there are process, docker"):
+        bench_start(1, ["dokker"])
+
+
+@pytest.mark.slow
+@pytest.mark.docker
+def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_left(docker_images: Images):
+    of_the_image = ("--filter", f"ancestor={docker_images.name('virtual-trail')}")
+    owners: set[str] = set()
+
+    def on_start(row: str, seconds: float) -> None:
+        owners.update(docker("ps", "-a", "--format", '{{.Label "skytether.io/owner"}}', *of_the_image))
+
+    rows = bench_start(1, ["docker"], docker_images.prefix, on_start)
+    # How fast it is, the benchmark says where it is run for that; here a busy machine may take its time.
+    assert [(row.runtime, row.standby, row.n) for row in rows] == [
+        ("docker", 0, 1),
+        ("docker run", 0, 1),
+        ("docker", 1, 1),
+    ]
+    assert all(0 < row.p50_s == row.p99_s for row in rows)
+    assert docker("ps", "-aq", *of_the_image) == []
+    (owner,) = owners
+    assert owner.startswith("bench-")
+    assert docker("network", "ls", "-q", "--filter", f"name={owner}") == []
+    assert docker("volume", "ls", "-q", "--filter", f"name={owner}") == []
+    look = ("run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", docker_images.name("guard"), "list tables")
+    assert table_of(f"skytether-{owner}").split()[1] not in docker(*look)
