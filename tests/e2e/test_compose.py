@@ -137,6 +137,11 @@ def test_the_orchestrator_is_at_home_in_its_container(stack: Stack) -> None:
     stack.inside("orchestrator", "ssh", "-G", "edge.example")  # it refuses a user that it does not know
 
 
+def test_the_database_can_be_copied(stack: Stack) -> None:
+    copied = stack.inside("postgres", "pg_dump", "--username=skytether", "--data-only", "--table=tokens", "skytether")
+    assert "prometheus" in copied
+
+
 def test_the_configuration_is_good_for_prometheus(stack: Stack) -> None:
     stack.inside("prometheus", "promtool", "check", "config", "/etc/prometheus/prometheus.yml")
 
