@@ -42,9 +42,11 @@ def test_the_page_of_the_documentation_is_the_one_that_is_made() -> None:
     [
         ("prot: 1", {}, "prot: unknown key, did you mean 'port'?"),
         ("limits: {body_byte: 1}", {}, "limits.body_byte: unknown key, did you mean 'body_bytes'?"),
+        ("timing: {place: .nan}", {}, "timing.place: input should be a finite number"),
         ("port: 70000", {}, "port: input should be less than or equal to 65535"),
         ("timing: {place: 0}", {}, "timing.place: input should be greater than 0"),
         ("tls: {key: a}", {}, "tls: certificate and key belong together"),
+        ("proxies: [127.0.0.1, gateway]", {}, "proxies: 'gateway' is no address and no network such as 10.0.0.0/24"),
         ("logs: {format: xml}", {}, "logs.format: input should be 'text' or 'json'"),
         ("limits: 3", {"SKYTETHER_LIMITS_EVENTS": "4"}, "limits: must be a mapping"),
         ("- 1", {}, "must hold one document of keys"),

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from typing import Any
 
+from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .settings import Logs
@@ -21,6 +22,7 @@ _CHATTY = ("alembic", "uvicorn", "httpx")
 _AUDIT_BYTES, _AUDIT_FILES = 10_000_000, 5
 _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)
+_CREATED = 201
 
 
 class TextFormatter(logging.Formatter):
@@ -77,24 +79,28 @@ class Audit:
         """Serve one request."""
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
-        status = 0
+        status, made = 0, ""
 
         async def noting(message: Message) -> None:
-            nonlocal status
+            nonlocal status, made
             if message["type"] == "http.response.start":
                 status = message["status"]
+                made = Headers(raw=message["headers"]).get("location", "") if status == _CREATED else ""
             await send(message)
 
         try:
             await self._app(scope, receive, noting)
         finally:
             if scope["method"] not in _READS or status in _REFUSED:
-                self._note(scope, status)
+                self._note(scope, status, made)
 
-    def _note(self, scope: Scope, status: int) -> None:
+    def _note(self, scope: Scope, status: int, made: str) -> None:
         who = scope.get("state", {}).get("who", "nobody")
         address = scope["client"][0] if scope.get("client") else ""
         fields = {"who": who, "address": address, "method": scope["method"], "path": scope["path"], "status": status}
+        if made:
+            fields["made"] = made  # which robot, token or instance: their names are in the body
         if scope["path"].endswith("/renew") and status == 200:
             return  # every robot, every two seconds: the lease in the database says it
-        audit.info("%(who)s %(address)s %(method)s %(path)s %(status)s", fields, extra={"fields": fields})
+        text = " ".join(str(value) for value in fields.values())
+        audit.info("%s", text, extra={"fields": fields})

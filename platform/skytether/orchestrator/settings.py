@@ -6,6 +6,7 @@ The text under each field is its documentation: ``skytether orchestrator config`
 
 from __future__ import annotations
 
+import ipaddress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -160,6 +161,16 @@ class Settings(Group):
     """Bounds of what is kept and taken."""
     weights: Weights = Weights()
     """What placement weighs."""
+
+    @field_validator("proxies")
+    @classmethod
+    def _addresses(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        for proxy in proxies:
+            try:
+                ipaddress.ip_network(proxy, strict=False)
+            except ValueError:
+                raise ValueError(f"'{proxy}' is no address and no network such as 10.0.0.0/24") from None
+        return proxies
 
     @field_validator("advertise")
     @classmethod

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import Depends, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from skytether.api.plain import oddity
@@ -67,6 +67,11 @@ CatalogOperator = Annotated[Principal, _holder("catalog")]
 SitesOperator = Annotated[Principal, _holder("sites")]
 RobotsOperator = Annotated[Principal, _holder("robots")]
 TokensOperator = Annotated[Principal, _holder("tokens")]
+
+
+def made(response: Response, kind: str, id_: str) -> None:
+    """Say where what was just made can be found; the audit notes it too."""
+    response.headers["Location"] = f"{PREFIX}/{kind}/{id_}"
 
 
 def says(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -18,7 +18,7 @@ from ..instances import utc
 from ..records import Record
 from ..runtimes.base import LogStream
 from ..store import EventRow
-from .deps import PREFIX, Actor, Caller, Core, says
+from .deps import PREFIX, Actor, Caller, Core, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
 
@@ -31,10 +31,13 @@ def create(
     core: Core,
     caller: Actor,
     asked: InstanceCreate,
+    response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=255)] = None,
 ) -> Instance:
     """Ask for a service. The same request with the same Idempotency-Key is answered with the instance made first."""
-    return core.instances.show(core.instances.create(caller, asked, idempotency_key))
+    record = core.instances.create(caller, asked, idempotency_key)
+    made(response, "instances", record.id)
+    return core.instances.show(record)
 
 
 @router.get("")
@@ -70,9 +73,11 @@ def renew(core: Core, caller: Actor, instance: str, asked: Renew) -> Instance:
 
 
 @router.post("/{instance}/migrate", status_code=201, responses=says(403, 404, 409, 422))
-def migrate(core: Core, caller: Actor, instance: str, asked: Migrate) -> Instance:
+def migrate(core: Core, caller: Actor, instance: str, asked: Migrate, response: Response) -> Instance:
     """Move an instance: another is started elsewhere; its robot changes to that once it runs, and lets this one go."""
-    return core.instances.show(core.instances.migrate(caller, instance, asked))
+    record = core.instances.migrate(caller, instance, asked)
+    made(response, "instances", record.id)
+    return core.instances.show(record)
 
 
 @router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404, 503))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 
 from skytether.api.rest import Robot, RobotCreate, RobotCreated
 
 from ..instances import utc
 from ..store import RobotRow
-from .deps import PREFIX, Core, Reader, RobotsOperator, says
+from .deps import PREFIX, Core, Reader, RobotsOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))
 
@@ -25,9 +25,10 @@ def list_robots(core: Core, _: Reader) -> list[Robot]:
 
 
 @router.post("", status_code=201, responses=says(409, 422))
-def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate) -> RobotCreated:
+def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate, response: Response) -> RobotCreated:
     """Register a robot. Its token is in the answer and cannot be shown again."""
     row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s)
+    made(response, "robots", row.name)
     return RobotCreated(**_show(row).model_dump(), token=token)
 
 

@@ -9,7 +9,7 @@ from skytether.api.rest import Site, SiteCreate
 from ..access import Principal
 from ..core import Orchestrator
 from ..sites import Site as LiveSite
-from .deps import PREFIX, Caller, Core, SitesOperator, says
+from .deps import PREFIX, Caller, Core, SitesOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/sites", tags=["sites"])
 
@@ -42,9 +42,11 @@ def list_sites(core: Core, caller: Caller) -> list[Site]:
 
 
 @router.post("", status_code=201, responses=says(401, 403, 409, 422))
-def create_site(core: Core, caller: SitesOperator, asked: SiteCreate) -> Site:
+def create_site(core: Core, caller: SitesOperator, asked: SiteCreate, response: Response) -> Site:
     """Add a site."""
-    return _show(core, core.sites.add(asked), caller)
+    site = core.sites.add(asked)
+    made(response, "sites", site.name)
+    return _show(core, site, caller)
 
 
 @router.get("/{site}", responses=says(401, 404))

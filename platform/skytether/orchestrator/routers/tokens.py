@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 
 from skytether.api.rest import Token, TokenCreate, TokenCreated, TokenRotate
 
 from ..instances import utc
 from ..store import TokenRow
-from .deps import PREFIX, Authenticated, Core, Reader, TokensOperator, says
+from .deps import PREFIX, Authenticated, Core, Reader, TokensOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/tokens", tags=["tokens"], responses=says(401, 403, 429))
 
@@ -29,16 +29,18 @@ def list_tokens(core: Core, _: Reader) -> list[Token]:
 
 
 @router.post("", status_code=201, responses=says(404, 422))
-def create_token(core: Core, caller: TokensOperator, asked: TokenCreate) -> TokenCreated:
+def create_token(core: Core, caller: TokensOperator, asked: TokenCreate, response: Response) -> TokenCreated:
     """Make a token: another one of a robot, or an operator's with some of the scopes that the caller has."""
     row, token = core.access.create(caller, asked.name, asked.robot, asked.scopes, asked.ttl_s)
+    made(response, "tokens", row.id)
     return TokenCreated.model_validate({**_fields(row), "token": token})
 
 
 @router.post("/{token}/rotate", status_code=201, responses=says(404, 422))
-def rotate_token(core: Core, caller: Authenticated, token: str, asked: TokenRotate) -> TokenCreated:
+def rotate_token(core: Core, caller: Authenticated, token: str, asked: TokenRotate, response: Response) -> TokenCreated:
     """Make one with the same rights; the old one ends soon. `self` is the one that the request came with."""
     row, fresh = core.access.rotate(caller, token, asked.grace_s)
+    made(response, "tokens", row.id)
     return TokenCreated.model_validate({**_fields(row), "token": fresh})
 
 
