@@ -96,7 +96,10 @@ def migrate(
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Moves.")] = 10,
     json: Annotated[bool, typer.Option("--json", help="Print one row.")] = False,
 ) -> None:
-    """Move a service from one site to another under a driven robot: the longest time without a command."""
+    """Move a service from one site to another under a driven robot: the longest time without a command.
+
+    Beside it, the same while nothing happens, and around the start of another program of the service's size.
+    """
     from rich.table import Table
 
     from skytether.lab.bench.migrate import bench_migrate
@@ -115,6 +118,7 @@ def migrate(
     for heading in ("", "p50 [ms]", "max [ms]"):
         table.add_column(heading, justify="right")
     table.add_row("around a move", f"{row.gap_p50_ms:.1f}", f"{row.gap_max_ms:.1f}")
+    table.add_row("around the start of another program", f"{row.gap_start_p50_ms:.1f}", f"{row.gap_start_max_ms:.1f}")
     table.add_row("without a move", f"{row.gap_still_p50_ms:.1f}", f"{row.gap_still_max_ms:.1f}")
     console.print(table)
     console.print(

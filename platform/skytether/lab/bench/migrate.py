@@ -1,11 +1,15 @@
 """How long a robot is without commands when its service moves from one site to another.
 
 Everything is real: an orchestrator with two sites, the service as a process on each, a simulated walker whose agent
-drives at 100 Hz. The service is moved to and fro while it drives.
+drives at 100 Hz. The service is moved to and fro while it drives. Beside each move the same is measured while nothing
+happens, and while another program of the service's size is started on the same machine, as a peer: all of it shares the
+processors, and a start that has nothing to do with the robot delays its commands as well.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -43,6 +47,9 @@ class MigrateRow:
         gap_max_ms: The largest of them.
         gap_still_p50_ms: The same over as long a time without a move: what machine and service do by themselves.
         gap_still_max_ms: The largest of those.
+        gap_start_p50_ms: The same around the start of another program, which loads what the service does and ends: what
+            a start costs on this machine.
+        gap_start_max_ms: The largest of those.
         move_p50_s: Median time from the request to the first command of the other instance.
         fallbacks: Moves during which the robot's own controller took over.
         bound_ms: Two periods of the service's commands.
@@ -53,6 +60,8 @@ class MigrateRow:
     gap_max_ms: float
     gap_still_p50_ms: float
     gap_still_max_ms: float
+    gap_start_p50_ms: float
+    gap_start_max_ms: float
     move_p50_s: float
     fallbacks: int
     bound_ms: float = 2 * PERIOD_MS
@@ -83,9 +92,10 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
     Raises:
         BenchError: It did not drive, or was not moved, in time.
     """
-    gaps, still, moves, fallbacks = [], [], [], 0
+    gaps, still, starts, moves, fallbacks = [], [], [], [], 0
     with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
         operator.create_site(SiteCreate(name="other", tier="edge", runtime="process"))
+        program = str(operator.get_service(SERVICE).spec.entrypoint)
         token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
         bind = ("127.0.0.1", 0)
         config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=bind, renew_s=0.5)
@@ -96,6 +106,12 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
                 time.sleep(2 * _AROUND_S)
                 began = time.monotonic()
                 still.append(seen.longest_gap_ms(began - 2 * _AROUND_S, began))
+                _load(program)
+                ended = time.monotonic()
+                time.sleep(_AROUND_S)
+                starts.append(seen.longest_gap_ms(began - _AROUND_S, ended + _AROUND_S))
+                time.sleep(_AROUND_S)
+                began = time.monotonic()
                 before = len(agent.status().driver.transitions)
                 coming = operator.migrate_instance(_instance(agent)).id
                 _wait(lambda: _instance(agent) == coming, agent)  # noqa: B023 (called at once)
@@ -111,9 +127,22 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
         round(max(gaps), 2),
         round(float(np.median(still)), 2),
         round(max(still), 2),
+        round(float(np.median(starts)), 2),
+        round(max(starts), 2),
         round(float(np.median(moves)), 3),
         fallbacks,
     )
+
+
+def _load(program: str) -> None:
+    """Load what a service does, in a process of its own, and end it."""
+    command = [sys.executable, "-P", "-c", f"import {program}.__main__, skytether.bridge"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise BenchError(f"the service's program does not load within {_LIMIT_S:.0f} s") from None
+    if done.returncode:
+        raise BenchError(f"the service's program does not load: {done.stderr.strip().splitlines()[-1]}")
 
 
 def _instance(agent: Agent) -> str:
