@@ -8,6 +8,7 @@ import io
 import json
 import sys
 import tarfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
@@ -397,3 +399,11 @@ def test_every_service_with_an_image_has_its_dockerfile() -> None:
         image = yaml.safe_load(path.read_text())["spec"]["image"]
         name = image.removeprefix("skytether/").removesuffix(":1")
         assert (ROOT / "images" / name / "Dockerfile").is_file(), image
+
+
+def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        runtime._prepare_early()
+    assert "site edge: nothing can be started yet: the Docker engine at unix://" in caplog.text

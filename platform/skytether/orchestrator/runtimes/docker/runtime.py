@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from .logs import ContainerLog
 from .network import ensure_network, remove_network
 from .objects import Seen, observation, refusal
 from .options import DockerOptions
+
+log = logging.getLogger(__name__)
 
 
 class DockerRuntime(Runtime):
@@ -44,6 +46,7 @@ class DockerRuntime(Runtime):
                 raise RuntimeFailure(f"tls: there is no file {path}")
         if options.registry_auth is not None:
             check_credentials(options.registry_auth)
+        self._site = site
         self._options = options
         self._owner = options.owner or _kept_owner(folder)
         self._engine = Engine(options)
@@ -68,8 +71,10 @@ class DockerRuntime(Runtime):
         self._early.start()
 
     def _prepare_early(self) -> None:
-        with suppress(RuntimeFailure):  # the first start will say it
+        try:
             self._prepare()
+        except RuntimeFailure as error:  # each start tries again, and says it to who asked
+            log.warning("site %s: nothing can be started yet: %s", self._site, error)
 
     def _prepare(self, *, anew: bool = False) -> None:
         with self._network_lock:
