@@ -235,7 +235,10 @@ class Reconciler:
             self._act(site, action)
         if due:
             site.tidied_at = time.monotonic()
-            site.runtime.tidy()
+            try:
+                site.runtime.tidy()
+            except RuntimeFailure as error:
+                log.warning("site %s: %s", site.name, error)
         if actions or any(r.state in (State.STARTING, State.STOPPING) for r in live):
             return self._timing.observe_changing
         return self._timing.observe

@@ -21,7 +21,7 @@ from docker import APIClient
 from docker.errors import APIError, DockerException
 from docker.tls import TLSConfig
 
-from ..base import RuntimeFailure
+from ..base import RuntimeFailure, SiteSilentError
 from .options import LOCAL_SOCKET, DockerOptions
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 
 
-class EngineGoneError(RuntimeFailure):
+class EngineGoneError(SiteSilentError):
     """The engine does not answer: nothing is known of what runs there."""
 
 

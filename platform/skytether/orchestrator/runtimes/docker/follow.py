@@ -19,14 +19,14 @@ import urllib3
 from docker.errors import NotFound
 
 from ..base import RuntimeFailure
-from .engine import Engine
+from .engine import Engine, EngineGoneError
 from .meter import Meter
 from .objects import OWNER, READY, Seen, carried_over, last_line, parse
 
 log = logging.getLogger(__name__)
 
 _QUIET_S = 10.0
-"""A stream without events for so long is opened anew: in between, an engine that went away in silence is noticed."""
+"""A stream without events for so long at most is opened anew: an engine that went away in silence is noticed then."""
 _AGAIN_S = 1.0
 """Between two attempts to reach an engine that does not answer."""
 _READY_S = 0.02
@@ -41,9 +41,10 @@ brings three others, and each file that is handed over one."""
 class Follower:
     """Keeps up with one engine, in a thread of its own."""
 
-    def __init__(self, engine: Engine, owner: str, on_connect: Callable[[], None]) -> None:
-        """``on_connect`` is called with each new connection; it must not wait."""
+    def __init__(self, engine: Engine, owner: str, on_connect: Callable[[], None], timeout_s: float) -> None:
+        """``on_connect`` is called with each new connection; it must not wait. ``timeout_s``: the engine's patience."""
         self._engine = engine
+        self._quiet_s = min(_QUIET_S, timeout_s)
         self._owner = owner
         self._on_connect = on_connect
         self._lock = threading.Lock()
@@ -73,7 +74,8 @@ class Follower:
         """All containers of ours; waits for the first look only, ``timeout_s`` [s] at most.
 
         Raises:
-            RuntimeFailure: The engine does not answer.
+            EngineGoneError: The engine does not answer.
+            RuntimeFailure: What it answers is not understood.
         """
         self._must_answer(timeout_s)
         with self._lock:
@@ -86,9 +88,15 @@ class Follower:
 
     def _must_answer(self, timeout_s: float) -> None:
         if not self._looked.wait(timeout_s):
-            raise RuntimeFailure("the Docker engine has not answered yet")
-        if self._failure is not None:
-            raise RuntimeFailure(str(self._failure))
+            raise EngineGoneError("the Docker engine has not answered yet")
+        failure = self._failure
+        if failure is not None:
+            raise type(failure)(str(failure))
+
+    def doubt(self, error: EngineGoneError) -> None:
+        """A call got no answer: believe that the engine is away until it has been looked at anew, at once."""
+        self._failure = error
+        self._end_stream()
 
     def of(self, instance: str) -> list[Seen]:
         """The containers of one instance as last seen, the earliest run first."""
@@ -163,7 +171,7 @@ class Follower:
             self._info = api.info()
             # By the engine's clock: events from before the list are looked at again, and none is missed.
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
-            quiet = self._engine.api(_QUIET_S)
+            quiet = self._engine.api(self._quiet_s)
             self._stream = quiet.events(since=since, filters={**mine, "type": ["container"]}, decode=True)
             try:
                 there = {row["Id"] for row in api.containers(all=True, filters=mine)}

@@ -11,7 +11,7 @@ from typing import Protocol
 from docker.errors import APIError, NotFound
 
 from ..base import Launch, RuntimeFailure
-from .engine import Engine, explain
+from .engine import Engine, EngineGoneError, explain
 from .follow import Follower
 from .images import ensure_image
 from .objects import Seen, advised, container, free_gpus, free_port, grant_archive, name_of
@@ -56,6 +56,8 @@ class Job:
         self.launch = launch
         self.failure = ""
         """Why nothing runs, when it has ended that way."""
+        self.unanswered = False
+        """It came to nothing, or nobody knows to what, because the engine did not answer: to be started again."""
         self.detail = ""
         self._engine = engine
         self._options = options
@@ -93,6 +95,10 @@ class Job:
             self._launch()
         except StoppedError:
             self.failure = "was stopped before it ran"
+        except EngineGoneError as error:
+            log.warning("start of %s: %s", self.launch.instance, error)
+            self._follower.doubt(error)
+            self.unanswered = True
         except RuntimeFailure as error:
             self.failure = f"could not be started: {advised(str(error))}"
         except Exception as error:

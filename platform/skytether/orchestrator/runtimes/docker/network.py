@@ -11,6 +11,7 @@ import hashlib
 import logging
 from contextlib import suppress
 
+from docker import APIClient
 from docker.errors import APIError, NotFound
 
 from ..base import RuntimeFailure
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 _OURS = "skytether.io/network"
 _GUARD = "skytether.io/guard"
 _GUARD_TIMEOUT_S = 30
+_LEFT_S = 2 * _GUARD_TIMEOUT_S
+"""A container of a guard that is older than another one by so much was left behind: its orchestrator was killed."""
 
 
 def bridge_of(network: str) -> str:
@@ -135,13 +138,21 @@ def run_guard(engine: Engine, image: str, script: str) -> tuple[str, int]:
     }
     with engine.asked():
         api = engine.api()
-        for left in api.containers(all=True, filters={"label": [_GUARD], "status": ["exited", "created"]}):
-            with suppress(APIError):  # another orchestrator's, which is just removing it
-                api.remove_container(left["Id"])
         made = api.create_container_from_config(body)["Id"]
         try:
+            _remove_left(api, made)
             api.start(made)
             status = int(api.wait(made, timeout=_GUARD_TIMEOUT_S)["StatusCode"])
             return api.logs(made).decode(errors="replace"), status
         finally:
             api.remove_container(made, force=True)
+
+
+def _remove_left(api: APIClient, made: str) -> None:
+    """Remove what others left behind, and not what another orchestrator is just about to start."""
+    rows = api.containers(all=True, filters={"label": [_GUARD]})
+    latest = max((row["Created"] for row in rows if row["Id"] == made), default=0) - _LEFT_S
+    for row in rows:
+        if row["Created"] < latest:
+            with suppress(APIError):  # somebody else is at it
+                api.remove_container(row["Id"], force=True)

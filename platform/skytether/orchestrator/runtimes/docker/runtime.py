@@ -57,7 +57,7 @@ class DockerRuntime(Runtime):
         self._network_lock = threading.Lock()
         self._network_ready = False
         self._early: threading.Thread | None = None
-        self._follower = Follower(self._engine, self._owner, self._on_connect)
+        self._follower = Follower(self._engine, self._owner, self._on_connect, options.timeout_s)
         self._follower.start()
 
     @override
@@ -96,7 +96,7 @@ class DockerRuntime(Runtime):
         self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
         with self._lock:
             job, newest = self._jobs.get(launch.instance), self._newest(launch.instance)
-            if job is not None and job.attempt == launch.attempt:
+            if job is not None and job.attempt == launch.attempt and not job.unanswered:
                 return
             if newest is not None and newest.attempt == launch.attempt and newest.status != "created":
                 return
@@ -125,6 +125,8 @@ class DockerRuntime(Runtime):
         for instance, job in jobs.items():
             if instance in found and found[instance].attempt >= job.attempt:
                 continue
+            if job.unanswered:
+                continue  # as if it had not been begun: it is, once the engine answers
             if job.failure:
                 found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure)
             else:
@@ -140,9 +142,9 @@ class DockerRuntime(Runtime):
         for seen in self._follower.of(instance):
             if not seen.runs or (not force and seen.id in self._asked):
                 continue
+            kill(self._engine, seen.id, "KILL" if force else "TERM")
             if not force:
                 self._asked.add(seen.id)  # once only: services may take a second signal for impatience
-            kill(self._engine, seen.id, "KILL" if force else "TERM")
 
     def remove(self, instance: str) -> None:
         with self._lock:
@@ -155,6 +157,7 @@ class DockerRuntime(Runtime):
             self._asked.discard(seen.id)
 
     def logs(self, instance: str, lines: int) -> str:
+        self._follower.seen(self._options.timeout_s)  # who asks an engine that is away need not wait for it
         texts: list[str] = []
         left = lines
         for seen in reversed(self._follower.of(instance)):
@@ -171,11 +174,22 @@ class DockerRuntime(Runtime):
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
+        self._follower.seen(self._options.timeout_s)
         newest = self._newest(instance)
         return ContainerLog(self._engine, newest.id, lines) if newest is not None and newest.runs else None
 
     @override
+    def tidy(self) -> None:
+        """Remove what was made and never begun: an orchestrator was killed, or an engine answered too late."""
+        with self._lock:
+            busy = {instance for instance, job in self._jobs.items() if not job.ended}
+        for seen in self._follower.seen(self._options.timeout_s):
+            if seen.status == "created" and seen.instance not in busy:
+                remove(self._engine, self._follower, seen.id)
+
+    @override
     def dismantle(self) -> None:
+        self.tidy()
         remove_network(self._engine, self._options)
 
     @override
