@@ -9,6 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
+from nothing_lost import assert_nothing_lost, processes, told
 from orchestrator_program import Program, alive, until, with_toy
 
 from skytether.api.client import ApiError
@@ -58,8 +59,11 @@ def test_what_runs_runs_on_and_changes_are_refused_until_there_is_room(small_dis
             after = client.create_instance(InstanceCreate(robot="later", service="toy", lease_s=1000))
             assert client.wait_running(after.id).state is State.RUNNING
             assert client.get_instance(made.id).restarts == 0
+            running = dict.fromkeys((made.id, after.id), State.RUNNING)
+            assert_nothing_lost(told(client), running, processes(program.folder))
             for instance in client.instances():
                 client.delete_instance(instance.id)
-            until(lambda: all(i.state.final for i in client.instances()), program)
+            ended = {i.id: State.STOPPED for i in client.instances()}
+            assert_nothing_lost(told(client), ended, processes(program.folder))
     finally:
         program.clean_up()

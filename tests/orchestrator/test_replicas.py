@@ -14,6 +14,7 @@ import httpx
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from nothing_lost import assert_nothing_lost, processes, told
 from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 
 from skytether.api.client import Client
@@ -135,7 +136,8 @@ def test_one_leads_all_answer_and_when_the_leader_is_killed_another_adopts(
     again = second.create_instance(ASK)
     until(lambda: running(second, again.id))
     second.delete_instance(made.id)
-    until(lambda: second.get_instance(made.id).state is State.STOPPED)
+    after = {made.id: State.STOPPED, again.id: State.RUNNING}
+    assert_nothing_lost(told(second), after, processes(tmp_path))
 
 
 def test_prometheus_is_told_of_all_that_are_connected(replicas: Callable[..., Replica], tmp_path: Path) -> None:
@@ -192,6 +194,7 @@ def test_the_database_is_away_for_longer_than_a_lease_and_nothing_is_lost(
     back = client.renew_instance(made.id, Renew(lease_s=1000))
     assert (back.state, back.restarts) == (State.RUNNING, 0)
     assert program.services() == pids
+    assert_nothing_lost(told(client), {made.id: State.RUNNING}, processes(program.folder))
     assert program.log.count("the database does not answer, trying again") <= 3
     assert "Traceback" not in program.log
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
 from skytether.orchestrator.runtimes.docker.network import table_of
+from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
 
 
 @dataclass(frozen=True)
@@ -38,44 +39,49 @@ ENTRYPOINT ["/app/bin/python", "-P", "-m", "skytether.testing.toy_service"]
 class DockerSite:
     """Docker sites of the tests: with a network of their own, and nothing left of them at the end."""
 
-    def __init__(self, images: Images) -> None:
+    def __init__(self, images: Images, engine: str = f"unix://{LOCAL_SOCKET}") -> None:
         self.images = images
+        self.engine = engine
         self.network = f"skytether-test-{secrets.token_hex(4)}"
         self.owner = f"test-{secrets.token_hex(4)}"
 
     def options(self, **changes: object) -> dict[str, object]:
         """The site's options, as over REST."""
         guard = self.images.name("guard")
-        return {"network": self.network, "guard_image": guard, "owner": self.owner, "pull": "never"} | changes
+        return {
+            "engine": self.engine,
+            "network": self.network,
+            "guard_image": guard,
+            "owner": self.owner,
+            "pull": "never",
+        } | changes
 
     def open(self, folder: Path, **changes: object) -> DockerRuntime:
         return DockerRuntime("edge", folder, DockerOptions.model_validate(self.options(**changes)))
 
+    def docker(self, *arguments: str) -> str:
+        """Ask the engine; what it says."""
+        done = subprocess.run(["docker", "-H", self.engine, *arguments], capture_output=True, text=True)
+        return done.stdout.strip()
+
     def containers(self) -> list[str]:
         """Ids of all that are this site's, ended ones too."""
-        filtered = f"label=skytether.io/owner={self.owner}"
-        listed = subprocess.run(
-            ["docker", "ps", "-aq", "--no-trunc", "--filter", filtered], capture_output=True, text=True
-        )
-        return listed.stdout.split()
+        return self.docker("ps", "-aq", "--no-trunc", "--filter", f"label=skytether.io/owner={self.owner}").split()
 
     def volumes(self) -> list[str]:
         """Names of the volumes that hold what the services wrote."""
-        filtered = f"name=skytether-{self.owner}-data-"
-        listed = subprocess.run(["docker", "volume", "ls", "-q", "--filter", filtered], capture_output=True, text=True)
-        return listed.stdout.split()
+        return self.docker("volume", "ls", "-q", "--filter", f"name=skytether-{self.owner}-data-").split()
 
     def clean(self) -> None:
         """Remove containers and data."""
         for kind, names in (("container", self.containers()), ("volume", self.volumes())):
             if names:
-                flags = ["-f", "-v"] if kind == "container" else ["-f"]
-                subprocess.run(["docker", kind, "rm", *flags, *names], capture_output=True)
+                self.docker(kind, "rm", *(["-f", "-v"] if kind == "container" else ["-f"]), *names)
 
     def close(self) -> None:
         """Remove the network and its filter too."""
         self.clean()
-        subprocess.run(["docker", "network", "rm", self.network], capture_output=True)
+        self.docker("network", "rm", self.network)
         self._nft(f"delete table {table_of(self.network)}")
 
     def filtered(self) -> bool:
@@ -83,5 +89,5 @@ class DockerSite:
         return self._nft(f"list table {table_of(self.network)}") == 0
 
     def _nft(self, script: str) -> int:
-        command = ["docker", "run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", self.images.name("guard")]
-        return subprocess.run([*command, script], capture_output=True).returncode
+        command = ["docker", "-H", self.engine, "run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN"]
+        return subprocess.run([*command, self.images.name("guard"), script], capture_output=True).returncode

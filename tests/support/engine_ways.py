@@ -16,7 +16,7 @@ import tarfile
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -28,8 +28,14 @@ ENGINE = "/var/run/docker.sock"
 class EngineProxy:
     """Passes bytes between clients and the engine's socket; ``cut`` is an engine that goes away."""
 
-    def __init__(self, path: Path | None = None, context: ssl.SSLContext | None = None) -> None:
-        """On a socket of its own at ``path``, or on a TCP port of loopback with TLS."""
+    def __init__(
+        self, path: Path | None = None, context: ssl.SSLContext | None = None, target: str = f"unix://{ENGINE}"
+    ) -> None:
+        """On a socket of its own at ``path``, or on a TCP port of loopback with TLS; to the engine at ``target``."""
+        self._target = target.removeprefix("unix://")
+        self.swallow: bytes | None = None
+        """Requests with this in them get lost on their way, and no answer; then ``swallowed`` is set."""
+        self.swallowed = threading.Event()
         self.port = 0
         self._path = path
         self._context = context
@@ -78,20 +84,30 @@ class EngineProxy:
             if self._context is not None:
                 client = self._context.wrap_socket(client, server_side=True)
             engine = socket.socket(socket.AF_UNIX)
-            engine.connect(ENGINE)
+            engine.connect(self._target)
         except OSError:
             client.close()
             return
         self._open += [client, engine]
-        both = [threading.Thread(target=_pump, args=pair, daemon=True) for pair in ((client, engine), (engine, client))]
+        both = [
+            threading.Thread(target=_pump, args=(client, engine, self._loses), daemon=True),
+            threading.Thread(target=_pump, args=(engine, client, lambda _: False), daemon=True),
+        ]
         for one in both:
             one.start()
 
+    def _loses(self, data: bytes) -> bool:
+        lost = self.swallow is not None and self.swallow in data
+        if lost:
+            self.swallowed.set()
+        return lost
 
-def _pump(source: socket.socket, sink: socket.socket) -> None:
+
+def _pump(source: socket.socket, sink: socket.socket, loses: Callable[[bytes], bool]) -> None:
     with contextlib.suppress(OSError, ValueError):
         while data := source.recv(65_536):
-            sink.sendall(data)
+            if not loses(data):
+                sink.sendall(data)
     for one in (source, sink):
         with contextlib.suppress(OSError):
             one.shutdown(socket.SHUT_RDWR)

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import platform
+import secrets
 import shutil
 import signal
 import socket
@@ -54,6 +55,9 @@ class ProcessOptions(Strict):
     """Address that services listen on."""
     folder: Path | None = None
     """Of the instances, the same for several orchestrators on this machine; None: in the orchestrator's own state."""
+    owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
+    """Under this name instances are found again in ``folder``, beside those of other databases; None: one is made up
+    when the site is added."""
     advertise_host: str | None = None
     """Address that robots are told; None: the one bound. Needed when that is a wildcard."""
     cpu: Annotated[float, Field(gt=0)] | None = None
@@ -112,12 +116,18 @@ class ProcessRuntime(Runtime):
         if not sys.platform.startswith("linux"):
             raise RuntimeFailure("the process runtime needs Linux: use a container site")
         self._options = options
-        folder = self._options.folder or folder
+        if self._options.folder is not None:
+            folder = self._options.folder / (self._options.owner or "")
         self._folder = folder / "instances"
         self._data = folder / "data"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._measured_at = -math.inf
         self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
+
+    @override
+    @classmethod
+    def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return {"owner": secrets.token_hex(6), **options} if options.get("folder") else options
 
     def _adopt(self, folder: Path) -> _Run:
         note = folder / "run.json"
