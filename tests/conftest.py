@@ -82,6 +82,15 @@ def ros1() -> None:
 
 
 @pytest.fixture(scope="session")
+def faketime() -> str:
+    """A library that gives a program, by LD_PRELOAD, a wall clock which a test can set."""
+    found = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
+    if not found:
+        require("faketime", "there is no libfaketimeMT.so.1: install libfaketime")
+    return str(found[0])
+
+
+@pytest.fixture(scope="session")
 def docker_engine() -> str:
     """A Docker engine that answers, and the image that everything is built on; its version."""
     if shutil.which("docker") is None:

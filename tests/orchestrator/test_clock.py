@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
+from nothing_lost import assert_nothing_lost, processes, told
+from orchestrator_program import Program, until, with_toy
 from reconcile_bench import Bench, add
 
-from skytether.api.rest import State
+from skytether.api.client import ApiError, Client
+from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
 from skytether.orchestrator.clocks import SetClock
 from skytether.orchestrator.records import Record
 from skytether.testing.runtimes import CrashingRuntime, NeverReadyRuntime
@@ -87,3 +92,58 @@ def test_a_back_off_of_another_clock_is_not_waited_for(bench: Any, new_record: N
     b.clock.set_by(-HOURS)
     b.step(2)
     assert b.record().restarts == 3
+
+
+class Faked:
+    """The wall clock of programs that are started from now on; that of this machine is not touched."""
+
+    def __init__(self, library: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._offset = folder / "offset"
+        self.set_by(0)
+        for name, value in {
+            "LD_PRELOAD": library,
+            "FAKETIME_TIMESTAMP_FILE": str(self._offset),
+            "FAKETIME_NO_CACHE": "1",
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        }.items():
+            monkeypatch.setenv(name, value)
+
+    def set_by(self, seconds: float) -> None:
+        """Against the right time."""
+        draft = self._offset.with_suffix(".new")
+        draft.write_text(f"{seconds:+.0f}")
+        draft.replace(self._offset)
+
+
+@pytest.mark.slow
+def test_the_clock_of_a_machine_is_set_under_an_orchestrator(
+    faketime: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, manifest: Any
+) -> None:
+    faked = Faked(faketime, tmp_path, monkeypatch)
+    (tmp_path / "one").mkdir()
+    program = Program(tmp_path / "one" / "state")
+    runs = processes(program.folder)
+    try:
+        with with_toy(program.start(), manifest) as client:
+            made = client.wait_running(client.create_instance(InstanceCreate(robot="w", service="toy", lease_s=60)).id)
+            at_work = runs()
+            asked = TokenCreate(name="short", scopes=("read",), ttl_s=3600)
+            address = (program.folder / "address").read_text().strip()
+            with Client(address, client.create_token(asked).token) as reader:
+                for number, (by, good) in enumerate([(HOURS, False), (-HOURS, True)], start=1):
+                    faked.set_by(by)
+                    until(lambda n=number: program.log.count("leases and waits count anew") == n, program)
+                    if good:
+                        assert reader.get_instance(made.id).state is State.RUNNING
+                    else:
+                        with pytest.raises(ApiError, match="expired"):
+                            reader.get_instance(made.id)
+                    assert_nothing_lost(told(client), {made.id: State.RUNNING}, runs)
+                    left = client.get_instance(made.id).lease_expires_at.timestamp() - time.time() - by
+                    assert 0 < left <= 61
+            assert runs() == at_work
+            assert client.get_instance(made.id).restarts == 0
+            client.renew_instance(made.id, Renew(lease_s=1))
+            assert_nothing_lost(told(client), {made.id: State.STOPPED}, runs)
+    finally:
+        program.clean_up()

@@ -6,6 +6,9 @@ import datetime
 import ipaddress
 import json
 import logging
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -68,6 +71,24 @@ def test_https_with_a_certificate_of_ones_own(program: Callable[..., Program], t
     token = (running.folder / "operator.token").read_text().strip()
     with Client(url, token, ca_file=cert) as client:
         assert [site.name for site in client.sites()] == ["local"]
+
+
+def test_a_clock_that_is_wrong_is_no_wrong_certificate(
+    program: Callable[..., Program], tmp_path: Path, faketime: str
+) -> None:
+    cert, key = certificate(tmp_path)
+    running = program(tls={"certificate": str(cert), "key": str(key)})
+    running.start().close()
+    url = (running.folder / "address").read_text().strip()
+    token = (running.folder / "operator.token").read_text().strip()
+    for offset, says in (("+10d", "certificate has expired"), ("-10d", "certificate is not yet valid")):
+        wrong = {"LD_PRELOAD": faketime, "FAKETIME": offset, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+        ours = {"SKYTETHER_CA_FILE": str(cert), "SKYTETHER_TOKEN": token}
+        command = [sys.executable, "-m", "skytether.cli", "site", "list", "--url", url]
+        done = subprocess.run(command, env={**os.environ, **wrong, **ours}, capture_output=True, text=True)
+        said = " ".join(done.stderr.split())
+        assert done.returncode == 1
+        assert f"is not trusted (certificate verify failed: {says}): correct this machine's clock" in said
     with Client(url.replace("https:", "http:"), token) as client, pytest.raises((Unreachable, ApiError)):
         client.sites()
     elsewhere = Client(url.replace("127.0.0.1", "localhost"), token, ca_file=cert)

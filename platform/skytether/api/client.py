@@ -7,6 +7,7 @@ import ssl
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -325,10 +326,11 @@ class Client:
     def _unreachable(self, error: Exception | None = None) -> Unreachable:
         if "CERTIFICATE_VERIFY_FAILED" in str(error):
             why = str(error).partition("CERTIFICATE_VERIFY_FAILED] ")[2].partition(" (_ssl")[0]
-            return Unreachable(
-                f"the certificate of {self._url} is not trusted ({why}): "
-                "give the file of its authority (SKYTETHER_CA_FILE), or correct the address"
-            )
+            dated = "expired" in why or "not yet valid" in why
+            advice = "give the file of its authority (SKYTETHER_CA_FILE), or correct the address"
+            if dated:
+                advice = f"correct this machine's clock ({datetime.now(UTC):%Y-%m-%d %H:%M} UTC), or renew it"
+            return Unreachable(f"the certificate of {self._url} is not trusted ({why}): {advice}")
         return Unreachable(
             f"no orchestrator answers at {self._url}: "
             "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
