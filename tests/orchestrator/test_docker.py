@@ -409,6 +409,14 @@ def stopped(runtime: DockerRuntime) -> bool:
     return True
 
 
+def is_seen(runtime: DockerRuntime, phase: Phase) -> bool:
+    """Whether the engine answers, and says so."""
+    try:
+        return runtime.observe()["i1"].phase is phase
+    except RuntimeFailure:
+        return False
+
+
 def runtime_answers(runtime: DockerRuntime) -> bool:
     try:
         runtime.observe()
@@ -454,9 +462,9 @@ def test_an_engine_behind_ssh(sshd: str, docker_site: DockerSite, tmp_path: Path
             assert tunnel._process is not None
             tunnel._process.kill()  # the network is gone for a moment
             tunnel._process.wait()
-            until(lambda: runtime_answers(runtime) and runtime.observe()["i1"].phase is Phase.RUNNING)
+            until(lambda: is_seen(runtime, Phase.RUNNING))
             until(lambda: stopped(runtime))
-            until_phase(runtime, Phase.EXITED)
+            until(lambda: is_seen(runtime, Phase.EXITED))
         unknown = {**options, "ssh": {**options["ssh"], "known_hosts": str(tmp_path / "none")}}
         with closing(docker_site.open(tmp_path, **unknown)) as runtime:
             assert "Host key verification failed" in until_gone(runtime)
