@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -217,6 +219,57 @@ def test_waiting_gives_the_running_instance_or_says_why_not(script: Script, clie
     script.answers["GET", path] = (200, "text/event-stream", events("pending", "failed"))
     with pytest.raises(NotRunning, match=r"^instance i1 is failed: r2$"):
         client.wait_running("i1", timeout=5)
+
+
+@contextmanager
+def hanging_up(times: int) -> Iterator[tuple[str, list[bytes]]]:
+    """A server that takes requests and closes the connection, so many times; its address, and what it was sent."""
+    taken: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            for _ in range(times):
+                connection, _ = listener.accept()
+                with connection:
+                    taken.append(connection.recv(65536))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", taken
+        thread.join()
+
+
+def test_of_several_addresses_the_one_that_answers_is_asked(script: Script) -> None:
+    script.says("GET", "/api/v1/instances", [INSTANCE])
+    script.says("POST", "/api/v1/robots", {"name": "r", "created_at": NOW, "token": "t"}, 201)
+    with Client(f"http://127.0.0.1:1, {script.url}/", "sky-token") as client:
+        assert [i.id for i in client.instances()] == ["i1"]
+        assert client.create_robot(RobotCreate(name="r")).token == "t"
+    with Client("http://127.0.0.1:1,http://127.0.0.1:2") as client, pytest.raises(Unreachable) as caught:
+        client.instances()
+    assert "answers at http://127.0.0.1:1, http://127.0.0.1:2:" in str(caught.value)
+
+
+def test_one_that_cannot_serve_now_is_left_for_another(script: Script) -> None:
+    problem = {"title": "Not possible now", "status": 503, "detail": "not now"}
+    script.says("GET", "/api/v1/instances", problem, 503)
+    with Client(f"{script.url},http://127.0.0.1:1") as client, pytest.raises(ApiError, match="not now"):
+        client.instances()
+    assert len(script.asked) == 2, "once more after the others"
+
+
+def test_a_lost_connection_is_tried_again_only_where_that_does_no_harm(script: Script) -> None:
+    script.says("POST", "/api/v1/instances", INSTANCE, 201)
+    with hanging_up(1) as (url, taken), Client(f"{url},{script.url}") as client:
+        assert client.create_instance(InstanceCreate(robot="walker", service="toy")).id == "i1"
+    (key,) = (line for line in taken[0].lower().splitlines() if line.startswith(b"idempotency-key: "))
+    assert key.decode().endswith(script.asked[0][2]["idempotency-key"])
+    with hanging_up(1) as (url, _), Client(f"{url},{script.url}") as client, pytest.raises(Unreachable):
+        client.create_robot(RobotCreate(name="r"))
+    assert len(script.asked) == 1
+    with hanging_up(2) as (url, taken), Client(url) as client, pytest.raises(Unreachable):
+        client.instances()
+    assert len(taken) == 2
 
 
 def test_no_secret_shows(client: Client) -> None:

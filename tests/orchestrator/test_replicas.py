@@ -12,15 +12,12 @@ from typing import Any
 
 import httpx
 import pytest
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
 from nothing_lost import assert_nothing_lost, processes, told
 from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
-from skytether.orchestrator.db import make_engine, migrate
-from skytether.orchestrator.models import metadata
+from skytether.orchestrator.db import make_engine
 from skytether.orchestrator.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]
@@ -82,26 +79,6 @@ def services(folder: Path) -> set[int]:
 def running(client: Client, instance: str) -> Any:
     found = client.get_instance(instance)
     return found if found.state is State.RUNNING else None
-
-
-def test_the_schema_in_postgresql_is_that_of_the_models(postgres: str) -> None:
-    engine = make_engine(postgres)
-    migrate(engine, "0001")
-    with engine.begin() as connection:
-        connection.exec_driver_sql(
-            "INSERT INTO robots (name, services, token_prefix, token_sha256, created_at)"
-            " VALUES ('walker', '[]', 'sky-12345678', 'x', 1)"
-        )
-    migrate(engine)
-    migrate(engine)
-    with engine.connect() as connection:
-        assert connection.exec_driver_sql("SELECT id, robot, prefix FROM tokens").all() == [
-            ("12345678", "walker", "sky-12345678")
-        ]
-    with engine.connect() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, metadata) == []
-    engine.dispose()
 
 
 def test_one_leads_all_answer_and_when_the_leader_is_killed_another_adopts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -151,7 +152,7 @@ def test_watchers_do_not_hold_up_the_end(programs: Any, manifest: Any) -> None:
         watching = threading.Event()
 
         def watch() -> None:
-            for event in client.watch(made.id, timeout=PATIENCE):
+            for event in client.watch(made.id, timeout=4):
                 states.append(event.state)
                 watching.set()
 
@@ -163,6 +164,38 @@ def test_watchers_do_not_hold_up_the_end(programs: Any, manifest: Any) -> None:
         assert time.monotonic() - began < 3
         thread.join()
         assert State.RUNNING in states
+
+
+def test_at_shutdown_what_was_asked_is_answered_and_nobody_else_is_let_in(programs: Any, manifest: Any) -> None:
+    program = programs()
+    with program.start() as client:
+        host, _, port = (program.folder / "address").read_text().strip().removeprefix("http://").rpartition(":")
+        token = (program.folder / "operator.token").read_text().strip()
+        body = json.dumps(manifest("late")).encode()
+        head = (
+            f"PUT /api/v1/catalog/late HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+        )
+        assert program.process is not None
+        with socket.create_connection((host, int(port))) as slow:
+            slow.sendall(head.encode() + body[:10])
+            client.sites()  # so it has seen the beginning of the other one
+            program.process.send_signal(signal.SIGTERM)
+            until(lambda: refused(host, int(port)))
+            assert program.process.poll() is None
+            slow.sendall(body[10:])
+            assert slow.recv(65536).startswith(b"HTTP/1.1 201 ")
+        assert program.process.wait(PATIENCE) == 0
+    with program.start() as client:
+        assert client.get_service("late").metadata.name == "late"
+
+
+def refused(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port)).close()
+    except ConnectionRefusedError:
+        return True
+    return False
 
 
 def test_a_service_that_ends_at_once_is_failed_with_its_last_line(programs: Any, manifest: Any) -> None:

@@ -26,6 +26,8 @@ class Program:
     def __init__(self, folder: Path, *options: str) -> None:
         self.folder = folder
         self.options = options
+        self.code: Path | None = None
+        """Another source root than this one's."""
         self.process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -34,8 +36,11 @@ class Program:
 
     def spawn(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--state-dir", str(self.folder)]
+        path = os.pathsep.join([*([str(self.code)] if self.code else []), os.environ.get("PYTHONPATH", "")])
         with (self.folder.parent / "log").open("ab") as log:
-            self.process = subprocess.Popen([*command, "--port", "0", *self.options], stdout=log, stderr=log)
+            self.process = subprocess.Popen(
+                [*command, "--port", "0", *self.options], stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": path}
+            )
         return self.process
 
     def start(self) -> Client:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import ssl
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -44,6 +46,20 @@ _PING_LIMIT = 45.0
 """Seconds without a sign of life after which an event stream counts as dead; the server pings every 15."""
 
 
+_RESUME_S = 30.0
+"""How long an event stream that was lost is tried again [s]: an orchestrator is restarted in less."""
+_RESUME_PAUSE_S = 0.2
+_AWAY = (502, 503, 504)
+"""Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
+_REPEATABLE = ("/renew", "/migrate")
+"""Ends of paths to which a request that comes twice does what it would do once."""
+
+
+def addresses(base_url: str) -> list[str]:
+    """Each of the addresses that are given with commas between them; one that is empty stays, to be complained of."""
+    return [url.strip().rstrip("/") for url in base_url.split(",") if url.strip()] or [""]
+
+
 class ApiError(Exception):
     """The orchestrator answered that it will not; ``str()`` is its one sentence."""
 
@@ -61,7 +77,11 @@ class NotRunning(Exception):  # noqa: N818
 
 
 class Client:
-    """One orchestrator, as the owner of one token sees it. Safe from any thread; use it as a context manager.
+    """An orchestrator, as the owner of one token sees it. Safe from any thread; use it as a context manager.
+
+    Of several over one database the one that answered last is asked first, and the others when that is away. A request
+    whose connection was lost is sent again, if that can do no harm: it looks only, or does the same once more. So an
+    orchestrator that is being restarted is not noticed where there is another one.
 
     Every method raises :class:`ApiError` or :class:`Unreachable`, and nothing else.
     """
@@ -69,10 +89,10 @@ class Client:
     def __init__(
         self, base_url: str, token: str | None = None, *, timeout: float = 10.0, ca_file: Path | str | None = None
     ) -> None:
-        """One orchestrator.
+        """One orchestrator, or several.
 
         Args:
-            base_url: ``https://host:port``.
+            base_url: ``https://host:port``; of several, with commas between them.
             token: An operator's or a robot's.
             timeout: Seconds for each step of a request: connect, send, receive.
             ca_file: PEM file of the authority that the orchestrator's certificate is by; None: the system's.
@@ -80,15 +100,16 @@ class Client:
         Raises:
             ApiError: The token holds characters that no token has, or the file holds no certificate.
         """
-        self._url = base_url.rstrip("/")
+        self._urls = addresses(base_url)
+        self._at = 0
+        """Which of them answered last."""
         if token and not (token.isascii() and token.isprintable()):
             raise ApiError(Problem(title="No valid token", status=401, detail="what was given as token is none"))
         self._http = httpx.Client(
-            base_url=self._url,
             headers={"Authorization": f"Bearer {token}"} if token else {},
             timeout=timeout,
             # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
-            verify=False if self._url.startswith("http://") else _trust(ca_file),
+            verify=False if all(url.startswith("http://") for url in self._urls) else _trust(ca_file),
             # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
             trust_env=False,
         )
@@ -96,6 +117,10 @@ class Client:
     def set_token(self, token: str) -> None:
         """Use another token from the next request on."""
         self._http.headers["Authorization"] = f"Bearer {token}"
+
+    @property
+    def _shown(self) -> str:
+        return ", ".join(self._urls)
 
     def close(self) -> None:
         """Let go of the connections."""
@@ -142,13 +167,9 @@ class Client:
 
     def follow_logs(self, instance_id: str, tail: int = 200) -> Iterator[str]:
         """The last lines of its present run, then what that writes as it comes, until it ends."""
-        path = f"{_PREFIX}/instances/{instance_id}/logs?tail={tail}&follow=true"
-        timeout = httpx.Timeout(self._http.timeout.connect, read=None)
+        path = f"/instances/{instance_id}/logs?tail={tail}&follow=true"
         try:
-            with self._http.stream("GET", path, timeout=timeout) as response:
-                if response.is_error:
-                    response.read()
-                    raise ApiError(_problem(response))
+            with self._stream(path, None) as response:
                 yield from response.iter_text()
         except httpx.TransportError as error:
             raise self._unreachable(error) from error
@@ -156,32 +177,61 @@ class Client:
     def watch(self, instance_id: str, after: int = 0, *, timeout: float | None = None) -> Iterator[InstanceEvent]:
         """Every change so far after event ``after``, then each as it comes, until the instance has ended.
 
+        An orchestrator that ends meanwhile is waited for, or another one asked.
+
         Args:
             instance_id: Which.
             after: Id of the last event that is known already.
             timeout: Seconds after which to stop watching; None: never.
         """
-        deadline = None if timeout is None else time.monotonic() + timeout
-        try:
-            yield from self._watch(f"{_PREFIX}/instances/{instance_id}/events", after, deadline)
-        except httpx.ReadTimeout:
-            if deadline is None or time.monotonic() < deadline:
-                raise self._unreachable() from None
-        except httpx.TransportError as error:
-            raise self._unreachable(error) from error
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
+        reached, ended, silent_since = False, False, None
+        while True:
+            try:
+                for event in self._watch(instance_id, after, deadline):
+                    after, reached = event.id, True
+                    yield event
+                    if event.state.final:
+                        return
+                if ended or time.monotonic() >= deadline:
+                    return
+                # The stream has ended with the instance, or with the orchestrator; its last event may be missing yet.
+                ended = self.get_instance(instance_id).state.final
+                reached, silent_since = True, None
+            except (httpx.TransportError, Unreachable, ApiError) as error:
+                now = time.monotonic()
+                if now >= deadline:
+                    return
+                silent_since = silent_since or now
+                away = not isinstance(error, ApiError) or error.problem.status in _AWAY
+                if not (reached and away) or now - silent_since > _RESUME_S:
+                    if isinstance(error, httpx.TransportError):
+                        raise self._unreachable(error) from error
+                    raise
+                time.sleep(min(_RESUME_PAUSE_S, max(0.0, deadline - now)))
 
-    def _watch(self, path: str, after: int, deadline: float | None) -> Iterator[InstanceEvent]:
-        patience = _PING_LIMIT if deadline is None else max(0.001, min(_PING_LIMIT, deadline - time.monotonic()))
-        timeout = httpx.Timeout(self._http.timeout.connect, read=patience)
-        with self._http.stream("GET", path, headers={"Last-Event-ID": str(after)}, timeout=timeout) as response:
-            if response.is_error:
-                response.read()
-                raise ApiError(_problem(response))
+    def _watch(self, instance_id: str, after: int, deadline: float) -> Iterator[InstanceEvent]:
+        patience = max(0.001, min(_PING_LIMIT, deadline - time.monotonic()))
+        path = f"/instances/{instance_id}/events"
+        with self._stream(path, patience, {"Last-Event-ID": str(after)}) as response:
             for line in response.iter_lines():
                 if line.startswith("data:"):
                     yield _parse(InstanceEvent, json.loads(line.removeprefix("data:")))
-                if deadline is not None and time.monotonic() >= deadline:
+                if time.monotonic() >= deadline:
                     return
+
+    @contextmanager
+    def _stream(
+        self, path: str, patience: float | None, headers: dict[str, str] | None = None
+    ) -> Iterator[httpx.Response]:
+        """An answer that comes bit by bit; ``patience`` is for each bit, in seconds."""
+        timeout = httpx.Timeout(self._http.timeout.connect, read=patience)
+        response = self._send("GET", _PREFIX + path, headers=headers, timeout=timeout, stream=True)
+        with closing(response):
+            if response.is_error:
+                response.read()
+                raise ApiError(_problem(response))
+            yield response
 
     def wait_running(
         self, instance_id: str, timeout: float = 30.0, on_event: Callable[[InstanceEvent], None] = lambda _: None
@@ -315,13 +365,51 @@ class Client:
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None, prefix: str = _PREFIX
     ) -> httpx.Response:
         document = body.model_dump(mode="json", by_alias=True) if isinstance(body, BaseModel) else body
+        again = method != "POST" or "Idempotency-Key" in (headers or {}) or path.endswith(_REPEATABLE)
         try:
-            response = self._http.request(method, prefix + path, json=document, headers=headers)
+            response = self._send(method, prefix + path, again=again, json=document, headers=headers)
         except (httpx.TransportError, httpx.InvalidURL) as error:
             raise self._unreachable(error) from error
         if not response.is_success:
             raise ApiError(_problem(response))
         return response
+
+    def _send(
+        self, method: str, path: str, *, again: bool = True, stream: bool = False, **request: Any
+    ) -> httpx.Response:
+        """Ask the one that answered last; if it is away, each of the others, and that one once more.
+
+        Args:
+            method: Of the request.
+            path: Below the address.
+            again: Whether it does no harm if two get it.
+            stream: Whether the answer's body is left to be read.
+            request: All else, for httpx.
+
+        Raises:
+            httpx.TransportError: Nobody answers; the last one's.
+        """
+        first, count = self._at, len(self._urls)
+        for turn in range(count + 1):
+            at, last = (first + turn) % count, turn == count
+            try:
+                asked = self._http.build_request(method, self._urls[at] + path, **request)
+                response = self._http.send(asked, stream=stream)
+            except (httpx.ConnectError, httpx.ConnectTimeout):
+                if last or turn + 1 == count == 1:
+                    raise
+            except httpx.TimeoutException:
+                if last or not again or count == 1:
+                    raise
+            except httpx.TransportError:  # a connection that was kept open, and that the other end has closed
+                if last or not again:
+                    raise
+            else:
+                if last or response.status_code not in _AWAY or not again or count == 1:
+                    self._at = at
+                    return response
+                response.close()
+        raise AssertionError("the last turn returns or raises")
 
     def _unreachable(self, error: Exception | None = None) -> Unreachable:
         if "CERTIFICATE_VERIFY_FAILED" in str(error):
@@ -330,9 +418,9 @@ class Client:
             advice = "give the file of its authority (SKYTETHER_CA_FILE), or correct the address"
             if dated:
                 advice = f"correct this machine's clock ({datetime.now(UTC):%Y-%m-%d %H:%M} UTC), or renew it"
-            return Unreachable(f"the certificate of {self._url} is not trusted ({why}): {advice}")
+            return Unreachable(f"the certificate of {self._shown} is not trusted ({why}): {advice}")
         return Unreachable(
-            f"no orchestrator answers at {self._url}: "
+            f"no orchestrator answers at {self._shown}: "
             "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
         )
 

@@ -23,7 +23,7 @@ Url = Annotated[
     typer.Option(
         "--url",
         envvar="SKYTETHER_URL",
-        help="Of the orchestrator; without it the one of this machine.",
+        help="Of the orchestrator, or of several, with commas; without it the one of this machine.",
         show_default=False,
     ),
 ]

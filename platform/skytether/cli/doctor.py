@@ -64,6 +64,7 @@ def doctor(
 
 
 def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str | None) -> Iterator[Finding]:
+    from skytether.api.client import addresses
     from skytether.robot import examine
 
     from .config_file import ConfigError
@@ -77,7 +78,8 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     if settings is not None:
         yield examine.own_controller(settings.fallback.name, settings.fallback.options)
     if address is not None:
-        yield from examine.orchestrator(address, ca_file)
+        for one in addresses(address):
+            yield from examine.orchestrator(one, ca_file)
         given: str | None = os.environ.get("SKYTETHER_TOKEN")
         if settings is not None and config is not None:
             try:
@@ -87,7 +89,8 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
                 given = None
         if given:
             yield examine.token(address, ca_file, given, settings.service if settings else None)
-    echoes = [_address(echo)] if echo else [w for w in (_of(address),) if w is not None]
+    each = addresses(address) if address is not None else []
+    echoes = [_address(echo)] if echo else [where for where in map(_of, each) if where is not None]
     echoes += settings.task.addresses.values() if settings and not echo else ()
     for where in echoes:
         yield from examine.network(*where)
@@ -182,9 +185,9 @@ def _token(settings: RobotConfig, config: Path) -> str:
         return ""  # said before
 
 
-def _of(url: str | None) -> tuple[str, int] | None:
+def _of(url: str) -> tuple[str, int] | None:
     """The orchestrator's own echo: the same host and number."""
-    parts = urlsplit(url or "")
+    parts = urlsplit(url)
     if not parts.hostname:
         return None
     return parts.hostname, parts.port or (443 if parts.scheme == "https" else 80)

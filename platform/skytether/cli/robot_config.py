@@ -171,7 +171,7 @@ class RobotConfig(Strict):
 
     robot: Name
     """As it is registered: ``skytether robot add NAME``."""
-    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="http://HOST:PORT")]
+    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="http://HOST:PORT; several with commas")]
     token_file: Path
     """Holds the token that the registration printed; relative to this file's folder."""
     service: Name

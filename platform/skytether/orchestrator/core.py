@@ -5,12 +5,17 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from typing import ParamSpec
+
+from sqlalchemy.exc import ProgrammingError
 
 from skytether.api.rest import Report, ScrapeTargets
 
 from .access import Access
 from .catalogue import Catalogue
+from .db import GONE
 from .discovery import advertised, named, targets
+from .errors import OutdatedError
 from .events import Broker
 from .instances import Instances
 from .leader import Leadership
@@ -27,7 +32,9 @@ from .throttle import Throttle
 
 log = logging.getLogger(__name__)
 
+_Args = ParamSpec("_Args")
 _STOP_POLL = 0.02
+_SECOND = 1.0
 _FIRST_LOOK = 5.0
 """Seconds that the database gets to say who leads, before requests are answered all the same."""
 
@@ -54,6 +61,7 @@ class Orchestrator:
         settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.settings = settings
         self._clock = clock
+        self._outdated_since: float | None = None
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise))
@@ -76,7 +84,11 @@ class Orchestrator:
             lambda: self.leadership.leads,
         )
         self.sites = Sites(
-            settings.state_dir / "sites", self.store, self.reconciler.site_step, settings.timing, find_runtime
+            settings.state_dir / "sites",
+            self.store,
+            self._unless_outdated(self.reconciler.site_step),
+            settings.timing,
+            find_runtime,
         )
         self.reconciler.sites = self.sites
         moves = Moves(
@@ -89,8 +101,8 @@ class Orchestrator:
             settings.weights,
         )
         self.reconciler.moves = moves
-        self.placer = Loop("placer", self.reconciler.place_step, time.monotonic)
-        self.elector = Loop("elector", self.leadership.step, time.monotonic)
+        self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_step), time.monotonic)
+        self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(
             self.store,
             self.catalogue,
@@ -124,6 +136,49 @@ class Orchestrator:
         self.sites.start(self.settings.local_site)
         self.placer.start()
 
+    def _elect(self) -> float:
+        if self.look_outdated():
+            self.leadership.end()
+            return _SECOND
+        return self.leadership.step()
+
+    def _unless_outdated(self, step: Callable[_Args, float]) -> Callable[_Args, float]:
+        """A loop's step that waits from then on."""
+
+        def guarded(*args: _Args.args, **kwargs: _Args.kwargs) -> float:
+            try:
+                return _SECOND if self.outdated else step(*args, **kwargs)
+            except ProgrammingError:
+                if not self.look_outdated():
+                    raise
+                return _SECOND
+
+        return guarded
+
+    @property
+    def outdated(self) -> bool:
+        """A newer orchestrator has changed the database's schema: this one does nothing more."""
+        return self._outdated_since is not None
+
+    @property
+    def refuses(self) -> bool:
+        """It has been outdated for so long that the newer one serves."""
+        since, grace = self._outdated_since, self.settings.timing.outdated_grace
+        return since is not None and time.monotonic() - since >= grace
+
+    def look_outdated(self) -> bool:
+        """Whether a newer orchestrator has changed the database's schema; the last answer while that is away."""
+        try:
+            outdated = self.store.outdated()
+        except GONE:
+            return self.outdated
+        if outdated and not self.outdated:
+            log.error("a newer orchestrator has brought the database to its schema: end this one, or update it")
+            self._outdated_since = time.monotonic()
+        elif not outdated:
+            self._outdated_since = None
+        return outdated
+
     def _elected(self) -> None:
         self.store.extend_leases(self._clock())  # nobody could renew while there was no orchestrator at all
         self.sites.reopen()
@@ -156,6 +211,8 @@ class Orchestrator:
             self.store.ping()
         except Exception as error:  # whatever the database's driver raises
             return f"the database does not answer: {error}"
+        if self.outdated:
+            return str(OutdatedError())
         silent = time.monotonic() - self.placer.last_pass
         if silent > self.settings.timing.lock_up:
             return f"the reconciler has made no pass for {silent:.0f} s"

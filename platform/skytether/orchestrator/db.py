@@ -12,6 +12,8 @@ from .discovery import NAME
 GONE = (OperationalError, InterfaceError)
 """What the drivers raise when the database does not answer (or, SQLite, its disk is full)."""
 
+_LOCK_MS = 120_000
+"""How long a migration waits for a table, or for another migration."""
 MIGRATING, LEADING = 0x736B7901, 0x736B7902
 """Keys of PostgreSQL's advisory locks: who migrates, who leads."""
 _POSTGRES = {
@@ -58,16 +60,24 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
 
 
-def migrate(engine: Engine, to: str = "head") -> None:
-    """Bring the database to the newest schema; does nothing to one that has it. One at a time, where several start."""
+def migrate(engine: Engine, to: str = "head") -> str:
+    """Bring the database to the newest schema; does nothing to one that has it. One at a time, where several start.
+
+    Returns:
+        The newest schema that this code knows.
+    """
     from alembic import command  # Alembic is slow to import, and only needed here
     from alembic.config import Config
+    from alembic.script import ScriptDirectory
 
     config = Config()
     config.set_main_option("script_location", "skytether.orchestrator:migrations")
     config.set_main_option("path_separator", "os")
     with engine.execution_options(immediate=True).begin() as connection:
         if engine.dialect.name == "postgresql":
+            # A large table takes its time; requests of others that run still are waited for, but not for ever.
+            connection.execute(text(f"SET LOCAL statement_timeout = 0; SET LOCAL lock_timeout = {_LOCK_MS}"))
             connection.execute(text(f"SELECT pg_advisory_xact_lock({MIGRATING})"))
         config.attributes["connection"] = connection
         command.upgrade(config, to)
+    return str(ScriptDirectory.from_config(config).get_current_head())

@@ -44,6 +44,15 @@ class SilentSiteError(DomainError):
     """What was asked for is at a site that does not answer now."""
 
 
+class OutdatedError(DomainError):
+    """Another orchestrator, of a newer version, has the database now."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a newer orchestrator has brought the database to its schema: ask that one, and end or update this one"
+        )
+
+
 class TooManyError(DomainError):
     """More requests than one caller may make."""
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy.exc import ProgrammingError
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -24,10 +26,14 @@ from .errors import (
     InvalidError,
     NoSiteError,
     NotFoundError,
+    OutdatedError,
     SilentSiteError,
     TooManyError,
     UnauthenticatedError,
 )
+
+if TYPE_CHECKING:
+    from .core import Orchestrator
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +46,12 @@ STATUS: dict[type[DomainError], tuple[int, str]] = {
     NoSiteError: (409, "No site fits"),
     ConflictError: (409, "Not possible now"),
     InvalidError: (422, "Invalid input"),
+    OutdatedError: (503, "Not possible now"),
     SilentSiteError: (503, "Not possible now"),
 }
 """Status and title of each kind of error."""
+_RETRY_AFTER = "2"
+"""Seconds, to somebody who asked when the database was away or another's."""
 _HTTP = {
     400: ("Invalid input", "the body is no JSON that can be read"),
     404: ("Not found", "there is nothing at {path}: see /docs for what there is"),
@@ -64,6 +73,9 @@ def install(app: FastAPI, body_limit: int) -> None:
         headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
         if isinstance(error, TooManyError):
             headers["Retry-After"] = str(error.retry_after)
+        if isinstance(error, OutdatedError):
+            # A proxy's next request is to find another orchestrator, not this connection.
+            headers |= {"Retry-After": _RETRY_AFTER, "Connection": "close"}
         return answer(request, status, title, str(error), errors, headers)
 
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
@@ -83,7 +95,12 @@ def install(app: FastAPI, body_limit: int) -> None:
     async def on_database(request: Request, error: Exception) -> JSONResponse:
         log.warning("%s %s: the database does not answer (%s)", request.method, request.url.path, type(error).__name__)
         text = "the orchestrator's database does not answer: try again in a few seconds"
-        return answer(request, 503, "Not possible now", text, headers={"Retry-After": "2"})
+        return answer(request, 503, "Not possible now", text, headers={"Retry-After": _RETRY_AFTER})
+
+    async def on_schema(request: Request, error: Exception) -> JSONResponse:
+        core: Orchestrator = request.app.state.core
+        outdated = await asyncio.to_thread(core.look_outdated)
+        return await (on_domain(request, OutdatedError()) if outdated else on_anything(request, error))
 
     async def on_anything(request: Request, error: Exception) -> JSONResponse:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
@@ -92,6 +109,7 @@ def install(app: FastAPI, body_limit: int) -> None:
     app.add_exception_handler(DomainError, on_domain)
     app.add_exception_handler(RequestValidationError, on_invalid)
     app.add_exception_handler(HTTPException, on_http)
+    app.add_exception_handler(ProgrammingError, on_schema)
     for gone in GONE:
         app.add_exception_handler(gone, on_database)
     app.add_exception_handler(Exception, on_anything)

@@ -28,7 +28,7 @@ from .settings import Settings
 
 log = logging.getLogger(__name__)
 
-_DRAIN = 2
+_DRAIN = 5
 """Whole seconds that requests under way get at shutdown."""
 _BACKLOG = 512
 

@@ -59,6 +59,8 @@ class Timing(Group):
     """Lease of a standby when it is given to a robot that names none."""
     lock_up: Seconds = 30.0
     """A reconcile loop without a pass for this long makes the orchestrator not ready."""
+    outdated_grace: Annotated[float, Field(ge=0)] = 10.0
+    """An orchestrator whose database a newer one has changed leads no more, and still answers for this long."""
 
 
 class Weights(Group):

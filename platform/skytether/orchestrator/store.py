@@ -82,10 +82,17 @@ class Store:
         self._writer = self._engine.execution_options(immediate=True)
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
+        self._schema = ""
         self._seen: dict[str, Record] = {}
 
     def migrate(self) -> None:
-        migrate(self._engine)
+        """Bring the database to the schema of this code."""
+        self._schema = migrate(self._engine)
+
+    def outdated(self) -> bool:
+        """Whether a newer orchestrator has brought the database to a schema that this one does not know."""
+        with self._engine.connect() as connection:
+            return bool(connection.scalar(text("SELECT version_num FROM alembic_version")) != self._schema)
 
     def lock(self) -> Lock:
         """The lock of whoever leads over this database."""

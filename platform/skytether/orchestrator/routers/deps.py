@@ -13,7 +13,7 @@ from skytether.api.rest import Problem, Scope
 
 from ..access import Principal
 from ..core import Orchestrator
-from ..errors import InvalidError, NotFoundError
+from ..errors import InvalidError, NotFoundError, OutdatedError
 
 PREFIX = "/api/v1"
 _LARGE = 16_384
@@ -37,9 +37,12 @@ def authenticated(core: Core, request: Request, token: Bearer) -> Principal:
     """Whoever sends this token.
 
     Raises:
+        OutdatedError: This orchestrator has no say any more.
         UnauthenticatedError: Nobody we know.
         TooManyError: They asked too often.
     """
+    if core.refuses:
+        raise OutdatedError
     address = request.client.host if request.client else ""
     principal = core.access.authenticate(token.credentials if token else None, address)
     request.state.who = principal.owner  # for the audit

@@ -1,0 +1,167 @@
+"""From every schema that there was, with something in every table, to the newest: nothing is lost, all can be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+
+from skytether.api.rest import State
+from skytether.orchestrator import migrations
+from skytether.orchestrator.db import make_engine, migrate
+from skytether.orchestrator.models import metadata
+from skytether.orchestrator.security import TokenHash
+from skytether.orchestrator.store import Store
+
+pytestmark = pytest.mark.slow
+
+NOW = 1_700_000_000.0
+VERSIONS = sorted(path.stem[:4] for path in Path(migrations.__path__[0], "versions").glob("[0-9]*.py"))
+TOKEN = "sky-" + "ab" * 32
+KEPT = TokenHash.of(TOKEN)
+MANIFEST = {
+    "apiVersion": "skytether.io/v1",
+    "kind": "Service",
+    "metadata": {"name": "toy"},
+    "spec": {"entrypoint": "skytether.testing.toy_service"},
+}
+INSTANCE: dict[str, Any] = {
+    "id": "i1",
+    "robot": "walker",
+    "service": "toy",
+    "session_id": "ff" * 8,
+    "manifest": MANIFEST,
+    "created_at": NOW,
+    "lease_s": 15.0,
+    "lease_expires_at": NOW + 15,
+    "updated_at": NOW + 1,
+    "params": {"mass": 70.5, "path": [[0, 1], None]},
+    "measurements": {"lab": {"rtt_ms": 3.5}},
+    "state": "running",
+    "reason": "grün",
+    "site": "lab",
+    "refused": [{"site": "x", "reason": "cpu", "detail": "full"}],
+    "host": "10.0.0.1",
+    "port": 4711,
+    "attempt": 2,
+    "failures": 1,
+    "restarts": 1,
+    "start_at": NOW,
+    "started_at": NOW,
+    "running_at": NOW + 1,
+    "stopping_at": None,
+    "version": 7,
+    "scores": [],
+    "replaces": None,
+    "pinned": None,
+    "spare": False,
+}
+"""A value for every column that a table had at any time; what a version has not is left out."""
+ROWS: dict[str, dict[str, Any]] = {
+    "instances": INSTANCE,
+    "robots": {
+        "name": "walker",
+        "services": ["*"],
+        "token_prefix": KEPT.prefix,
+        "token_sha256": KEPT.digest,
+        "created_at": NOW,
+        "last_seen_at": NOW + 2,
+    },
+    "services": {"name": "toy", "manifest": MANIFEST},
+    "sites": {
+        "name": "lab",
+        "tier": "edge",
+        "runtime": "process",
+        "options": {"cpu": 2},
+        "speed": 1.0,
+        "cost": 0.0,
+        "images": ["*"],
+    },
+    "events": {"instance": "i1", "at": NOW, "state": "running", "reason": ""},
+    "idempotency": {"owner": "robot:walker", "key": "k", "body_sha256": "0" * 64, "instance": "i1", "created_at": NOW},
+    "reports": {"instance": "i1", "at": NOW, "report": {"rtt_s": 0.02}},
+    "facts": {"name": "secret.key", "value": "f"},
+    "tokens": {
+        "id": "t1",
+        "name": "walker",
+        "robot": "walker",
+        "scopes": [],
+        "prefix": KEPT.prefix,
+        "sha256": KEPT.digest,
+        "created_at": NOW,
+        "expires_at": None,
+        "last_used_at": None,
+    },
+}
+
+
+def fill(engine: sa.Engine) -> dict[str, int]:
+    """A row in every table that there is; how many rows each has."""
+    found = sa.MetaData()
+    found.reflect(engine)
+    counts = {}
+    with engine.begin() as connection:
+        for table in found.sorted_tables:
+            if table.name != "alembic_version":
+                names = [c.name for c in table.columns if (table.name, c.name) != ("events", "id")]
+                row = {name: ROWS[table.name][name] for name in names}
+                connection.execute(table.insert().values(**row))
+                counts[table.name] = 1
+    return counts
+
+
+def check(url: str, version: str) -> None:
+    engine = make_engine(url)
+    migrate(engine, version)
+    counts = fill(engine)
+    migrate(engine)
+    with engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+        for table, count in counts.items():
+            rows = connection.scalar(sa.select(sa.func.count()).select_from(sa.table(table)))
+            assert rows == count, f"from {version}: {table}"
+    engine.dispose()
+    store = Store(url)
+    store.migrate()
+    (record,) = store.live()
+    assert {key: getattr(record, key) for key in INSTANCE} == {**INSTANCE, "state": State.RUNNING}
+    assert [(r.name, r.services, r.last_seen_at) for r in store.robots()] == [("walker", ("*",), NOW + 2)]
+    (token,) = store.tokens_by_prefix(KEPT.prefix)
+    assert (token.robot, token.hash.matches(TOKEN)) == ("walker", True)
+    assert store.services() == {"toy": MANIFEST}
+    (site,) = store.sites()
+    assert (site.name, site.options, site.speed, site.images) == ("lab", {"cpu": 2}, 1.0, ("*",))
+    assert [(e.id, e.state) for e in store.events("i1", 0)] == [(1, State.RUNNING)]
+    again = store.made_with("robot:walker", "k", "0" * 64)
+    assert again is not None
+    assert again.id == "i1"
+    # What is added later fits in beside it.
+    changed = store.change(record, NOW + 3, state=State.STOPPING)
+    assert changed is not None
+    assert [e.id for e in store.events("i1", 1)] == [2]
+    assert store.change(changed, NOW + 4, state=State.STOPPED) is not None
+    store.delete_robot("walker")
+    assert store.tokens() == []
+    store.prune(NOW + 1000, ended_age=1, ended_count=0, events_count=0)
+    assert store.all() == []
+    store.close()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_from_every_schema_of_sqlite(tmp_path: Path, version: str) -> None:
+    check(f"sqlite:///{tmp_path}/state.db", version)
+
+
+@pytest.mark.postgres
+def test_from_every_schema_of_postgresql(postgres: str) -> None:
+    for version in VERSIONS:
+        check(postgres, version)
+        engine = make_engine(postgres)
+        with engine.begin() as connection:
+            connection.exec_driver_sql("DROP SCHEMA public CASCADE")
+            connection.exec_driver_sql("CREATE SCHEMA public")
+        engine.dispose()
