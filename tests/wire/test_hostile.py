@@ -66,6 +66,17 @@ def live(make_world):
     return link
 
 
+def test_what_names_another_session_is_no_traffic_of_the_path(live):
+    for role in Role:
+        before = live.sessions[role].stats(live.now).paths[0]
+        stranger = bytearray(live.sent[SERVICE if role is ROBOT else ROBOT][-1][1])
+        stranger[1] ^= 1
+        for data in (bytes(stranger), bytes(len(stranger)), b""):
+            live.inject(role, data, "stranger")
+        after = live.sessions[role].stats(live.now).paths[0]
+        assert (after.packets_received, after.bytes_received) == (before.packets_received, before.bytes_received)
+
+
 @given(data=st.binary(max_size=2000), segment=st.none() | st.integers(-1, 2000), path=st.integers(0, 1))
 @settings(max_examples=80)
 def test_any_bytes(live, data, segment, path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,14 +61,11 @@ def demo(
 
 def _walk(running: Demo) -> DemoResult:
     """Show how it goes while it goes."""
-    import logging
-
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from skytether.robot import driver as robot_driver
     from skytether.robot.snapshot import AgentStatus
 
-    logging.getLogger(robot_driver.__name__).setLevel(logging.ERROR)  # its hand-overs are told here, in people's words
     handed_over = 0.0
     columns = (
         TextColumn("{task.description}"),
@@ -75,7 +74,7 @@ def _walk(running: Demo) -> DemoResult:
         TimeElapsedColumn(),
         TextColumn("{task.fields[now]}"),
     )
-    with Progress(*columns, console=console) as progress:
+    with _silenced(robot_driver.__name__), Progress(*columns, console=console) as progress:
         task = progress.add_task("walking", total=running.trail.length, now="")
 
         def show(s: float, status: AgentStatus) -> None:
@@ -89,6 +88,20 @@ def _walk(running: Demo) -> DemoResult:
             progress.update(task, completed=s, now=now)
 
         return running.walk(show)
+
+
+@contextmanager
+def _silenced(name: str) -> Iterator[None]:
+    """Without the log's warnings of hand-overs, which are told here in people's words."""
+    import logging
+
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _told(change: Transition, s: float) -> str:

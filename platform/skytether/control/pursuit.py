@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from .admittance import STANDSTILL, Velocity
+from .numbers import check_positive
 
 Point = tuple[float, float]
 
@@ -45,9 +46,7 @@ class PursuitParams:
         Raises:
             ValueError: A field is not above 0 and finite; the text names it.
         """
-        for name in self.__slots__:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"path: {name} must be above 0 and finite, not {getattr(self, name)}")
+        check_positive(self, "path", self.__slots__)
 
 
 class Track:

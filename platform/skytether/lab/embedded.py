@@ -21,7 +21,8 @@ class EmbeddedOrchestrator:
     """Runs ``skytether orchestrator run`` on loopback and ends it, with all it started, on exit.
 
     It is a real child process, not a thread: what works here works with an orchestrator elsewhere, and it
-    can be killed and started again over the same state (``kill``, ``start``).
+    can be killed and started again over the same state (``kill``, ``start``). It ends, with its instances, also when
+    this process is killed; only a temporary state directory is left then.
     """
 
     def __init__(self, state_dir: Path | None = None) -> None:
@@ -61,11 +62,12 @@ class EmbeddedOrchestrator:
         """
         address = self.state_dir / "address"
         address.unlink(missing_ok=True)
-        command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--stop-instances"]
+        command = [sys.executable, "-m", "skytether.lab.tethered", "orchestrator", "run", "--stop-instances"]
         command += ["--state-dir", str(self.state_dir), "--port", str(self._port)]
+        self._let_go()
         with (self.state_dir / "orchestrator.log").open("ab") as log:
             process = self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
             )
         try:
             self._port = self._wait_for(address, process)
@@ -98,14 +100,21 @@ class EmbeddedOrchestrator:
             process.wait(_STOP_TIMEOUT)
         except subprocess.TimeoutExpired:
             self.kill()
-        self._process, self._port = None, 0
+        self._let_go()
+        self._port = 0
 
     def kill(self) -> None:
         """Kill the orchestrator alone, as a crash would; its instances go on."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-            self._process = None
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Forget a process that ended."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+        self._process = None
 
     def __enter__(self) -> EmbeddedOrchestrator:
         self.start()

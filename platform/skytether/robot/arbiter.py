@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, isfinite, nan
 
+from skytether.control.numbers import check_positive
+
 from .command import Source
 
 
@@ -70,9 +72,7 @@ class Needs:
         """
         if self.local is Source.CLOUD:
             raise ValueError("needs: local must be 'fallback' or 'stop'")
-        for name in ("max_clock_error_s", "command_timeout_s", "bad_s", "good_s"):
-            if not 0 < getattr(self, name) < inf:
-                raise ValueError(f"needs: {name} must be above 0 and finite, not {getattr(self, name)}")
+        check_positive(self, "needs", ("max_clock_error_s", "command_timeout_s", "bad_s", "good_s"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from typing import ClassVar
 from pydantic import ConfigDict
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.control.numbers import check_positive
 
 from .command import Command, Source
 
@@ -85,13 +86,9 @@ class Limits:
         Raises:
             ValueError: A field is out of its range; the text names it.
         """
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if name == "linear_min":
-                if not -inf < value <= 0:
-                    raise ValueError(f"limits: linear_min must be 0 or negative, not {value}")
-            elif not 0 < value < inf:
-                raise ValueError(f"limits: {name} must be above 0 and finite, not {value}")
+        if not -inf < self.linear_min <= 0:
+            raise ValueError(f"limits: linear_min must be 0 or negative, not {self.linear_min}")
+        check_positive(self, "limits", (name for name in self.__slots__ if name != "linear_min"))
         if self.linear_braking < self.linear_acceleration or self.angular_braking < self.angular_acceleration:
             raise ValueError("limits: braking must not be slower than ordinary acceleration")
 

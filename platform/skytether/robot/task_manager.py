@@ -39,6 +39,7 @@ from statistics import median
 
 from skytether.api.manifest import Needs, Tier
 from skytether.api.rest import Measurement
+from skytether.control.numbers import check_positive
 
 REFERENCE_RTT_S = 0.5
 """For services that state no ``max_rtt_ms``."""
@@ -97,10 +98,7 @@ class Policy:
         Raises:
             ValueError: A field is negative or not finite; the text names it.
         """
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if name != "mode" and not 0 <= value < inf:
-                raise ValueError(f"task: {name} must be 0 or above and finite, not {value}")
+        check_positive(self, "task", (name for name in self.__slots__ if name != "mode"), zero=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from .packet import (
     VERSION,
     WELCOME,
     Packets,
+    peek_session_id,
     pull_packets,
 )
 from .path import Path
@@ -107,7 +108,7 @@ class Receiver:
         by = path if path is not None else data[PATH_AT] if total > PATH_AT else 0
         known = self._find_path(by)
         several = segment is not None and 0 < segment < total
-        if known is not None:
+        if known is not None and peek_session_id(data) == self._session_id:
             known.comes(total, -(-total // segment) if several and segment else 1, now, waited)
         if not several or segment is None:
             self._packet(data, address, by, known, now)

@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import ConfigDict
 
 from skytether.control.admittance import Velocity
+from skytether.control.numbers import check_positive
 from skytether.robot.supervisor import Limits
 
 from . import limits as reach
@@ -63,10 +64,7 @@ class ZoneParams:
         Raises:
             ValueError: A field is out of its range; the text names it.
         """
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not 0 < value < inf:
-                raise ValueError(f"zones: {name} must be above 0 and finite, not {value}")
+        check_positive(self, "zones", self.__slots__)
 
 
 @dataclass(frozen=True, slots=True)
