@@ -20,7 +20,6 @@ from skytether.robot.command import Source
 
 pytestmark = pytest.mark.slow
 
-MID_TRAIL_M = 3.0
 LOCAL_WITHIN_S = 0.3
 
 
@@ -82,77 +81,61 @@ def pid_of_service(demo: Demo) -> int:
     return json.loads(run.read_text())["process"][0]
 
 
-def walk(demo: Demo, break_it) -> tuple[float, object]:
-    """Walk the trail; call ``break_it`` once in mid-trail. Returns when that was, and the result."""
-    began: list[float] = []
+class Faults:
+    """What breaks, at which place of the trail; each once, while the service drives."""
 
-    def watch(s, status):
-        if s >= MID_TRAIL_M and not began:
-            assert status.driver.source is Source.CLOUD
-            began.append(time.monotonic())
-            threading.Thread(target=break_it).start()
+    def __init__(self, demo: Demo) -> None:
+        self.demo = demo
+        self.waiting = [(1.0, self.orchestrator), (4.0, self.network), (6.5, self.service)]
+        self.at: list[float] = []
+        self.running: threading.Thread | None = None
 
-    result = demo.walk(watch)
+    def watch(self, s, status) -> None:
+        busy = self.running is not None and self.running.is_alive()
+        if self.waiting and s >= self.waiting[0][0] and status.driver.source is Source.CLOUD and not busy:
+            self.running = threading.Thread(target=self.waiting.pop(0)[1])
+            self.running.start()
+
+    def orchestrator(self) -> None:
+        self.instance, self.pid = instance_of(self.demo), pid_of_service(self.demo)
+        self.at.append(time.monotonic())
+        self.demo.orchestrator.kill()
+        time.sleep(3)
+        self.demo.orchestrator.start()
+
+    def network(self) -> None:
+        # The orchestrator is back: it took over what ran, and the robot renewed its lease.
+        self.adopted, self.adopted_pid = instance_of(self.demo), pid_of_service(self.demo)
+        up, down = self.demo.network.up, self.demo.network.down
+        self.at.append(time.monotonic())
+        self.demo.network.set(up=replace(up, cut=True), down=replace(down, cut=True))
+        time.sleep(3)
+        self.demo.network.set(up=up, down=down)
+
+    def service(self) -> None:
+        pid = pid_of_service(self.demo)
+        self.at.append(time.monotonic())
+        os.kill(pid, signal.SIGKILL)
+
+
+def test_the_trail_is_completed_whatever_breaks_on_the_way(demo):
+    faults = Faults(demo)
+    result = demo.walk(faults.watch)
     assert result.measures.completed
-    return began[0], result
-
-
-def transitions_after(result, moment: float) -> list[tuple[float, Source, Reason]]:
-    return [(t.at - moment, t.source, t.reason) for t in result.status.driver.transitions if t.at > moment]
-
-
-def test_killed_service_is_replaced_and_the_trail_completed(demo):
-    killed = []
-
-    def kill():
-        killed.append(pid_of_service(demo))
-        os.kill(killed[0], signal.SIGKILL)
-        killed.append(time.monotonic())
-
-    _, result = walk(demo, kill)
-    (to_local, source, reason), (_, back, why) = transitions_after(result, killed[1])[:2]
-    assert (source, reason) == (Source.FALLBACK, Reason.NO_COMMAND)
-    assert to_local < LOCAL_WITHIN_S
-    assert (back, why) == (Source.CLOUD, Reason.RECOVERED)
-    assert result.status.instance.restarts == 1
     assert result.measures.kte_m < 0.1
+    changes = [(t.at, t.source, t.reason) for t in result.status.driver.transitions]
+    orchestrator, network, service = faults.at
 
+    # Nobody on the way of a velocity command was killed: at most a busy machine lets one come too late.
+    assert all(reason is not Reason.DISCONNECTED for at, _, reason in changes if orchestrator < at < network)
+    assert (faults.adopted.id, faults.adopted_pid, faults.adopted.restarts) == (faults.instance.id, faults.pid, 0)
+    assert faults.adopted.lease_expires_at > faults.instance.lease_expires_at
 
-def test_cut_network_hands_over_and_back(demo):
-    cut = []
-
-    def break_network():
-        up, down = demo.network.up, demo.network.down
-        demo.network.set(up=replace(up, cut=True), down=replace(down, cut=True))
-        cut.append(time.monotonic())
-        time.sleep(3)
-        demo.network.set(up=up, down=down)
-
-    _, result = walk(demo, break_network)
-    (to_local, source, reason), (back_after, back, why) = transitions_after(result, cut[0])[:2]
-    assert (source, reason) == (Source.FALLBACK, Reason.NO_COMMAND)
-    assert to_local < LOCAL_WITHIN_S
-    assert (back, why) == (Source.CLOUD, Reason.RECOVERED)
-    assert back_after > 3
+    for fault, away_s in ((network, 3.0), (service, 0.0)):
+        (to_local, *first), (back_at, *second) = [change for change in changes if change[0] > fault][:2]
+        assert first == [Source.FALLBACK, Reason.NO_COMMAND]
+        assert to_local - fault < LOCAL_WITHIN_S
+        assert second == [Source.CLOUD, Reason.RECOVERED]
+        assert back_at - fault > away_s
+    assert result.status.instance.restarts == 1
     assert result.fallback_s > 3
-    assert result.status.instance.restarts == 0
-
-
-def test_killed_orchestrator_does_not_stop_the_walk_and_comes_back(demo):
-    before = []
-
-    def kill():
-        before.append((instance_of(demo), pid_of_service(demo)))
-        demo.orchestrator.kill()
-        before.append(time.monotonic())
-        time.sleep(3)
-        demo.orchestrator.start()
-
-    _, result = walk(demo, kill)
-    # Nobody on the way of a velocity command was killed: the walker is guided all the way.
-    assert transitions_after(result, before[1]) == []
-    (instance, pid), _ = before
-    assert instance_of(demo).id == instance.id
-    assert instance_of(demo).restarts == 0
-    assert pid_of_service(demo) == pid
-    assert instance_of(demo).lease_expires_at > instance.lease_expires_at

@@ -26,7 +26,7 @@ def test_no_request_makes_a_server_error(served: Any, who: str) -> None:
             continue  # a stream that ends with its instance
 
         @settings(
-            max_examples=15,
+            max_examples=8,
             derandomize=True,
             database=None,
             deadline=None,
