@@ -46,6 +46,18 @@ def test_it_asks_once_looks_until_it_runs_then_renews_with_a_report(orchestrator
     assert asker.trouble == ""
 
 
+def test_while_a_start_takes_long_its_lease_is_kept(orchestrator):
+    now = 10.0
+    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, renew_s=2.0, random=Random(1))
+    orchestrator.states = [State.STARTING]
+    for _ in range(100):  # 5 s
+        assert asker.step() == 0.03
+        now += 0.05
+    names = [name for name, _ in orchestrator.calls]
+    assert (names.count("create"), names.count("renew")) == (1, 2)
+    assert orchestrator.calls[names.index("renew")][1].report is None
+
+
 def test_when_the_link_goes_bad_it_looks_sooner(orchestrator, asked):
     asker, _ = asked
     orchestrator.healthy = False

@@ -8,6 +8,7 @@ is the loop for a thread.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 import uuid
@@ -113,6 +114,7 @@ class Asker:
         self._looks = Backoff(min(_LOOK_S, renew_s), renew_s, random)
         self._key = str(uuid.uuid4())
         self._instance: Instance | None = None
+        self._renewed_at = -math.inf
         self._trouble = ""
 
     @property
@@ -238,10 +240,15 @@ class Asker:
         return self._renew_s
 
     def _exchange(self, request: InstanceCreate) -> Instance:
+        now = self._clock()
         if self._instance is None:
+            self._renewed_at = now
             return self._client.create_instance(request, idempotency_key=self._key)
-        if self._instance.state is State.RUNNING:
-            return self._client.renew_instance(self._instance.id, Renew(report=self._report()))
+        running = self._instance.state is State.RUNNING
+        # One that comes up holds its lease too: an image may take minutes to be there, and room longer.
+        if running or now - self._renewed_at >= self._renew_s:
+            self._renewed_at = now
+            return self._client.renew_instance(self._instance.id, Renew(report=self._report() if running else None))
         return self._client.get_instance(self._instance.id)
 
     def _lost(self, sentence: str) -> float:

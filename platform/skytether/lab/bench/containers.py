@@ -21,7 +21,7 @@ from skytether.lab.bench.pair import BenchError
 from skytether.lab.demo import SERVICE
 from skytether.lab.embedded import EmbeddedOrchestrator
 
-_LIMIT_S = 20.0
+_LIMIT_S = 60.0
 _LOOK_S = 0.005
 _INSIDE = "/run/skytether/instance"
 _PORT = 7600

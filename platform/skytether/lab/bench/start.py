@@ -18,7 +18,7 @@ from skytether.lab.trail import Trail
 from skytether.lab.world import World
 from skytether.robot.agent import Agent, AgentConfig
 
-_LIMIT_S = 20.0
+_LIMIT_S = 60.0
 _LOOK_S = 0.005
 
 
