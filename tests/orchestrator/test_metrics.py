@@ -2,9 +2,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
+from skytether.api.report_metrics import counts_of
 from skytether.api.rest import Refusal, Report, TopicReport
+from skytether.orchestrator.accounts import Account, of_robot, of_run
 from skytether.orchestrator.metrics import Metrics, Running, SiteGauges
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Observation, Phase
@@ -16,15 +19,21 @@ STANDARD = {"le", "quantile"}
 
 
 def record_with(new_record: NewRecord, manifest: Any, *topics: str, **changes: Any) -> Record:
-    rows = [{"name": t, "type": "*" if t == "*" else "a/msg/B", "direction": "in"} for t in topics]
+    rows = [{"name": t, "type": "*" if t == "*" else "a/msg/B", "direction": "in", "priority": 100} for t in topics]
     return new_record(manifest=manifest(topics=rows), site="lab", **changes)
 
 
 def reported(running: list[Running], max_topics: int = 64) -> tuple[Metrics, Callable[[Record, Report], None]]:
     """Metrics, and what takes a robot's report as the orchestrator does."""
     reports: dict[str, Report] = {}
-    metrics = Metrics(lambda: running, max_topics, reports=lambda: reports)
-    return metrics, lambda record, report: reports.update({record.id: metrics.bounded(record, report)})
+    accounts: dict[tuple[str, str], Account] = {}
+    metrics = Metrics(lambda: running, max_topics, reports=lambda: reports, accounts=lambda: deepcopy(accounts))
+
+    def report(record: Record, told: Report) -> None:
+        kept = reports[record.id] = metrics.bounded(record, told)
+        accounts.setdefault((record.robot, record.service), Account()).merge(of_robot(told), counts_of(kept))
+
+    return metrics, report
 
 
 def topic(name: str = "scan", **more: Any) -> TopicReport:
@@ -67,6 +76,7 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "instance_start_seconds",
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
+        "instance_restarts_total",
         "instance_network_receive_bytes_total",
         "instance_network_transmit_bytes_total",
         "placement_refusals_total",
@@ -119,8 +129,8 @@ def test_series_vanish_with_the_site_and_the_service(new_record: NewRecord) -> N
 def test_two_instances_of_one_robot_add_up(new_record: NewRecord, manifest: Any) -> None:
     records = [record_with(new_record, manifest, "scan", name=name) for name in ("a", "b")]
     metrics, report = reported([Running(r, Observation(1, Phase.RUNNING, memory_bytes=10)) for r in records])
-    for record in records:
-        report(record, Report(topics=(topic(sent=3, jitter_s=0.5),), rtt_s=0.2))
+    for record in records:  # of two programs on the robot
+        report(record, Report(life=record.id, topics=(topic(sent=3, jitter_s=0.5),), rtt_s=0.2))
     text = metrics.text().decode()
     one = 'direction="in",outcome="sent",priority="100",robot="walker",service="toy",topic="scan"'
     assert sample(text, "topic_messages_total", one) == 6
@@ -142,6 +152,52 @@ def test_no_robot_can_blow_up_the_number_of_series(new_record: NewRecord, manife
     assert len(re.findall(r"^skytether_fallback_transitions_total", text, re.MULTILINE)) == 64
     assert "evil" not in text
     assert "xxx" not in text
+
+
+def test_no_robot_can_blow_it_up_in_the_course_of_time(new_record: NewRecord, manifest: Any) -> None:
+    wild = record_with(new_record, manifest, "*")
+    metrics, report = reported([Running(wild, None)], max_topics=20)
+    for n in range(40):
+        topics = tuple(topic(f"t{n}_{i}").model_copy(update={"priority": (n + i) % 128}) for i in range(20))
+        report(wild, Report(life=f"life {n % 20}", topics=topics, fallback_transitions={f"reason_{n}": 1}))
+    text = metrics.text().decode()
+    assert 1000 < len(re.findall(r"^skytether_topic_messages_total", text, re.MULTILINE)) <= 1024
+    assert set(re.findall(r'priority="(\d+)"', text)) == {str(wild.spec.topics[0].priority)}
+
+
+def test_calls_are_reported_by_their_two_topics(new_record: NewRecord, manifest: Any) -> None:
+    rows = [{"name": "plan", "kind": "call", "type": "nav_msgs/srv/GetPlan", "direction": "in"}]
+    record = new_record(manifest=manifest(topics=rows), site="lab")
+    metrics, report = reported([Running(record, None)])
+    answer = TopicReport(topic="plan/response", direction="out", priority=0, delivered=3)
+    report(record, Report(topics=(topic("plan/request", sent=3), answer, topic("plan/response", sent=9))))
+    text = metrics.text().decode()
+    assert set(re.findall(r'topic="(\S+?)"', text)) == {"plan/request", "plan/response"}
+    where = 'direction="out",outcome="delivered",priority="64",robot="walker",service="toy",topic="plan/response"'
+    assert sample(text, "topic_messages_total", where) == 3
+
+
+def test_what_runs_used_and_how_often_they_began_anew_goes_on_over_restarts(new_record: NewRecord) -> None:
+    where = 'robot="walker",service="toy",site="lab"'
+    account = Account()
+    running = [Running(new_record(site="lab"), Observation(1, Phase.RUNNING, cpu_s=5.0))]
+    metrics = Metrics(lambda: running, 64, accounts=lambda: {("walker", "toy"): deepcopy(account)})
+
+    def told() -> tuple[float | None, float | None]:
+        text = metrics.text().decode()
+        return sample(text, "instance_cpu_seconds_total", where), sample(text, "instance_restarts_total", where)
+
+    assert told() == (5.0, 0.0)
+    account.merge(*of_run(running[0].record, Observation(1, Phase.RUNNING, cpu_s=5.0)))  # noted, and still seen
+    assert told() == (5.0, 0.0)
+    running[0] = Running(new_record(site="lab", restarts=1, attempt=2), Observation(1, Phase.EXITED))
+    assert told() == (5.0, 1.0)
+    running[0] = Running(running[0].record, Observation(2, Phase.RUNNING, cpu_s=0.5))
+    assert told() == (5.5, 1.0)
+    running[0] = Running(new_record("i2", site="elsewhere"), Observation(1, Phase.RUNNING, cpu_s=0.25))
+    assert told() == (None, None)  # of what is there no more
+    running.append(Running(new_record("i3", site="lab"), None))
+    assert told() == (5.0, 0.0)
 
 
 def test_sites_tell_capacity_load_and_what_they_promised(new_record, manifest) -> None:

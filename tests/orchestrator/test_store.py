@@ -15,7 +15,7 @@ from skytether.orchestrator.models import metadata
 from skytether.orchestrator.moves import FOREVER
 from skytether.orchestrator.records import IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
-from skytether.orchestrator.store import KeyReusedError, RobotRow, Store, TokenRow
+from skytether.orchestrator.store import KeyReusedError, RobotRow, Store, TokenRow, Told
 
 NewRecord = Callable[..., Record]
 NOW = 1_700_000_000.0
@@ -93,7 +93,8 @@ def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecor
     assert [r.id for r in store.spares("toy")] == ["warm"]
     for name, source in (("a", "cloud"), ("b", "stop"), ("c", None)):
         store.add(new_record(name, state=State.RUNNING), "operator", None, "")
-        store.renew(name, NOW, None, report=lambda _, source=source: {"control_source": source})  # type: ignore[misc]
+        told = Told({"control_source": source}, "robot:a", {})
+        store.renew(name, NOW, None, told=lambda _, told=told: told)  # type: ignore[misc]
     assert store.reports() == {n: {"control_source": s} for n, s in (("a", "cloud"), ("b", "stop"), ("c", None))}
     assert store.reports(("stop", "fallback")) == {"b": {"control_source": "stop"}}
 

@@ -142,7 +142,8 @@ def test_release_lets_the_instance_go(orchestrator, asked):
     assert asker.release() is None
     asker.step()
     assert asker.release() == "i1"
-    assert orchestrator.calls[-1] == ("delete", "i1")
+    assert [name for name, _ in orchestrator.calls[-2:]] == ["renew", "delete"], "what was counted last is told"
+    assert orchestrator.calls[-2][1].report == Report(rtt_s=0.1)
     assert asker.release() is None
 
 

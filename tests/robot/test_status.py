@@ -33,6 +33,7 @@ def busy(agent):
     agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
     topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
     agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
+    agent._tally.take(agent, agent._stats)
     options = (Option("edge", {"delay": 0.3, "loss": 0.1}), Option("cloud", refused="answers no probe"))
     agent._tasks._decision = replace(agent._tasks.decision, options=options, challenger=(options[0], 45.0))
     return agent

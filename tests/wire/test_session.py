@@ -410,3 +410,35 @@ def test_nothing_is_loaded_while_commands_flow():
     """A module that the first seconds of a session load stands in the way of its commands, for 20 ms once."""
     done = subprocess.run([sys.executable, "-c", SECONDS_OF_COMMANDS], capture_output=True, text=True, timeout=60)
     assert (done.stdout.strip(), done.stderr) == ("", "")
+
+
+def test_no_counter_goes_down_and_the_books_balance_when_the_service_is_restarted(world):
+    bad = LinkConditions(delay=0.05, jitter=0.02, loss=0.05)
+    link = world.link(up=bad, down=bad)
+    before = {}
+
+    def look():
+        for row in stats_of(link, ROBOT).values():
+            counts = (
+                row.offered, row.sent, row.delivered, row.lost + row.late, row.late, row.expired, row.replaced,
+                row.superseded, row.duplicate, row.unknown, row.bytes_sent, row.bytes_delivered,
+            )  # fmt: skip
+            assert all(a <= b for a, b in zip(before.get(row.topic, counts), counts, strict=True)), row
+            before[row.topic] = counts
+
+    def publish():
+        link.publish(ROBOT, "scan", b"x" * 500)
+        link.publish(SERVICE, "cmd_vel", b"y" * 80)
+
+    link.every(0.04, link.now + 3, publish)
+    link.every(0.1, link.now + 5, look)
+    for _ in range(2):
+        link.run(1)
+        link.replace(SERVICE, world.session(SERVICE, now=link.service_time(link.now)))
+    link.run(3)
+    scan, command = stats_of(link, ROBOT)["scan"], stats_of(link, ROBOT)["cmd_vel"]
+    assert scan.unknown > 0 == command.unknown
+    for row in (scan, command):
+        assert row.sent > 50
+        assert row.sent == row.delivered + row.superseded + row.lost + row.unknown
+    assert command.delivered == len([m for _, m in link.messages[ROBOT] if m.topic == "cmd_vel"])

@@ -150,22 +150,32 @@ class InstanceEvent(Strict):
     reason: str = ""
 
 
-class TopicReport(Strict):
-    """One topic's quality as the robot knows it, counted since the session began."""
+MOST_COUNTED = 2**53
+"""A counter's largest value: what a double holds exactly, as Prometheus' samples are."""
+_Count = Annotated[int, Field(ge=0, le=MOST_COUNTED)]
 
-    topic: str
+
+class TopicReport(Strict):
+    """One topic's quality as the robot knows it. Counters only go up while the report's ``life`` is the same."""
+
+    topic: Annotated[str, Field(max_length=255)]
     direction: Literal["in", "out"]
-    priority: int
-    sent: int = 0
-    delivered: int = 0
-    lost: int = 0
-    late: int = 0
-    expired: int = 0
-    replaced: int = 0
-    superseded: int = 0
-    duplicate: int = 0
-    bytes_sent: int = 0
+    priority: Annotated[int, Field(ge=0, le=127)]
+    sent: _Count = 0
+    delivered: _Count = 0
+    lost: _Count = 0
+    """Those that came late after all included: when nothing is under way any more,
+    ``sent == delivered + superseded + lost - late + unknown``."""
+    late: _Count = 0
+    unknown: _Count = 0
+    """Sent to a service before it was restarted, which had not said what became of them."""
+    expired: _Count = 0
+    replaced: _Count = 0
+    superseded: _Count = 0
+    duplicate: _Count = 0
+    bytes_sent: _Count = 0
     delay_p50_s: float | None = None
+    """Delays and jitter are those of the present session."""
     delay_p99_s: float | None = None
     jitter_s: float | None = None
 
@@ -173,19 +183,22 @@ class TopicReport(Strict):
 class Report(Strict):
     """What the robot tells the orchestrator with each renewal; it feeds /metrics."""
 
+    life: Annotated[str, Field(max_length=64)] = ""
+    """Which counting it is of: another one begins at zero, and adds to what was counted before. Made up anew at each
+    start of the robot's program; under the same one counters go on over all its sessions with a service."""
     rtt_s: float | None = None
     topics: tuple[TopicReport, ...] = ()
     control_source: str | None = None
     """Who drives: ``cloud``, ``fallback`` or ``stop``."""
-    fallback_transitions: dict[str, int] = {}
+    fallback_transitions: dict[str, _Count] = {}
     """Counted by bounded reason."""
-    objections: dict[str, int] = {}
+    objections: dict[str, _Count] = {}
     """What the velocity supervisor found wrong with commands, counted by bounded kind."""
     load: float | None = None
     """Share of the robot's processors that is busy."""
     battery: float | None = None
     """Charge, 0 to 1."""
-    overruns: int | None = None
+    overruns: _Count | None = None
     """Ticks of the control loop that came more than a period late."""
 
 

@@ -9,9 +9,11 @@ from typing import ParamSpec
 
 from sqlalchemy.exc import ProgrammingError
 
+from skytether.api.report_metrics import Owner
 from skytether.api.rest import Report, ScrapeTargets
 
 from .access import Access
+from .accounts import Account
 from .catalogue import Catalogue
 from .db import GONE
 from .discovery import advertised, named, targets
@@ -67,7 +69,9 @@ class Orchestrator:
         self.store = Store(database, named(settings.advertise))
         self.broker = Broker()
         self.store.on_change = self.broker.publish
-        self.metrics = Metrics(self._running, settings.limits.reported_topics, self._site_gauges, self._reports)
+        self.metrics = Metrics(
+            self._running, settings.limits.reported_topics, self._site_gauges, self._reports, self._accounts
+        )
         self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
@@ -236,6 +240,9 @@ class Orchestrator:
         if not self.leadership.leads:
             return {}
         return {instance: Report.model_validate(report) for instance, report in self.store.reports().items()}
+
+    def _accounts(self) -> dict[Owner, Account]:
+        return self.store.accounts() if self.leadership.leads else {}
 
     def _site_gauges(self) -> list[SiteGauges]:
         if not self.leadership.leads:

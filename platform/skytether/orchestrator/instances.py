@@ -8,9 +8,22 @@ import json
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from skytether.api.rest import Instance, InstanceCreate, Migrate, Placement, Refusal, Renew, Score, Session, State
+from skytether.api.report_metrics import counts_of
+from skytether.api.rest import (
+    Instance,
+    InstanceCreate,
+    Migrate,
+    Placement,
+    Refusal,
+    Renew,
+    Report,
+    Score,
+    Session,
+    State,
+)
 
 from .access import Principal
+from .accounts import of_robot
 from .catalogue import Catalogue
 from .errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from .metrics import Metrics
@@ -21,7 +34,7 @@ from .records import Record, new_record
 from .runtimes.base import LogStream, RuntimeFailure
 from .security import Secrets
 from .sites import Sites
-from .store import KeyReusedError, Store
+from .store import KeyReusedError, Store, Told
 from .validation import check_params
 
 
@@ -174,16 +187,20 @@ class Instances:
         if renew.measurements:
             measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
             measurements = {**self.get(principal, instance).measurements, **measured}
-        told = renew.report
+        report = renew.report
         renewed = self._store.renew(
             instance,
             self._clock(),
             renew.lease_s,
             robot=principal.robot,
             measurements=measurements,
-            report=(lambda record: self._metrics.bounded(record, told).model_dump(mode="json")) if told else None,
+            told=(lambda record: self._told(record, report)) if report else None,
         )
         return renewed or self.get(principal, instance)
+
+    def _told(self, record: Record, report: Report) -> Told:
+        kept = self._metrics.bounded(record, report)
+        return Told(kept.model_dump(mode="json"), of_robot(report), counts_of(kept))
 
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.

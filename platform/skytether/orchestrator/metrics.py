@@ -15,15 +15,22 @@ from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from skytether.api.manifest import ANY_TOPIC
-from skytether.api.report_metrics import INSTANCE, Sums, counter, gauge, of_reports
+from skytether.api.report_metrics import INSTANCE, Described, Owner, Sums, counters_of, gauge, gauges_of
 from skytether.api.rest import Refusal, Report
 
+from .accounts import Account, of_instance, of_run
 from .records import Record
 from .runtimes.base import Capacity, Observation
 
 _REASON = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _MAX_REASONS = 32
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0, 30.0)
+_USED = {
+    "instance_cpu_seconds": Described("Processor time", ("site",)),
+    "instance_network_receive_bytes": Described("By the network", ("site",)),
+    "instance_network_transmit_bytes": Described("By the network", ("site",)),
+    "instance_restarts": Described("Runs that ended by themselves and were begun anew", ("site",)),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +59,7 @@ class Metrics(Collector):
         max_topics: int,
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
         reports: Callable[[], Mapping[str, Report]] = dict,
+        accounts: Callable[[], Mapping[Owner, Account]] = dict,
     ) -> None:
         """All callables are asked at each scrape.
 
@@ -60,10 +68,12 @@ class Metrics(Collector):
             max_topics: Bounds the topics of a robot's report.
             sites: What is known of the sites.
             reports: The last report on each instance, as ``bounded`` left it.
+            accounts: What was counted, by robot and service.
         """
         self._running = running
         self._sites = sites
         self._reports = reports
+        self._accounts = accounts
         self._max_topics = max_topics
         self._registry = CollectorRegistry()
         self._start = Histogram(
@@ -102,11 +112,16 @@ class Metrics(Collector):
 
     def bounded(self, record: Record, report: Report) -> Report:
         """A robot's report on one instance, without what would make series that nobody declared."""
-        known = {topic.name for topic in record.spec.topics}
-        topics = [t for t in report.topics if t.topic in known or ANY_TOPIC in known][: self._max_topics]
+        rows = [row for topic in record.spec.topics for row in topic.rows()]
+        priorities = {(row.name, row.direction): row.priority for row in rows}
+        topics = {}
+        for topic in report.topics:
+            priority = priorities.get((topic.topic, topic.direction), priorities.get((ANY_TOPIC, topic.direction)))
+            if priority is not None:
+                topics[topic.topic, topic.direction] = topic.model_copy(update={"priority": priority})
         return report.model_copy(
             update={
-                "topics": tuple(topics),
+                "topics": tuple(topics.values())[: self._max_topics],
                 "fallback_transitions": _few(report.fallback_transitions),
                 "objections": _few(report.objections),
             }
@@ -131,30 +146,37 @@ class Metrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         running = list(self._running())
-        known = self._reports()
+        # After the look at what runs: a run's use is in the account before the run is seen no more.
+        accounts, known = dict(self._accounts()), self._reports()
+        counted: dict[Owner, Account] = {}
+        places = set()
+        for one in running:
+            owner = (one.record.robot, one.record.service)
+            account = counted.setdefault(owner, accounts.get(owner) or Account())
+            account.merge(*of_instance(one.record))
+            if one.observation:
+                account.merge(*of_run(one.record, one.observation))
+            places.add((*owner, one.record.site or ""))
+        sums = [(owner, account.sums()) for owner, account in counted.items()]
+        used = [
+            (owner, {key: n for key, n in counts.items() if key[0] in _USED and (*owner, key[1]) in places})
+            for owner, counts in sums
+        ]
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
-        yield from _instances(running)
+        yield _memory(running)
+        yield from counters_of(used, _USED)
         yield from _sites(self._sites(), running)
-        yield from of_reports([((r.robot, r.service, r.site or ""), report) for r, report in reports])
+        yield from counters_of(sums)
+        yield from gauges_of([((r.robot, r.service, r.site or ""), report) for r, report in reports])
 
 
-def _instances(running: Iterable[Running]) -> Iterator[Metric]:
-    cpu, memory, received, sent = Sums(), Sums(), Sums(), Sums()
+def _memory(running: Iterable[Running]) -> Metric:
+    memory = Sums()
     for one in running:
-        labels = (one.record.robot, one.record.service, one.record.site or "")
-        if one.observation and one.observation.cpu_s is not None:
-            cpu.add(labels, one.observation.cpu_s)
         if one.observation and one.observation.memory_bytes is not None:
+            labels = (one.record.robot, one.record.service, one.record.site or "")
             memory.add(labels, one.observation.memory_bytes)
-        if one.observation and one.observation.received_bytes is not None:
-            received.add(labels, one.observation.received_bytes)
-        if one.observation and one.observation.sent_bytes is not None:
-            sent.add(labels, one.observation.sent_bytes)
-    yield counter("instance_cpu_seconds", "Processor time of the present runs", INSTANCE, cpu)
-    yield gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
-    text = "By the network, of the present runs; containers only"
-    yield counter("instance_network_receive_bytes", text, INSTANCE, received)
-    yield counter("instance_network_transmit_bytes", text, INSTANCE, sent)
+    return gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
 
 
 def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Metric]:

@@ -144,6 +144,15 @@ reports = Table(
     comment="The last of each instance's robot: any orchestrator may get it, and the one that leads exports it",
 )
 
+accounts = Table(
+    "accounts",
+    metadata,
+    Column("robot", String(63), primary_key=True),
+    Column("service", String(63), primary_key=True),
+    Column("account", JSON, nullable=False),
+    comment="Counters of each robot and service, over all programs and runs that counted them",
+)
+
 facts = Table(
     "facts",
     metadata,

@@ -6,11 +6,12 @@ import base64
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from skytether.api.grant import Grant
 from skytether.api.rest import Measurement, Refusal, State
 
+from .accounts import of_instance, of_run
 from .clocks import SetClock
 from .db import GONE
 from .metrics import Metrics
@@ -18,7 +19,7 @@ from .moves import Moves
 from .placement import NOTHING, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
-from .runtimes.base import Capacity, Launch, RuntimeFailure, SiteSilentError
+from .runtimes.base import Capacity, Launch, Observation, Phase, RuntimeFailure, SiteSilentError
 from .security import Secrets
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
@@ -220,6 +221,9 @@ class Reconciler:
             site.capacity = site.load = None  # it may come back as another machine
             site.seen_since = None
             return self._timing.place
+        if self._leads():
+            for record, seen in _ended(live, site.observed, observed):
+                self._store.count(record, [of_run(record, seen)])
         site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
         if not self._leads():
             return self._timing.observe
@@ -314,6 +318,8 @@ class Reconciler:
         if after is None:
             return
         log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
+        if after.restarts:
+            self._store.count(after, [of_instance(after)])
         self.moves.fail_over(after, after.reason)
         if after.state.final:
             site.runtime.stop(after.id, force=True)
@@ -327,6 +333,19 @@ class Reconciler:
         to = State.STOPPED if record.site is None else State.STOPPING
         if self._store.change(record, now, state=to, stopping_at=now, reason=reason):
             log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)
+
+
+def _ended(
+    records: Iterable[Record], before: Mapping[str, Observation], after: Mapping[str, Observation]
+) -> list[tuple[Record, Observation]]:
+    """Runs that are seen no more, or not running, as they were when they last were."""
+    ended = []
+    for record in records:
+        was, now = before.get(record.id), after.get(record.id)
+        over = now is None or now.phase is Phase.EXITED or (was is not None and now.attempt != was.attempt)
+        if was is not None and was.phase is not Phase.EXITED and over:
+            ended.append((record, was))
+    return ended
 
 
 def _used(records: Sequence[Record]) -> dict[str, Capacity]:

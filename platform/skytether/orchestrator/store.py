@@ -11,15 +11,17 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, RowMapping, delete, func, insert, select, text, update
+from sqlalchemy import ColumnElement, Connection, Row, RowMapping, delete, exists, func, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
+from skytether.api.report_metrics import Counts
 from skytether.api.rest import Scope, SiteCreate, State
 
+from .accounts import Account
 from .db import make_engine, migrate
 from .discovery import NAME
 from .leader import Lock, lock_of
-from .models import events, facts, idempotency, instances, reports, robots, services, sites, tokens
+from .models import accounts, events, facts, idempotency, instances, reports, robots, services, sites, tokens
 from .records import Record, check_move
 from .security import TokenHash
 
@@ -67,6 +69,16 @@ class TokenRow:
     created_at: float
     expires_at: float | None = None
     last_used_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a robot told of an instance."""
+
+    report: dict[str, Any]
+    life: str
+    """Whose counting it is, and what is counted: see `accounts.Account.merge`."""
+    counts: Counts
 
 
 class KeyReusedError(Exception):
@@ -254,7 +266,7 @@ class Store:
         *,
         robot: str | None = None,
         measurements: dict[str, Any] | None = None,
-        report: Callable[[Record], dict[str, Any]] | None = None,
+        told: Callable[[Record], Told] | None = None,
     ) -> Record | None:
         """Keep an instance's lease, and its robot's report instead of the one before; whoever leads exports that.
 
@@ -264,7 +276,7 @@ class Store:
             lease_s: From now on; None: as before.
             robot: Whose it must be; None: anybody's.
             measurements: Instead of those before; None: as before.
-            report: Makes the report of the instance as it is; None: there is none.
+            told: What to take of the robot's report for the instance as it is; None: there is none.
 
         Returns:
             The instance; None if it is not there, not the robot's, or has ended or ends.
@@ -283,8 +295,10 @@ class Store:
             if row is None:
                 return None
             record = _record(row)
-            if report is not None:
-                values = {"at": now, "report": report(record)}
+            if told is not None:
+                heard = told(record)
+                self._count(connection, record, [(heard.life, heard.counts)])
+                values = {"at": now, "report": heard.report}
                 if connection.execute(update(reports).where(reports.c.instance == instance), values).rowcount == 0:
                     connection.execute(insert(reports).values(instance=instance, **values))
         return record
@@ -297,6 +311,31 @@ class Store:
         with self._engine.connect() as connection:
             rows = connection.execute(query)
             return {row.instance: row.report for row in rows}
+
+    def count(self, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
+        """Add to what is known of an instance's robot and service: lives and what each has counted by now."""
+        with self._writer.begin() as connection:
+            self._count(connection, record, counted)
+
+    def _count(self, connection: Connection, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
+        mine = (accounts.c.robot == record.robot) & (accounts.c.service == record.service)
+        # Locked, for two orchestrators may be told of the same robot at once; the first makes the row.
+        kept = connection.scalar(select(accounts.c.account).where(mine).with_for_update())
+        if kept is None:
+            made = (
+                "INSERT INTO accounts (robot, service, account) VALUES (:robot, :service, '{}') ON CONFLICT DO NOTHING"
+            )
+            connection.execute(text(made).bindparams(robot=record.robot, service=record.service))
+            kept = connection.scalar(select(accounts.c.account).where(mine).with_for_update())
+        account = Account(kept)
+        for life, counts in counted:
+            account.merge(life, counts)
+        connection.execute(update(accounts).where(mine).values(account=account.document()))
+
+    def accounts(self) -> dict[tuple[str, str], Account]:
+        """What is known, by robot and service."""
+        with self._engine.connect() as connection:
+            return {(row.robot, row.service): Account(row.account) for row in connection.execute(select(accounts))}
 
     def extend_leases(self, now: float) -> None:
         """Give every live instance its whole lease from now, no less and no more; spares keep theirs, which never ends.
@@ -316,7 +355,7 @@ class Store:
         return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason) for row in rows]
 
     def prune(self, now: float, ended_age: float, ended_count: int, events_count: int) -> list[tuple[str, str | None]]:
-        """Forget ended instances that are too old or too many, their events and keys, and the oldest events.
+        """Forget ended instances that are too old or too many, their events, keys and sums, and the oldest events.
 
         Returns:
             Forgotten instances with their sites.
@@ -326,6 +365,8 @@ class Store:
             rows = connection.execute(ended.order_by(instances.c.updated_at.desc())).all()
             gone = [(r.id, r.site) for i, r in enumerate(rows) if i >= ended_count or r.updated_at < now - ended_age]
             connection.execute(delete(instances).where(instances.c.id.in_([i for i, _ in gone])))
+            same = (instances.c.robot == accounts.c.robot) & (instances.c.service == accounts.c.service)
+            connection.execute(delete(accounts).where(~exists().where(same)))
             newest = connection.scalar(select(func.max(events.c.id))) or 0
             connection.execute(delete(events).where(events.c.id <= newest - events_count))
         return gone

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
@@ -41,6 +42,7 @@ from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
 from .supervisor import Limits
 from .table import Offer, robot_table
+from .tally import Tally
 from .task_manager import PathQuality, RobotView
 from .tasks import TaskConfig, Tasks
 
@@ -199,6 +201,7 @@ class Agent:
         """The one before; its instance may still be told of."""
         self._notices = Notices(_log)
         self._stats: SessionStats | None = None
+        self._tally = Tally(uuid.uuid4().hex)
         self._trouble = ""
         self._asked_at: float | None = None
         self._overruns = 0
@@ -285,6 +288,7 @@ class Agent:
         robot = self._tasks.robot if self._tasks else RobotView()
         return report(
             self._driver.status(),
+            self._tally,
             self._stats,
             self._driver.quality.rtt,
             load=robot.load,
@@ -339,7 +343,12 @@ class Agent:
         self._driver.let_go()
         opened, self._open_sessions = list(self._open_sessions.values()), {}
         for one in opened:
-            one.session.close()
+            self._end(one.session)
+
+    def _end(self, session: LiveSession) -> None:
+        session.close()
+        if session.bridge is not None:
+            self._tally.take(session, session.bridge.stats(), last=True)
 
     def _taken_over(self, instance: rest.Instance) -> bool:
         session = self._driver.session
@@ -357,7 +366,7 @@ class Agent:
             self._driver.let_go()
             self._driver.session = serving
         for session_id in [i for i in self._open_sessions if serving is None or i != serving.id]:
-            self._open_sessions.pop(session_id).session.close()
+            self._end(self._open_sessions.pop(session_id).session)
         if self._tasks is not None:
             self._tasks.stayed(instance, reason)
 
@@ -386,6 +395,9 @@ class Agent:
     def watch(self, now: float) -> None:
         """Look at the bridge's counters once."""
         self._settle()
+        for opened in list(self._open_sessions.values()):
+            if opened.session.bridge is not None:
+                self._tally.take(opened.session, opened.session.bridge.stats())
         session = self._driver.session
         if session is None or session.bridge is None:
             return
@@ -445,7 +457,7 @@ class Agent:
         while self._driver.left:
             left = self._driver.left.popleft()
             self._open_sessions.pop(left.id, None)
-            left.close()
+            self._end(left)
 
     def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
         for topic in granted.topics:

@@ -177,7 +177,7 @@ class Asker:
             told = self._trouble
 
     def release(self) -> str | None:
-        """Let the instance go; an orchestrator that does not answer frees it when the lease ends.
+        """Report for the last time and let the instance go; if nobody answers, the end of its lease frees it.
 
         Returns:
             The instance's id, if there was one and the orchestrator took it back.
@@ -186,13 +186,15 @@ class Asker:
         coming, self._next = self._next, None
         if coming is not None:
             self._let_go(coming[0])
-        return self._let_go(released)
+        return self._let_go(released, self._report())
 
-    def _let_go(self, instance: Instance | None) -> str | None:
+    def _let_go(self, instance: Instance | None, report: Report | None = None) -> str | None:
         if instance is None:
             return None
         self._key = str(uuid.uuid4())
         try:
+            if report is not None and instance.state is State.RUNNING:
+                self._client.renew_instance(instance.id, Renew(report=report))
             self._client.delete_instance(instance.id)
         except (ApiError, Unreachable) as error:
             _log.warning("instance %s was not released, its lease will end it: %s", instance.id, error)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ from .asker import Asker, Orchestrator
 from .bag import Bag
 from .snapshot import report
 from .table import robot_table
+from .tally import Tally
 
 _START_S = 30.0
 """For the service to come up."""
@@ -192,6 +194,7 @@ class _Replay:
         self._progress = progress
         self._instance: rest.Instance | None = None
         self._ended = ""
+        self._tally = Tally(uuid.uuid4().hex)
         self._bridge: Bridge | None = None
         self._peer: Address | None = None
         self._settled = threading.Event()
@@ -290,7 +293,8 @@ class _Replay:
         if self._bridge is None:
             return None
         stats = self._bridge.stats()
-        return report(None, stats, min((path.rtt for path in stats.paths), default=nan))
+        self._tally.take(self._bridge, stats)
+        return report(None, self._tally, stats, min((path.rtt for path in stats.paths), default=nan))
 
     def _wait_until_running(self) -> rest.Session:
         deadline = time.monotonic() + _START_S

@@ -9,6 +9,7 @@ from skytether.api import rest
 from skytether.wire.stats import SessionStats
 
 from .driver import DriverStatus
+from .tally import COUNTERS, Tally
 from .task_manager import Decision
 
 
@@ -49,6 +50,7 @@ class AgentStatus:
 
 def report(
     driver: DriverStatus | None,
+    tally: Tally,
     stats: SessionStats | None,
     rtt: float,
     *,
@@ -56,28 +58,33 @@ def report(
     battery: float | None = None,
     overruns: int | None = None,
 ) -> rest.Report:
-    """Say for the orchestrator's metrics what bridge and control loop counted."""
+    """Say for the orchestrator's metrics what bridge and control loop counted.
+
+    Args:
+        driver: What the control loop knows; None: there is none.
+        tally: What all sessions counted.
+        stats: The present session's, for delays.
+        rtt: Round trip [s]; NaN: not known.
+        load: Share of the robot's processors that is busy; NaN: not known.
+        battery: Charge, 0 to 1.
+        overruns: Of the control loop.
+    """
+    present = {(topic.topic, topic.direction): topic for topic in (stats.topics if stats else ())}
     return rest.Report(
+        life=tally.life,
         rtt_s=_known(rtt),
         topics=tuple(
             rest.TopicReport(
-                topic=topic.topic,
-                direction="in" if topic.direction == "in" else "out",
-                priority=topic.priority,
-                sent=topic.sent,
-                delivered=topic.delivered,
-                lost=topic.lost,
-                late=topic.late,
-                expired=topic.expired,
-                replaced=topic.replaced,
-                superseded=topic.superseded,
-                duplicate=topic.duplicate,
-                bytes_sent=topic.bytes_sent,
-                delay_p50_s=_known(topic.delay_p50),
-                delay_p99_s=_known(topic.delay_p99),
-                jitter_s=_known(topic.jitter),
+                topic=key[0],
+                direction="in" if key[1] == "in" else "out",
+                priority=priority,
+                # A service may claim any number: one that the orchestrator refuses must not cost the robot its lease.
+                **{name: min(max(counts[name], 0), rest.MOST_COUNTED) for name in COUNTERS},
+                delay_p50_s=_known(present[key].delay_p50) if key in present else None,
+                delay_p99_s=_known(present[key].delay_p99) if key in present else None,
+                jitter_s=_known(present[key].jitter) if key in present else None,
             )
-            for topic in (stats.topics if stats else ())
+            for key, (priority, counts) in tally.sums().items()
         ),
         control_source=driver.source if driver else None,
         fallback_transitions=dict(driver.transition_counts) if driver else {},

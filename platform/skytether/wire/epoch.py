@@ -87,7 +87,9 @@ class ReceiveTopic:
             Whether to deliver it; else it is superseded.
         """
         counters = self.counters
-        counters.late += self.tracker.observe(sequence, now)
+        if self.tracker.observe(sequence, now):
+            counters.late += 1
+            self._count_lost()  # together, so that lost and late added up never go down
         in_order = sequence > self.newest
         if in_order:
             self.newest = sequence
@@ -111,10 +113,12 @@ class ReceiveTopic:
             self.counters.lost += self.inbox.skipped
             self.inbox.skipped = 0
         self.counters.settle()
-        tracker = self.tracker
-        tracker.settle(now)
-        self.counters.lost += tracker.lost - self.settled
-        self.settled = tracker.lost
+        self.tracker.settle(now)
+        self._count_lost()
+
+    def _count_lost(self) -> None:
+        self.counters.lost += self.tracker.lost - self.settled
+        self.settled = self.tracker.lost
 
 
 class Epoch:

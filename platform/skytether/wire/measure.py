@@ -143,10 +143,13 @@ class Outbound:
     """Counters of a topic at its sender, since the session object was made; names as in `stats.TopicStats`."""
 
     __slots__ = (
-        "bytes_redundant", "bytes_sent", "expired", "offered", "payload_sent", "replaced", "retransmitted", "sent",
+        "bytes_redundant", "bytes_sent", "expired", "offered", "payload_sent", "reliable", "replaced", "retransmitted",
+        "sent",
     )  # fmt: skip
 
     def __init__(self) -> None:
+        self.reliable = False
+        """Whether the topic is."""
         self.bytes_redundant = 0
         """Of ``bytes_sent``, copies and parity."""
         self.offered = self.sent = self.expired = self.replaced = self.retransmitted = self.bytes_sent = 0

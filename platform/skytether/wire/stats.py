@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class TopicStats:
-    """One topic in one direction. Counters count messages since the session object was made.
+    """One topic in one direction. Counters count messages since the session object was made, over all its peers.
 
     Sender's counters are exact at the sender and as of its last report at the receiver, and the other
     way round; times are in seconds, NaN where nothing was measured yet.
@@ -24,11 +24,13 @@ class TopicStats:
     """Complete and authentic at the receiver, and given to its graph."""
     lost: int = 0
     """Sent, never completed: gaps in the topic's sequence that are older than its lifespan (of a reliable topic: that
-    the sender gave up). When nothing is under
-    way any more, ``sent == delivered + superseded + lost`` (of one peer's life: what was sent to a peer just before
-    it was restarted is in ``sent`` only)."""
+    the sender gave up). When nothing is under way any more, ``sent == delivered + superseded + lost + unknown``."""
+    unknown: int = 0
+    """Sent to a peer before it was restarted, which had not said what became of them (not of reliable topics: there
+    they are sent again)."""
     late: int = 0
-    """Arrived after having been counted lost; subtracted from ``lost`` again."""
+    """Arrived after having been counted lost; subtracted from ``lost`` again, the only counter that goes down: use
+    ``lost + late`` where none may."""
     expired: int = 0
     """Dropped for age in the sender's queue or on its way out, or partly arrived and dropped in the receiver's
     reassembly (those are among the lost too)."""

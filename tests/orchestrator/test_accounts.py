@@ -1,0 +1,80 @@
+"""Sums over all that counted, whatever is told twice, late, or not at all."""
+
+from __future__ import annotations
+
+import json
+from random import Random
+from typing import Any
+
+from skytether.api.rest import State
+from skytether.orchestrator.accounts import Account
+from skytether.orchestrator.store import Store, Told
+
+KEY = ("topic_messages", "scan", "64", "in", "sent")
+
+
+def sent(account: Account) -> float:
+    return account.sums().get(KEY, 0)
+
+
+def test_a_report_that_comes_twice_or_late_changes_nothing() -> None:
+    account = Account()
+    for value in (10, 20, 20, 10, 30, 20):
+        account.merge("robot:a", {KEY: value})
+    assert sent(account) == 30
+
+
+def test_a_program_that_is_started_anew_adds_to_what_was_counted_before() -> None:
+    account = Account()
+    account.merge("robot:a", {KEY: 1000})
+    account.merge("robot:b", {KEY: 1500})  # more than the one before at its first report: no reset to be seen
+    account.merge("robot:a", {KEY: 1010})  # a report that was on its way
+    assert sent(account) == 2510
+
+
+def test_no_sum_ever_goes_down_and_in_the_end_it_is_that_of_the_lives() -> None:
+    random = Random(1)
+    account, truth, before = Account(), {}, 0.0
+    for life in range(30):
+        counting = [random.randrange(1, 50) for _ in range(20)]
+        told = [sum(counting[: n + 1]) for n in range(20)]
+        truth[life] = told[-1]
+        late = random.choices(told, k=8)
+        last = [told[-1]]
+        for value in [*told[:-1:3], *late, *last, *late]:
+            account.merge(f"robot:{life}", {KEY: value})
+            account = Account(json.loads(json.dumps(account.document())))
+            assert sent(account) >= before
+            before = sent(account)
+    assert sent(account) == sum(truth.values())
+    assert len(account.document()["lives"]) == 8
+
+
+def test_new_series_are_refused_when_there_are_too_many_and_old_ones_go_on() -> None:
+    account = Account()
+    for n in range(2000):
+        account.merge("robot:a", {("fallback_transitions", f"r{n}"): 1, KEY: n})
+    assert len(account.sums()) == 1025
+    assert sent(account) == 1999
+    account.merge("robot:b", {("fallback_transitions", "r0"): 1, ("fallback_transitions", "new"): 1})
+    assert account.sums()["fallback_transitions", "r0"] == 2
+    assert len(account.sums()) == 1025
+
+
+def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store, new_record: Any) -> None:
+    record = store.add(new_record(state=State.RUNNING), "robot:walker", None, "")
+    now = record.created_at
+    for value in (5, 4):
+        store.renew(record.id, now, None, told=lambda _, value=value: Told({}, "robot:a", {KEY: value}))
+    store.count(record, [("run:i1:1", {("instance_cpu_seconds", "lab"): 2.5})])
+    assert store.accounts()["walker", "toy"].sums() == {KEY: 5, ("instance_cpu_seconds", "lab"): 2.5}
+    store.prune(now, ended_age=10, ended_count=10, events_count=10)
+    assert ("walker", "toy") in store.accounts()
+    record = store.get(record.id)
+    assert record is not None
+    assert store.renew(record.id, now, None, robot="other", told=lambda _: Told({}, "x", {KEY: 9})) is None
+    stopping = store.change(record, now, state=State.STOPPING)
+    assert stopping is not None
+    assert store.change(stopping, now, state=State.STOPPED)
+    store.prune(now + 60, ended_age=10, ended_count=10, events_count=10)
+    assert store.accounts() == {}
