@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from skytether.api.client import Client
 from skytether.orchestrator.runtimes.procfs import ProcessStat
 
@@ -71,10 +73,14 @@ class Program:
         return int(json.loads(note.read_text())["process"][0])
 
     def clean_up(self) -> None:
-        if self.process is not None:
+        begun: set[int] = set()
+        if self.process is not None and self.process.poll() is None:
+            self.process.send_signal(signal.SIGSTOP)
+            # One that was forked and does not run its program yet cannot be told by its environment.
+            begun = {child.pid for child in psutil.Process(self.process.pid).children()}
             self.process.kill()
             self.process.wait()
-        for pid in self.services():
+        for pid in begun | self.services():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
