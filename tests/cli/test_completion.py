@@ -28,7 +28,7 @@ def shell(tmp_path: Path) -> Ask:
     base = {**clean, "PATH": f"{script.parent}:{os.environ['PATH']}", "HOME": str(tmp_path)}
 
     def ask(*command: str, **variables: str) -> str:
-        done = subprocess.run(command, env={**base, **variables}, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(command, env={**base, **variables}, capture_output=True, text=True, timeout=120)
         assert done.stderr == ""
         return done.stdout
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 import pytest
-from orchestrator_program import Program, environment, until, with_toy
+from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 
 import skytether
 from skytether.api.client import ApiError, Client, Unreachable
@@ -114,7 +114,7 @@ def retried(call: Callable[[], Any]) -> Any:
             return call()
         except (ApiError, Unreachable) as error:
             again = isinstance(error, Unreachable) or error.problem.status == 503
-            if not again or time.monotonic() - began > 10:
+            if not again or time.monotonic() - began > PATIENCE:
                 raise
             time.sleep(0.1)
 
@@ -197,7 +197,7 @@ def test_a_rolling_update_to_a_new_schema_is_noticed_by_nobody(
         folder = {"folder": str(tmp_path / "instances")}
         operator.create_site(SiteCreate(name="shared", tier="cloud", runtime="process", options=folder))
         operator.delete_site("local")
-        ask = InstanceCreate(robot="walker", service="toy", lease_s=15)
+        ask = InstanceCreate(robot="walker", service="toy", lease_s=60)
         held = [operator.wait_running(operator.create_instance(ask).id) for _ in range(2)]
         pids = services(tmp_path / "instances")
         assert len(pids) == 2
@@ -215,7 +215,7 @@ def test_a_rolling_update_to_a_new_schema_is_noticed_by_nobody(
         for robot, mine in zip(
             (connect(f"{url(one)},{url(two)}"), connect(f"{url(two)},{url(one)}")), held, strict=True
         ):
-            traffic.append(Traffic(lambda robot=robot, mine=mine: robot.renew_instance(mine.id)))  # type: ignore[misc]
+            traffic.append(Traffic(lambda robot=robot, mine=mine: retried(lambda: robot.renew_instance(mine.id))))  # type: ignore[misc]
         traffic += [Traffic(come_and_go), Traffic(lambda: retried(through.instances))]
         seen: list[str] = []
 
