@@ -45,6 +45,14 @@ def test_nothing_goes_down():
     assert counted(tally) == (10, 8, 3, 2)
 
 
+def test_what_is_under_way_when_a_session_ends_is_unknown():
+    tally, session = Tally("a"), Session()
+    tally.take(session, of(replace(SCAN, sent=15)))
+    assert tally.sums()["scan", "in"][1]["unknown"] == 0
+    tally.take(session, of(replace(SCAN, sent=15)), last=True)
+    assert tally.sums()["scan", "in"][1]["unknown"] == 6  # of 15, 7 arrived and 2 are lost
+
+
 def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one():
     tally = Tally("a")
     tally.take(Session(), of(SCAN, TopicStats("old", "in", 5, sent=3)), last=True)

@@ -168,7 +168,8 @@ class TopicReport(Strict):
     ``sent == delivered + superseded + lost - late + unknown``."""
     late: _Count = 0
     unknown: _Count = 0
-    """Sent to a service before it was restarted, which had not said what became of them."""
+    """Sent to a service before it was restarted, which had not said what became of them, or under way when their
+    session ended."""
     expired: _Count = 0
     replaced: _Count = 0
     superseded: _Count = 0

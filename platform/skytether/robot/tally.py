@@ -16,7 +16,8 @@ from skytether.wire.stats import SessionStats, TopicStats
 COUNTERS = (
     "sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded", "duplicate", "bytes_sent",
 )  # fmt: skip
-"""Of `skytether.wire.stats.TopicStats`; ``lost`` with those that came late after all, so that it only goes up."""
+"""Of `skytether.wire.stats.TopicStats`; ``lost`` with those that came late after all, so that it only goes up, and
+``unknown`` with those under way when their session ended."""
 
 Key = tuple[str, str]
 """Topic and direction."""
@@ -61,6 +62,8 @@ class Tally:
                 del self._open[session]
                 self._ended.add(session)
                 for key, counts in counted.items():
+                    told = counts["delivered"] + counts["superseded"] + counts["lost"] - counts["late"]
+                    counts["unknown"] = max(counts["unknown"], counts["sent"] - told)  # under way, and nobody will say
                     self._past.setdefault(key, Counter()).update(counts)
 
     def sums(self) -> Mapping[Key, tuple[int, Mapping[str, int]]]:
