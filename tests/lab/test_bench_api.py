@@ -1,23 +1,43 @@
 """Many instances and many requests, few of each here."""
 
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
 import pytest
 
-from skytether.lab.bench.api import _spread, bench_api
-from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.api import Spread, bench_api, passes_in
+from skytether.lab.bench.requests import Held, Mix
 
 
 @pytest.mark.slow
 def test_every_request_is_answered_and_no_instance_is_lost():
-    row = bench_api(3, 20, 2)
-    assert (row.instances, row.requests, row.failed, row.lost) == (3, 40, 0, 0)
-    assert 0 < row.api_p50_ms <= row.api_p99_ms
+    row = bench_api(3, 20, 3)
+    assert (row.instances, row.requests, row.failed, row.lost) == (3, 60, 0, 0)
+    assert 0 < row.client_p50_ms < row.api_p50_ms <= row.api_p99_ms <= row.api_max_ms
+    assert {"renew", "show"} <= row.kinds.keys()
     assert 0 < row.pass_p50_ms <= row.pass_max_ms
+    assert row.placer_max_ms > 0
+    assert 0 < row.cpu_idle < row.cpu
     assert row.memory_mb > 10
 
 
-def test_the_spread_of_passes_is_that_of_the_ones_in_between():
-    before = {0.01: 10.0, 0.1: 20.0, 1.0: 20.0}
-    after = {0.01: 13.0, 0.1: 24.0, 1.0: 25.0}  # 3 up to 10 ms, 1 up to 100 ms, 1 up to 1 s
-    assert _spread(before, after) == (0.01, 1.0)
-    with pytest.raises(BenchError, match="no pass"):
-        _spread(after, after)
+def test_passes_are_those_that_the_log_tells_of():
+    log = "2026 DEBUG x: site-fleet: pass of 1.50 ms\n2026 INFO other\n2026 DEBUG x: placer: pass of 20.00 ms\n"
+    assert passes_in(log + log) == {"site-fleet": [1.5, 1.5], "placer": [20.0, 20.0]}
+    assert Spread.of([0.001 * n for n in range(1, 101)]) == Spread(100, 50.0, 99.0, 100.0)
+
+
+def test_the_mix_lets_go_only_what_was_made():
+    mix = Mix([Held("r", "t", "i")], "o", np.random.default_rng(1))
+    kinds: Counter[str] = Counter()
+    for _ in range(1000):
+        request = mix.next()
+        kinds[request.kind] += 1
+        if request.kind == "create":
+            request.then(b'{"id": "made"}')
+        assert (request.kind == "delete") == request.path.endswith("/made")
+    assert 700 < kinds["renew"] < 900
+    assert kinds["scrape"] == 2
+    assert 0 < kinds["delete"] <= kinds["create"] < 60

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 import threading
 import time
 
@@ -77,14 +78,16 @@ def test_a_pass_that_raises_is_logged_and_not_the_last(
     assert "ZeroDivisionError: oh" in caplog.text
 
 
-def test_the_last_pass_is_dated() -> None:
+def test_the_last_pass_is_dated_and_timed(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
     times = iter([10.0, 20.0, 30.0])
     loop = Loop("test", Steps(1000), lambda: next(times))
     assert loop.last_pass == 10
     loop.start()
     loop.wait_first(PATIENCE)
-    assert loop.last_pass == 20
+    assert loop.last_pass == 30
     loop.stop(PATIENCE)
+    assert "test: pass of 10000.00 ms" in caplog.text
 
 
 def test_stopping_one_that_never_ran_is_no_error() -> None:

@@ -45,7 +45,9 @@ def test_tokens_of_the_first_schema_are_good_still(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path}/db")
     store.migrate()
     assert [row.name for row in store.robots()] == ["walker"]
-    (row,) = store.tokens_by_prefix(kept.prefix)
+    ((row, robot),) = store.holders(kept.prefix)
+    assert robot is not None
+    assert robot.services == ("*",)
     assert row.robot == "walker"
     assert row.hash.matches(token)
     store.close()
@@ -233,9 +235,10 @@ def test_robots_sites_and_services(store: Store) -> None:
     found = store.robot("r")
     assert found is not None
     assert (found.services, found.last_seen_at) == (("a", "b"), NOW + 1)
-    assert store.tokens_by_prefix("sky-12345678") == [token]
+    assert store.holders("sky-12345678") == [(token, found)]
     other = TokenRow("o", "metrics", None, ("metrics",), TokenHash("sky-87654321", "1" * 64), NOW, NOW + 9)
     assert store.add_token(other)
+    assert store.holders("sky-87654321") == [(other, None)]
     assert not store.add_token(dataclasses.replace(token, id="v", robot="nobody"))
     store.change_token("o", expires_at=NOW + 5, last_used_at=NOW + 4)
     assert store.tokens() == [token, dataclasses.replace(other, expires_at=NOW + 5, last_used_at=NOW + 4)]

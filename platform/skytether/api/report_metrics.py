@@ -45,15 +45,14 @@ Counts = Mapping[tuple[str, ...], float]
 class Sums(dict[tuple[str, ...], float]):
     """Samples by labels. A robot may hold two instances of one service: counts add up, and of gauges the last stays."""
 
-    def add(self, labels: Iterable[object], value: float) -> None:
+    def add(self, labels: tuple[str, ...], value: float) -> None:
         """One more."""
-        key = tuple(str(label) for label in labels)
-        self[key] = self.get(key, 0.0) + value
+        self[labels] = self.get(labels, 0.0) + value
 
-    def put(self, labels: Iterable[object], value: float | None) -> None:
+    def put(self, labels: tuple[str, ...], value: float | None) -> None:
         """The value now, if it is known."""
         if value is not None:
-            self[tuple(str(label) for label in labels)] = value
+            self[labels] = value
 
 
 def gauge(name: str, text: str, labels: Iterable[str], samples: Mapping[tuple[str, ...], float]) -> Metric:
@@ -118,7 +117,7 @@ def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Metric]:
         load.put((robot,), report.load)
         battery.put((robot,), report.battery)
         for topic in report.topics:
-            labels = (robot, service, topic.topic, topic.priority, topic.direction)
+            labels = (robot, service, topic.topic, str(topic.priority), topic.direction)
             delay.put((*labels, "0.5"), topic.delay_p50_s)
             delay.put((*labels, "0.99"), topic.delay_p99_s)
             jitter.put(labels, topic.jitter_s)

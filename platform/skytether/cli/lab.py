@@ -151,8 +151,13 @@ def api(
         return
     table = Table("", "measured", title=f"{row.instances} instances, {row.rate_hz:g} requests a second")
     table.add_row("answers, p50 / p99", f"{row.api_p50_ms:.1f} / {row.api_p99_ms:.1f} ms")
+    for kind, spread in row.kinds.items():
+        table.add_row(f"  {kind}", f"{spread.p50_ms:.1f} / {spread.p99_ms:.1f} ms")
+    table.add_row("the client by itself, p50 / p99", f"{row.client_p50_ms:.1f} / {row.client_p99_ms:.1f} ms")
     table.add_row("requests without a good answer", f"{row.failed} of {row.requests}")
-    table.add_row("reconcile pass, p50 / slowest, at most", f"{row.pass_p50_ms:g} / {row.pass_max_ms:g} ms")
+    table.add_row("reconcile pass, p50 / slowest", f"{row.pass_p50_ms:.1f} / {row.pass_max_ms:.1f} ms")
+    table.add_row("slowest pass of the placer", f"{row.placer_max_ms:.1f} ms")
+    table.add_row("cores busy before / meanwhile", f"{row.cpu_idle:.2f} / {row.cpu:.2f}")
     table.add_row("memory of the orchestrator", f"{row.memory_mb:.0f} MiB")
     table.add_row("instances lost or doubled", str(row.lost))
     table.add_row("all started within", f"{row.start_s:.1f} s")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -25,8 +27,12 @@ class EmbeddedOrchestrator:
     this process is killed; only a temporary state directory is left then.
     """
 
-    def __init__(self, state_dir: Path | None = None) -> None:
-        """Without a state directory a temporary one is used, and removed at the end."""
+    def __init__(self, state_dir: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
+        """Without a state directory a temporary one is used, and removed at the end.
+
+        ``environment`` is added to this process's.
+        """
+        self._environment = {**os.environ, **(environment or {})}
         self._temporary = None if state_dir else tempfile.TemporaryDirectory(prefix="skytether-")
         self.state_dir = state_dir or Path(self._temporary.name if self._temporary else "")
         self._process: subprocess.Popen[bytes] | None = None
@@ -67,7 +73,12 @@ class EmbeddedOrchestrator:
         self._let_go()
         with (self.state_dir / "orchestrator.log").open("ab") as log:
             process = self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+                command,
+                env=self._environment,
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
         try:
             self._port = self._wait_for(address, process)

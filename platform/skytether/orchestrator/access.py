@@ -123,22 +123,19 @@ class Access:
             raise UnauthenticatedError("a token is needed: send `Authorization: Bearer TOKEN`")
         if self._secrets.is_operator(token):
             return Principal(None, scopes=frozenset(SCOPES))
-        for row in self._store.tokens_by_prefix(token[:PREFIX_LENGTH]):
+        for row, robot in self._store.holders(token[:PREFIX_LENGTH]):
             if row.hash.matches(token):
-                return self._principal(row)
+                return self._principal(row, robot)
         raise UnauthenticatedError("this token is not known here: it was revoked, or is another orchestrator's")
 
-    def _principal(self, row: TokenRow) -> Principal:
+    def _principal(self, row: TokenRow, robot: RobotRow | None) -> Principal:
         now = self._clock()
         if row.expires_at is not None and now >= row.expires_at:
             when = datetime.fromtimestamp(row.expires_at, UTC).isoformat(timespec="seconds")
             raise UnauthenticatedError(f"this token expired at {when}: ask the operator for another")
         self._note_used(row, now)
-        if row.robot is None:
-            return Principal(None, scopes=frozenset(row.scopes), token=row)
-        robot = self._store.robot(row.robot)
         if robot is None:
-            raise UnauthenticatedError("this token's robot is registered no more")
+            return Principal(None, scopes=frozenset(row.scopes), token=row)
         return Principal(robot.name, robot.services, token=row)
 
     def _note_used(self, row: TokenRow, now: float) -> None:

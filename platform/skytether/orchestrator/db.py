@@ -28,6 +28,10 @@ _POSTGRES = {
 without an encoding (``SQL_ASCII``) text would come back as bytes."""
 
 
+SQLITE_PATIENCE = 10
+"""Seconds that a statement waits for another program that writes."""
+
+
 def make_engine(url: str, name: str = NAME) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
@@ -51,13 +55,26 @@ def make_engine(url: str, name: str = NAME) -> Engine:
 
 def _set_up_sqlite(connection: Any, _: Any) -> None:
     connection.isolation_level = None  # the driver's own idea of transactions off; _begin_sqlite says when
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "busy_timeout=10000"):
+    for pragma in (
+        "journal_mode=WAL",
+        "synchronous=NORMAL",
+        "foreign_keys=ON",
+        f"busy_timeout={SQLITE_PATIENCE * 1000}",
+    ):
         connection.execute(f"PRAGMA {pragma}")
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    immediate = connection.get_execution_options().get("immediate", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+    options = connection.get_execution_options()
+    if not options.get("reading", False):
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if options.get("immediate", False) else "BEGIN")
+
+
+def reading(engine: Engine) -> Engine:
+    """The same database for statements that only read, each by itself: with no transaction around it."""
+    if engine.dialect.name == "postgresql":
+        return engine.execution_options(isolation_level="AUTOCOMMIT")
+    return engine.execution_options(reading=True)
 
 
 def migrate(engine: Engine, to: str = "head") -> str:

@@ -18,7 +18,8 @@ AUDIT = "skytether.audit"
 audit = logging.getLogger(AUDIT)
 
 _TEXT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-_CHATTY = ("alembic", "uvicorn", "httpx")
+_CHATTY = ("alembic", "asyncio", "httpx", "sqlalchemy", "uvicorn")
+"""At level debug too; SQLAlchemy would tell what is in every row."""
 _AUDIT_BYTES, _AUDIT_FILES = 10_000_000, 5
 _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)

@@ -16,7 +16,7 @@ class Loop:
     """Calls ``step``, which says in how many seconds it wants to be called again; ``wake`` makes that now."""
 
     def __init__(self, name: str, step: Callable[[], float], clock: Callable[[], float]) -> None:
-        """``clock`` is monotonic; it only dates the last pass."""
+        """``clock`` is monotonic; it only dates and times the passes."""
         self._step = step
         self._clock = clock
         self._wake = threading.Event()
@@ -46,6 +46,7 @@ class Loop:
 
     def _run(self) -> None:
         while not self._ending:
+            began = self._clock()
             self._wake.clear()  # before the step: a wake during it is not lost
             try:
                 delay = self._step()
@@ -54,5 +55,6 @@ class Loop:
                 log.exception("%s: pass failed, trying again", self._thread.name)
                 delay = _AFTER_ERROR
             self.last_pass = self._clock()
+            log.debug("%s: pass of %.2f ms", self._thread.name, (self.last_pass - began) * 1e3)
             self._first.set()
             self._wake.wait(delay)

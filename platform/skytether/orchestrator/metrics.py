@@ -191,9 +191,10 @@ def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[
         promised.put(labels, 0.0)
         count.put(labels, 0.0)
     for one in running:
-        if (one.record.site or "",) in up:
-            promised.add((one.record.site,), one.record.spec.needs.cpu)
-            count.add((one.record.site,), 1)
+        labels = (one.record.site or "",)
+        if labels in up:
+            promised.add(labels, one.record.spec.needs.cpu)
+            count.add(labels, 1)
     yield gauge("site_up", "1 while the site answers", ("site",), up)
     yield gauge("site_cpu_cores", "Processors of the site", ("site",), cores)
     yield gauge("site_memory_bytes", "Memory of the site", ("site",), memory)

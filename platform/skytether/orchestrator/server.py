@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import ipaddress
 import logging
 import os
 import signal
 import socket
 import ssl
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +33,9 @@ log = logging.getLogger(__name__)
 _DRAIN = 5
 """Whole seconds that requests under way get at shutdown."""
 _BACKLOG = 512
+_SWITCH = 0.001
+"""Seconds that one thread computes while others wait. An answer passes through several threads, each of which waits so
+long for a reconcile pass that is under way: at Python's own 5 ms that adds up."""
 
 
 class StartError(Exception):
@@ -76,6 +81,8 @@ def _serve(core: Orchestrator, listener: socket.socket) -> None:
     try:
         _start(core)
         try:
+            gc.freeze()  # what is loaded by now stays: looking through it for garbage holds up every request
+            sys.setswitchinterval(_SWITCH)
             with _echo(core, listener):
                 server.run(sockets=[listener])
         finally:

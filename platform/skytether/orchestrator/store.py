@@ -7,18 +7,33 @@ seen the last change gets None and looks again. Each change of state or reason l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Sequence
+import threading
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, RowMapping, delete, exists, func, insert, select, text, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    RowMapping,
+    bindparam,
+    delete,
+    exists,
+    func,
+    insert,
+    select,
+    text,
+    update,
+)
 from sqlalchemy.exc import IntegrityError
 
 from skytether.api.report_metrics import Counts
 from skytether.api.rest import Scope, SiteCreate, State
 
 from .accounts import Account
-from .db import make_engine, migrate
+from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import Lock, lock_of
 from .models import accounts, events, facts, idempotency, instances, reports, robots, services, sites, tokens
@@ -81,6 +96,23 @@ class Told:
     counts: Counts
 
 
+_INSTANCE = select(instances).where(instances.c.id == bindparam("instance"))
+_SUCCESSOR = (
+    select(instances.c.id)
+    .where(instances.c.replaces == bindparam("instance"), instances.c.state.not_in([*_FINAL, State.STOPPING]))
+    .order_by(instances.c.created_at.desc())
+    .limit(1)
+)
+_HOLDERS = (
+    select(
+        tokens, robots.c.services.label("may_use"), robots.c.created_at.label("registered_at"), robots.c.last_seen_at
+    )
+    .outerjoin(robots, tokens.c.robot == robots.c.name)
+    .where(tokens.c.prefix == bindparam("prefix"))
+)
+"""Made once: what every request asks."""
+
+
 class KeyReusedError(Exception):
     """An idempotency key came again with another body."""
 
@@ -91,11 +123,28 @@ class Store:
     def __init__(self, url: str, name: str = NAME) -> None:
         """``name`` is what a database server lists its connections under."""
         self._engine = make_engine(url, name)
+        self._reader = reading(self._engine)
         self._writer = self._engine.execution_options(immediate=True)
+        self._turn = threading.Lock()
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
         self._schema = ""
         self._seen: dict[str, Record] = {}
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        """A transaction that changes something.
+
+        SQLite has one writer at a time, and lets the others ask again and again after growing pauses, in no order: here
+        they queue. One that waits for another program's lock does not keep the queue for longer than that may take.
+        """
+        turn = self._engine.dialect.name == "sqlite" and self._turn.acquire(timeout=SQLITE_PATIENCE)
+        try:
+            with self._writer.begin() as connection:
+                yield connection
+        finally:
+            if turn:
+                self._turn.release()
 
     def migrate(self) -> None:
         """Bring the database to the schema of this code."""
@@ -115,7 +164,7 @@ class Store:
         if self._engine.dialect.name != "postgresql":
             return []
         ours = "datname = current_database() AND usename = current_user"
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             asked = connection.scalars(text(f"SELECT DISTINCT application_name FROM pg_stat_activity WHERE {ours}"))  # noqa: S608
             return [name for name in asked if name]
 
@@ -123,7 +172,7 @@ class Store:
         """Note a fact at first, and from then on say whether it is still the same."""
         if self._insert(facts, {"name": name, "value": value}):
             return True
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return connection.scalar(select(facts.c.value).where(facts.c.name == name)) == value
 
     def close(self) -> None:
@@ -131,7 +180,7 @@ class Store:
 
     def ping(self) -> None:
         """Raise what the database raises, if it does not answer."""
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             connection.execute(text("SELECT 1"))
 
     # Instances
@@ -143,7 +192,7 @@ class Store:
             KeyReusedError: The key was used with another body.
         """
         try:
-            with self._writer.begin() as connection:
+            with self._writing() as connection:
                 connection.execute(insert(instances).values(**_values(record)))
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": record.id}
@@ -165,7 +214,7 @@ class Store:
         """
         mine = (idempotency.c.owner == owner) & (idempotency.c.key == key)
         query = select(instances, idempotency.c.body_sha256).join(idempotency).where(mine)
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             row = connection.execute(query).mappings().one_or_none()
         if row is None:
             return None
@@ -174,8 +223,8 @@ class Store:
         return _record(row)
 
     def get(self, instance: str) -> Record | None:
-        with self._engine.connect() as connection:
-            row = connection.execute(select(instances).where(instances.c.id == instance)).mappings().one_or_none()
+        with self._reader.connect() as connection:
+            row = connection.execute(_INSTANCE, {"instance": instance}).mappings().one_or_none()
         return None if row is None else _record(row)
 
     def all(self, robot: str | None = None) -> list[Record]:
@@ -199,7 +248,7 @@ class Store:
 
     def known(self, ids: Iterable[str]) -> set[str]:
         """Those that the store has a row of, ended or not."""
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return set(connection.scalars(select(instances.c.id).where(instances.c.id.in_(list(ids)))))
 
     def change(self, record: Record, now: float, **changes: Any) -> Record | None:
@@ -218,7 +267,7 @@ class Store:
         if told:
             new = dataclasses.replace(new, updated_at=now)
         seen = (instances.c.id == record.id) & (instances.c.version == record.version)
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
                 return None
             if told:
@@ -234,7 +283,7 @@ class Store:
         new = dataclasses.replace(spare, version=spare.version + 1, updated_at=now, spare=False, **changes)
         seen = (instances.c.id == spare.id) & (instances.c.version == spare.version)
         try:
-            with self._writer.begin() as connection:
+            with self._writing() as connection:
                 if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
                     return None
                 if key is not None:
@@ -248,14 +297,13 @@ class Store:
 
     def successor(self, instance: str) -> str | None:
         """The id of the one that replaces an instance and has not ended."""
-        mine = (instances.c.replaces == instance) & instances.c.state.not_in([*_FINAL, State.STOPPING])
-        with self._engine.connect() as connection:
-            return connection.scalar(select(instances.c.id).where(mine).order_by(instances.c.created_at.desc()))
+        with self._reader.connect() as connection:
+            return connection.scalar(_SUCCESSOR, {"instance": instance})
 
     def last_params(self, service: str) -> dict[str, Any] | None:
         """What the last robot that asked for a service asked for; None: nobody did."""
         newest = select(instances.c.params).where(instances.c.service == service, instances.c.spare.is_(False))
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return connection.scalar(newest.order_by(instances.c.created_at.desc()).limit(1))
 
     def renew(
@@ -290,7 +338,7 @@ class Store:
             statement = statement.values(measurements=measurements)
         # The version counts up, so that whoever is about to end it for its old lease has to look again.
         statement = statement.values(lease_s=length, lease_expires_at=now + length, version=instances.c.version + 1)
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             row = connection.execute(statement.returning(instances)).mappings().one_or_none()
             if row is None:
                 return None
@@ -308,13 +356,13 @@ class Store:
         query = select(reports.c.instance, reports.c.report).join(instances).where(instances.c.state.not_in(_FINAL))
         if control is not None:
             query = query.where(reports.c.report["control_source"].as_string().in_(control))
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             rows = connection.execute(query)
             return {row.instance: row.report for row in rows}
 
     def count(self, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
         """Add to what is known of an instance's robot and service: lives and what each has counted by now."""
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             self._count(connection, record, counted)
 
     def _count(self, connection: Connection, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
@@ -334,7 +382,7 @@ class Store:
 
     def accounts(self) -> dict[tuple[str, str], Account]:
         """What is known, by robot and service."""
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return {(row.robot, row.service): Account(row.account) for row in connection.execute(select(accounts))}
 
     def extend_leases(self, now: float) -> None:
@@ -344,13 +392,13 @@ class Store:
         """
         full = now + instances.c.lease_s
         statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.spare.is_(False))
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))
 
     def events(self, instance: str, after: int) -> list[EventRow]:
         """An instance's events with higher ids, in order."""
         query = select(events).where(events.c.instance == instance, events.c.id > after).order_by(events.c.id)
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             rows = connection.execute(query).all()
         return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason) for row in rows]
 
@@ -361,7 +409,7 @@ class Store:
             Forgotten instances with their sites.
         """
         ended = select(instances.c.id, instances.c.site, instances.c.updated_at).where(instances.c.state.in_(_FINAL))
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             rows = connection.execute(ended.order_by(instances.c.updated_at.desc())).all()
             gone = [(r.id, r.site) for i, r in enumerate(rows) if i >= ended_count or r.updated_at < now - ended_age]
             connection.execute(delete(instances).where(instances.c.id.in_([i for i, _ in gone])))
@@ -374,7 +422,7 @@ class Store:
     def _look(self, *conditions: ColumnElement[bool]) -> list[Record]:
         """Oldest first. Of those that have not changed since they were seen last, only the version is read."""
         newest = select(instances.c.id, instances.c.version).where(*conditions)
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             rows = connection.execute(newest.order_by(instances.c.created_at, instances.c.id)).all()
             found = {id_: self._seen.get(id_) for id_, _ in rows}
             changed = [id_ for id_, version in rows if (seen := found[id_]) is None or seen.version != version]
@@ -387,29 +435,29 @@ class Store:
         return [record for record in found.values() if record is not None]
 
     def _records(self, query: Any) -> list[Record]:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return [_record(row) for row in connection.execute(query).mappings()]
 
     # Catalogue
 
     def services(self) -> dict[str, dict[str, Any]]:
         """Manifests that were put, by name."""
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return {row.name: row.manifest for row in connection.execute(select(services))}
 
     def put_service(self, name: str, manifest: dict[str, Any]) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(delete(services).where(services.c.name == name))
             connection.execute(insert(services).values(name=name, manifest=manifest))
 
     def delete_service(self, name: str) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(delete(services).where(services.c.name == name))
 
     # Sites
 
     def sites(self) -> list[SiteCreate]:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             rows = connection.execute(select(sites).order_by(sites.c.name)).mappings()
             return [SiteCreate.model_validate(dict(row)) for row in rows]
 
@@ -418,17 +466,17 @@ class Store:
         return self._insert(sites, site.model_dump())
 
     def delete_site(self, name: str) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(delete(sites).where(sites.c.name == name))
 
     # Robots
 
     def robots(self) -> list[RobotRow]:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return [_robot(row) for row in connection.execute(select(robots).order_by(robots.c.name))]
 
     def robot(self, name: str) -> RobotRow | None:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             row = connection.execute(select(robots).where(robots.c.name == name)).one_or_none()
         return _robot(row) if row else None
 
@@ -436,7 +484,7 @@ class Store:
         """With its first token; False if there is one of that name."""
         row = {"name": robot.name, "services": list(robot.services), "created_at": robot.created_at}
         try:
-            with self._writer.begin() as connection:
+            with self._writing() as connection:
                 connection.execute(insert(robots).values(**row))
                 connection.execute(insert(tokens).values(**_token_values(token)))
         except IntegrityError:
@@ -444,28 +492,33 @@ class Store:
         return True
 
     def delete_robot(self, name: str) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(delete(robots).where(robots.c.name == name))
 
     def seen(self, robot: str, now: float) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
 
     # Tokens
 
     def tokens(self) -> list[TokenRow]:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             return [_token(row) for row in connection.execute(select(tokens).order_by(tokens.c.created_at))]
 
     def token(self, id_: str) -> TokenRow | None:
-        with self._engine.connect() as connection:
+        with self._reader.connect() as connection:
             row = connection.execute(select(tokens).where(tokens.c.id == id_)).one_or_none()
         return _token(row) if row else None
 
-    def tokens_by_prefix(self, prefix: str) -> Sequence[TokenRow]:
-        """Those that begin so; at most one but for a freak of chance."""
-        with self._engine.connect() as connection:
-            return [_token(row) for row in connection.execute(select(tokens).where(tokens.c.prefix == prefix))]
+    def holders(self, prefix: str) -> list[tuple[TokenRow, RobotRow | None]]:
+        """Tokens that begin so, at most one but for a freak of chance, each with the robot whose it is."""
+        with self._reader.connect() as connection:
+            rows = connection.execute(_HOLDERS, {"prefix": prefix}).all()
+        robots_ = (
+            RobotRow(row.robot, tuple(row.may_use), row.registered_at, row.last_seen_at) if row.robot else None
+            for row in rows
+        )
+        return [(_token(row), robot) for row, robot in zip(rows, robots_, strict=True)]
 
     def add_token(self, token: TokenRow) -> bool:
         """False if its robot is gone."""
@@ -473,16 +526,16 @@ class Store:
 
     def change_token(self, id_: str, **values: float | None) -> None:
         """Set when it expires, or when it was last used."""
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(update(tokens).where(tokens.c.id == id_).values(**values))
 
     def delete_token(self, id_: str) -> None:
-        with self._writer.begin() as connection:
+        with self._writing() as connection:
             connection.execute(delete(tokens).where(tokens.c.id == id_))
 
     def _insert(self, table: Any, values: dict[str, Any]) -> bool:
         try:
-            with self._writer.begin() as connection:
+            with self._writing() as connection:
                 connection.execute(insert(table).values(**values))
         except IntegrityError:
             return False

@@ -1,39 +1,59 @@
-"""An orchestrator with many instances: its answers, its reconcile passes, its memory.
+"""An orchestrator with many robots: its answers, its reconcile passes, its memory.
 
-Everything is real: the orchestrator as a program, each instance a sleeping process, requests over HTTP. Requests are
-due at fixed times, whether or not those before were answered, and are timed from when they were due.
+Everything is real: the orchestrator as a program, each instance a sleeping process, requests over HTTP with the robots'
+own tokens. Requests are due at random times (Poisson), whether or not those before were answered, and are timed from
+when they were due until all of the answer was read. The same client asks for ``/healthz`` first, which costs the
+orchestrator next to nothing: what it, the machine's network and HTTP take by themselves.
 """
 
 from __future__ import annotations
 
 import re
-import threading
 import time
+from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import TypeVar
 
-import httpx
 import numpy as np
 import psutil
 
 from skytether.api.client import Client
-from skytether.api.rest import InstanceCreate, SiteCreate, State
+from skytether.api.grant import GRANT_VARIABLE
+from skytether.api.rest import InstanceCreate, RobotCreate, SiteCreate, State
 from skytether.lab.embedded import EmbeddedOrchestrator
 
+from .open_loop import Answered, ask_openly
 from .pair import BenchError
+from .requests import MANIFEST, SERVICE, Held, Mix, healthz
 
-SERVICE = "sleeper"
-_MANIFEST = {
-    "apiVersion": "skytether.io/v1",
-    "kind": "Service",
-    "metadata": {"name": SERVICE},
-    "spec": {"entrypoint": "skytether.testing.toy_service", "needs": {"cpu": 0.001, "memory_mb": 1}},
-}
 _START_LIMIT_S = 600.0
 _LEASE_S = 3600.0
-_THREADS = 32
-"""Requests under way at most; one that waits for a thread is late, and counts as such."""
+_FLOOR_S = 5.0
+"""For how long ``/healthz`` is asked for, at most."""
+_SETTLE_S = 2.0
+"""After the last start, and after the last request for what is being let go."""
+_SEED = 20
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Times in milliseconds."""
+
+    n: int
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+    @classmethod
+    def of(cls, seconds: list[float]) -> Spread:
+        """Of at least one time."""
+        p50, p99, most = np.percentile(seconds, [50, 99, 100], method="inverted_cdf") * 1e3
+        return cls(len(seconds), round(float(p50), 2), round(float(p99), 2), round(float(most), 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +62,22 @@ class ApiRow:
 
     Attributes:
         instances: That run meanwhile.
-        rate_hz: Requests a second: renewals, looks at one, creations and ends.
+        rate_hz: Requests a second.
         requests: Made.
         failed: Of these, those without a good answer.
         api_p50_ms: Median time from due to answered.
         api_p99_ms: 99th percentile.
-        pass_p50_ms: Median reconcile pass over the site.
-        pass_max_ms: Bound of the histogram's bucket that holds the slowest.
-        memory_mb: The orchestrator's resident memory.
-        lost: Instances that do not run any more, or were never started, or run twice.
+        api_max_ms: The slowest.
+        kinds: The same by kind of request.
+        client_p50_ms: Median time of ``/healthz``, asked in the same way: the client's own share.
+        client_p99_ms: 99th percentile of that.
+        pass_p50_ms: Median reconcile pass over the site, while requests came.
+        pass_max_ms: The slowest.
+        placer_max_ms: Slowest pass of the placer, which looks at all instances.
+        cpu_idle: Cores that the orchestrator kept busy before the requests.
+        cpu: The same while they came.
+        memory_mb: The most memory that the orchestrator had resident.
+        lost: Instances that do not run any more, or run twice.
         start_s: From the first request to the last instance running.
     """
 
@@ -60,8 +87,15 @@ class ApiRow:
     failed: int
     api_p50_ms: float
     api_p99_ms: float
+    api_max_ms: float
+    kinds: dict[str, Spread]
+    client_p50_ms: float
+    client_p99_ms: float
     pass_p50_ms: float
     pass_max_ms: float
+    placer_max_ms: float
+    cpu_idle: float
+    cpu: float
     memory_mb: float
     lost: int
     start_s: float
@@ -79,105 +113,110 @@ def bench_api(
     Raises:
         BenchError: Not all of them ran in time.
     """
-    with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
-        operator.put_service(SERVICE, _MANIFEST)
+    rng = np.random.default_rng(_SEED)
+    with (
+        EmbeddedOrchestrator(environment={"SKYTETHER_LOGS_LEVEL": "debug"}) as orchestrator,
+        Client(orchestrator.url, orchestrator.operator_token, timeout=30) as operator,
+    ):
+        operator.put_service(SERVICE, MANIFEST)
         operator.create_site(SiteCreate(name="fleet", tier="edge", runtime="process", options={"cpu": instances}))
         operator.delete_site("local")
+        tokens = [operator.create_robot(RobotCreate(name=f"robot-{i}")).token for i in range(instances)]
         began = time.monotonic()
-        held = _start(operator, instances, on_progress)
+        held = _start(operator, tokens, on_progress)
         start_s = time.monotonic() - began
-        before = _passes(operator)
+        cpu_idle = _busy(orchestrator.pid, lambda: time.sleep(_SETTLE_S))[0]
+        on_progress("the client by itself")
+        floor = ask_openly(orchestrator.url, healthz, rate_hz, min(seconds, _FLOOR_S), rng)
         on_progress(f"{rate_hz:g} requests a second for {seconds:g} s")
-        took, failed = _ask(orchestrator, held, rate_hz, seconds)
-        after = _passes(operator)
-        memory = max(_memory(orchestrator.pid), 0)
-        alive = [i.id for i in operator.instances() if i.state is State.RUNNING]
-        lost = len(set(held) ^ (set(alive) & set(held))) + len(alive) - len(set(alive))
-    p50, p99 = np.percentile(took, [50, 99], method="inverted_cdf")
-    pass_p50, pass_max = _spread(before, after)
+        mix = Mix(held, orchestrator.operator_token, rng)
+        written = len(orchestrator.log)
+        cpu, answers = _busy(orchestrator.pid, lambda: ask_openly(orchestrator.url, mix.next, rate_hz, seconds, rng))
+        passes = passes_in(orchestrator.log[written:])
+        time.sleep(_SETTLE_S)
+        lost = _lost(operator, [one.instance for one in held])
+        memory = _peak_mb(orchestrator.pid)
+    site, placer = passes.get("site-fleet"), passes.get("placer")
+    if not site or not placer:
+        raise BenchError("the reconciler made no pass")
+    every, client = Spread.of([one.seconds for one in answers]), Spread.of([one.seconds for one in floor])
     return ApiRow(
-        instances,
-        rate_hz,
-        len(took),
-        failed,
-        round(float(p50) * 1e3, 2),
-        round(float(p99) * 1e3, 2),
-        pass_p50 * 1e3,
-        pass_max * 1e3,
-        round(memory / 2**20, 1),
-        lost,
-        round(start_s, 1),
+        instances=instances,
+        rate_hz=rate_hz,
+        requests=len(answers),
+        failed=sum(not one.good for one in answers),
+        api_p50_ms=every.p50_ms,
+        api_p99_ms=every.p99_ms,
+        api_max_ms=every.max_ms,
+        kinds=_by_kind(answers),
+        client_p50_ms=client.p50_ms,
+        client_p99_ms=client.p99_ms,
+        pass_p50_ms=round(median(site), 2),
+        pass_max_ms=max(site),
+        placer_max_ms=max(placer),
+        cpu_idle=round(cpu_idle, 3),
+        cpu=round(cpu, 3),
+        memory_mb=round(memory, 1),
+        lost=lost,
+        start_s=round(start_s, 1),
     )
 
 
-def _start(operator: Client, n: int, on_progress: Callable[[str], None]) -> list[str]:
-    held = [
-        operator.create_instance(InstanceCreate(robot=f"robot-{i}", service=SERVICE, lease_s=_LEASE_S)).id
-        for i in range(n)
-    ]
+def _start(operator: Client, tokens: list[str], on_progress: Callable[[str], None]) -> list[Held]:
+    held = []
+    for i, token in enumerate(tokens):
+        asked = InstanceCreate(robot=f"robot-{i}", service=SERVICE, lease_s=_LEASE_S)
+        held.append(Held(f"robot-{i}", token, operator.create_instance(asked).id))
     deadline = time.monotonic() + _START_LIMIT_S
-    while (up := sum(i.state is State.RUNNING for i in operator.instances())) < n:
+    while (up := sum(i.state is State.RUNNING for i in operator.instances())) < len(held):
         if time.monotonic() > deadline:
-            raise BenchError(f"only {up} of {n} instances ran within {_START_LIMIT_S:.0f} s")
-        on_progress(f"{up} of {n} instances run")
+            raise BenchError(f"only {up} of {len(held)} instances ran within {_START_LIMIT_S:.0f} s")
+        on_progress(f"{up} of {len(held)} instances run")
         time.sleep(0.5)
     return held
 
 
-def _ask(orchestrator: EmbeddedOrchestrator, held: list[str], rate: float, seconds: float) -> tuple[list[float], int]:
-    """Renewals mostly, as robots do; looks; and now and then a new instance, which is let go at once."""
-    took: list[float] = []
-    failures: list[int] = []
-    lock = threading.Lock()
-    headers = {"Authorization": f"Bearer {orchestrator.operator_token}"}
-    limits = httpx.Limits(max_connections=_THREADS, max_keepalive_connections=_THREADS)
-    http = httpx.Client(
-        base_url=f"{orchestrator.url}/api/v1", headers=headers, limits=limits, timeout=30, trust_env=False
-    )
-
-    def one(number: int, due: float) -> None:
-        instance = held[number % len(held)]
-        if number % 50 == 49:
-            body = {"robot": "passer-by", "service": SERVICE, "lease_s": 60}
-            answer = http.post("/instances", json=body)
-            if answer.is_success:
-                http.delete(f"/instances/{answer.json()['id']}")
-        elif number % 5 == 4:
-            answer = http.get(f"/instances/{instance}")
-        else:
-            answer = http.post(f"/instances/{instance}/renew", json={"report": {"rtt_s": 0.01}})
-        with lock:
-            took.append(time.monotonic() - due)
-            failures.append(not answer.is_success)
-
-    with http, ThreadPoolExecutor(_THREADS) as pool:
-        start = time.monotonic()
-        for number in range(round(rate * seconds)):
-            due = start + number / rate
-            time.sleep(max(0.0, due - time.monotonic()))
-            pool.submit(one, number, due)
-    if not took:
-        raise BenchError("no request was answered")
-    return took, sum(failures)
+def _by_kind(answers: list[Answered]) -> dict[str, Spread]:
+    kinds: dict[str, list[float]] = {}
+    for one in answers:
+        kinds.setdefault(one.kind, []).append(one.seconds)
+    return {kind: Spread.of(seconds) for kind, seconds in sorted(kinds.items())}
 
 
-def _memory(pid: int) -> int:
-    return int(psutil.Process(pid).memory_info().rss)
+def _busy(pid: int, act: Callable[[], T]) -> tuple[float, T]:
+    """How many cores a process kept busy meanwhile."""
+    before, began = sum(psutil.Process(pid).cpu_times()[:2]), time.monotonic()
+    result = act()
+    return (sum(psutil.Process(pid).cpu_times()[:2]) - before) / (time.monotonic() - began), result
 
 
-_BUCKET = re.compile(r'^skytether_reconcile_pass_seconds_bucket\{le="([^"]+)",site="fleet"\} (\S+)$', re.MULTILINE)
+def _peak_mb(pid: int) -> float:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-def _passes(operator: Client) -> dict[float, float]:
-    """Passes so far that took at most so many seconds."""
-    return {float(bound): float(count) for bound, count in _BUCKET.findall(operator.metrics())}
+def _lost(operator: Client, held: list[str]) -> int:
+    """Instances that are not running, as the orchestrator says, in exactly one process, as the kernel says."""
+    running = {one.id for one in operator.instances() if one.state is State.RUNNING}
+    processes = Counter(_instance_of(process) for process in psutil.process_iter())
+    return sum(one not in running or processes[one] != 1 for one in held)
 
 
-def _spread(before: dict[float, float], after: dict[float, float]) -> tuple[float, float]:
-    """Bounds of the buckets that hold the median and the slowest of the passes in between."""
-    counts = {bound: count - before.get(bound, 0.0) for bound, count in sorted(after.items())}
-    total = max(counts.values(), default=0.0)
-    if not total:
-        raise BenchError("the reconciler made no pass")
-    median = next(bound for bound, count in counts.items() if count >= total / 2)
-    return median, next(bound for bound, count in counts.items() if count >= total)
+def _instance_of(process: psutil.Process) -> str | None:
+    """Whose process this is, by its grant's path; None: no instance's."""
+    try:
+        grant = process.environ().get(GRANT_VARIABLE)
+    except psutil.Error:
+        return None
+    return Path(grant).parent.name if grant else None
+
+
+_PASS = re.compile(r"(\S+): pass of (\S+) ms$", re.MULTILINE)
+
+
+def passes_in(log: str) -> dict[str, list[float]]:
+    """How long the passes took that an orchestrator's log tells of, in milliseconds, by the loop's name."""
+    passes: dict[str, list[float]] = {}
+    for name, took in _PASS.findall(log):
+        passes.setdefault(name, []).append(float(took))
+    return passes

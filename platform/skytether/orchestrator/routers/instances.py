@@ -55,9 +55,9 @@ Own = Annotated[Record, Depends(_own)]
 
 
 @router.get("/{instance}", responses=says(404))
-def get(core: Core, record: Own) -> Instance:
+def get(core: Core, caller: Caller, instance: str) -> Instance:
     """One instance with its session."""
-    return core.instances.show(record)
+    return core.instances.show(core.instances.get(caller, instance))
 
 
 @router.delete("/{instance}", status_code=204, responses=says(404))
