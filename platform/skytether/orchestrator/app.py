@@ -8,6 +8,7 @@ import skytether
 
 from . import problems
 from .core import Orchestrator
+from .crowd import Crowd
 from .logs import Audit
 from .routers import catalog, health, instances, robots, sites, tokens
 from .routers.deps import plain_request
@@ -25,5 +26,6 @@ def create_app(core: Orchestrator) -> FastAPI:
     problems.install(app, core.settings.limits.body_bytes)
     for router in (catalog.router, sites.router, instances.router, robots.router, tokens.router, health.router):
         app.include_router(router)
+    app.add_middleware(Crowd, most=core.settings.limits.requests_at_once)
     app.add_middleware(Audit)
     return app

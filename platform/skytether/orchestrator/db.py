@@ -6,11 +6,12 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as NoConnectionError
 
 from .discovery import NAME
 
-GONE = (OperationalError, InterfaceError)
-"""What the drivers raise when the database does not answer (or, SQLite, its disk is full)."""
+GONE = (OperationalError, InterfaceError, NoConnectionError)
+"""What is raised when the database does not answer (or, SQLite, its disk is full), or all connections wait for it."""
 
 _LOCK_MS = 120_000
 """How long a migration waits for a table, or for another migration."""

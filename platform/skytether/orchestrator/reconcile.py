@@ -97,7 +97,10 @@ class Reconciler:
             return delay
         except GONE as error:
             if not self._database_gone:
-                log.error("the database does not answer, trying again: %s", str(error.orig).splitlines()[0])
+                log.error(
+                    "the database does not answer, trying again: %s",
+                    str(getattr(error, "orig", None) or error).splitlines()[0],
+                )
             self._database_gone = True
             return self._timing.place
 

@@ -7,6 +7,7 @@ import gc
 import ipaddress
 import logging
 import os
+import resource
 import signal
 import socket
 import ssl
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 _DRAIN = 5
 """Whole seconds that requests under way get at shutdown."""
 _BACKLOG = 512
+_FILES = 16_384
+"""Open files, connections among them; beyond that nobody could be served in time."""
 _SWITCH = 0.001
 """Seconds that one thread computes while others wait. An answer passes through several threads, each of which waits so
 long for a reconcile pass that is under way: at Python's own 5 ms that adds up."""
@@ -63,6 +66,7 @@ def run(settings: Settings) -> None:
         logs.set_up(settings.logs)
     except OSError as error:
         raise StartError(f"cannot write {settings.logs.audit_file}: {error.strerror}", usage=True) from error
+    _allow_connections()
     with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
         try:
             core = Orchestrator(settings)
@@ -72,6 +76,14 @@ def run(settings: Settings) -> None:
             text = str(error).splitlines()[0]
             raise StartError(f"the database address cannot be used: {text}", usage=True) from error
         _serve(core, listener)
+
+
+def _allow_connections() -> None:
+    """As many as the system lets this program have: a thousand robots may come at once."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    enough = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    if resource.RLIM_INFINITY != soft < enough:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (enough, hard))
 
 
 def _serve(core: Orchestrator, listener: socket.socket) -> None:

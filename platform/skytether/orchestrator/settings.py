@@ -85,6 +85,8 @@ class Limits(Group):
     """Requests that one robot's token may make, and one address without a valid token; an operator's are free."""
     requests_burst: Count = 200
     """Requests at once above which that rate holds."""
+    requests_at_once: Count = 256
+    """Requests under way, of all callers; whoever comes beyond gets 503 and `Retry-After`, as robots take it."""
     ended_age: Seconds = 86_400.0
     """How long ended instances, their logs and idempotency keys are kept."""
     ended_count: Count = 200
