@@ -190,9 +190,9 @@ class Orchestrator:
     def stop(self) -> None:
         """Stop reconciling; with ``stop_instances`` end all instances first, otherwise they run on."""
         self.broker.close()
+        self.placer.stop(timeout=1.0)  # first: each instance that ends would have it look for a place for all that wait
         if self.settings.stop_instances:
             self._stop_instances()
-        self.placer.stop(timeout=1.0)
         self.sites.stop()
         self.elector.stop(timeout=1.0)
         self.leadership.end()
