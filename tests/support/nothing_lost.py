@@ -81,7 +81,7 @@ def _containers(site: DockerSite, *statuses: str) -> dict[str, list[str]]:
 
 
 def assert_nothing_lost(
-    states: Told, expected: Mapping[str, State], *places: Runs, left: Litter = list, patience: float = PATIENCE
+    states: Told, expected: Mapping[str, State], *places: Runs, left: Litter = list, patience: float = 2 * PATIENCE
 ) -> dict[str, list[str]]:
     """Wait until every instance is as it should be, and all that runs is somebody's; two runs of one fail at once.
 
