@@ -41,6 +41,11 @@ def engine(docker_images: Images, netns: None) -> Iterator[OwnEngine]:
 
 @pytest.fixture
 def site(engine: OwnEngine, docker_images: Images) -> Iterator[DockerSite]:
+    # An orchestrator that a test before killed may have been closing the network off: the next one to do so removes
+    # what it left, but a minute later at the earliest.
+    guards = engine.docker("ps", "-aq", "--filter", "label=skytether.io/guard").split()
+    if guards:
+        engine.docker("rm", "-f", *guards)
     site = DockerSite(docker_images, engine.address)
     yield site
     site.close()
