@@ -55,11 +55,11 @@ def test_a_refused_token_is_read_again_from_where_it_came(base, monkeypatch):
     agent = Agent(replace(CONFIG, fresh_token=lambda: tokens.pop(0)), base, clock=lambda: 50.0)
     sent = []
 
-    def refuse(method, path, **options):
-        sent.append(agent._own_client._http.headers["Authorization"])
+    def refuse(request, **options):
+        sent.append(request.headers["Authorization"])
         raise ApiError(Problem(title="no", status=401, detail="the token has expired"))
 
-    monkeypatch.setattr(agent._own_client._http, "request", refuse)
+    monkeypatch.setattr(agent._own_client._http, "send", refuse)
     assert agent._asker.step() == 10.0, "the file holds the same"
     assert agent._asker.step() < 1.0
     monkeypatch.setattr(agent, "_config", replace(CONFIG, fresh_token=lambda: "new"))

@@ -25,12 +25,13 @@ from .runtimes.base import Capacity, Observation
 _REASON = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _MAX_REASONS = 32
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0, 30.0)
-_USED = {
+USED = {
     "instance_cpu_seconds": Described("Processor time", ("site",)),
     "instance_network_receive_bytes": Described("By the network", ("site",)),
     "instance_network_transmit_bytes": Described("By the network", ("site",)),
     "instance_restarts": Described("Runs that ended by themselves and were begun anew", ("site",)),
 }
+"""What is counted of instances."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,12 +160,12 @@ class Metrics(Collector):
             places.add((*owner, one.record.site or ""))
         sums = [(owner, account.sums()) for owner, account in counted.items()]
         used = [
-            (owner, {key: n for key, n in counts.items() if key[0] in _USED and (*owner, key[1]) in places})
+            (owner, {key: n for key, n in counts.items() if key[0] in USED and (*owner, key[1]) in places})
             for owner, counts in sums
         ]
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
-        yield from counters_of(used, _USED)
+        yield from counters_of(used, USED)
         yield from _sites(self._sites(), running)
         yield from counters_of(sums)
         yield from gauges_of([((r.robot, r.service, r.site or ""), report) for r, report in reports])
