@@ -97,6 +97,7 @@ def test_what_ended_instances_left_goes_with_their_site(start: Start) -> None:
 
     core = start(find=lambda _: Tidy)
     core.sites.add(SiteCreate(name="mine", tier="cloud", runtime="tidy"))
+    core.sites.delete("local")
     core.sites.get("mine").loop.stop(5)  # the reconciler knows no such instance, and would remove it too
     did.clear()
     core.sites.delete("mine")

@@ -10,12 +10,13 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from skytether.api.rest import SiteCreate, State
+from skytether.orchestrator.database import RobotRow, TokenRow
 from skytether.orchestrator.db import make_engine, migrate
 from skytether.orchestrator.models import metadata
 from skytether.orchestrator.moves import FOREVER
 from skytether.orchestrator.records import IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
-from skytether.orchestrator.store import KeyReusedError, RobotRow, Store, TokenRow, Told
+from skytether.orchestrator.store import KeyReusedError, Store, Told
 
 NewRecord = Callable[..., Record]
 NOW = 1_700_000_000.0

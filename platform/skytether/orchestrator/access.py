@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 
 from skytether.api.rest import SCOPES, Scope
 
+from .database import RobotRow, TokenRow
 from .errors import (
     ConflictError,
     Fault,
@@ -24,7 +25,7 @@ from .errors import (
     UnauthenticatedError,
 )
 from .security import PREFIX_LENGTH, Secrets, TokenHash, new_token
-from .store import RobotRow, Store, TokenRow
+from .store import Store
 from .throttle import Throttle
 
 ANY_SERVICE = "*"

@@ -1,4 +1,4 @@
-"""What outlives the orchestrator: all reading and writing of the database.
+"""Instances in the database, their events, reports and sums.
 
 Changes of instances are compare-and-set on the record's version: load, work outside any transaction, apply; who has not
 seen the last change gets None and looks again. Each change of state or reason leaves an event.
@@ -7,16 +7,13 @@ seen the last change gets None and looks again. Each change of state or reason l
 from __future__ import annotations
 
 import dataclasses
-import threading
-from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
     Connection,
-    Row,
     RowMapping,
     bindparam,
     delete,
@@ -30,15 +27,13 @@ from sqlalchemy import (
 from sqlalchemy.exc import IntegrityError
 
 from skytether.api.report_metrics import Counts
-from skytether.api.rest import Scope, SiteCreate, State
+from skytether.api.rest import State
 
 from .accounts import Account
-from .db import SQLITE_PATIENCE, make_engine, migrate, reading
+from .database import Database
 from .discovery import NAME
-from .leader import Lock, lock_of
-from .models import accounts, events, facts, idempotency, instances, reports, robots, services, sites, tokens
+from .models import accounts, events, idempotency, instances, reports
 from .records import Record, check_move
-from .security import TokenHash
 
 _FINAL = [state for state in State if state.final]
 _REASON_LENGTH = 1024
@@ -60,33 +55,6 @@ class EventRow:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotRow:
-    """A registered robot."""
-
-    name: str
-    services: tuple[str, ...]
-    created_at: float
-    last_seen_at: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class TokenRow:
-    """What is kept of a token, of a robot or of an operator."""
-
-    id: str
-    name: str
-    """For people; of a robot's first token: the robot's."""
-    robot: str | None
-    """None: an operator's."""
-    scopes: tuple[Scope, ...]
-    """What an operator's may do; a robot's has none, for what it may is the robot's."""
-    hash: TokenHash
-    created_at: float
-    expires_at: float | None = None
-    last_used_at: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Told:
     """What a robot told of an instance."""
 
@@ -103,13 +71,6 @@ _SUCCESSOR = (
     .order_by(instances.c.created_at.desc())
     .limit(1)
 )
-_HOLDERS = (
-    select(
-        tokens, robots.c.services.label("may_use"), robots.c.created_at.label("registered_at"), robots.c.last_seen_at
-    )
-    .outerjoin(robots, tokens.c.robot == robots.c.name)
-    .where(tokens.c.prefix == bindparam("prefix"))
-)
 """Made once: what every request asks."""
 
 
@@ -117,71 +78,15 @@ class KeyReusedError(Exception):
     """An idempotency key came again with another body."""
 
 
-class Store:
-    """The database. Safe from any thread."""
+class Store(Database):
+    """The database with its instances. Safe from any thread."""
 
     def __init__(self, url: str, name: str = NAME) -> None:
         """``name`` is what a database server lists its connections under."""
-        self._engine = make_engine(url, name)
-        self._reader = reading(self._engine)
-        self._writer = self._engine.execution_options(immediate=True)
-        self._turn = threading.Lock()
+        super().__init__(url, name)
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
-        self._schema = ""
         self._seen: dict[str, Record] = {}
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        """A transaction that changes something.
-
-        SQLite has one writer at a time, and lets the others ask again and again after growing pauses, in no order: here
-        they queue. One that waits for another program's lock does not keep the queue for longer than that may take.
-        """
-        turn = self._engine.dialect.name == "sqlite" and self._turn.acquire(timeout=SQLITE_PATIENCE)
-        try:
-            with self._writer.begin() as connection:
-                yield connection
-        finally:
-            if turn:
-                self._turn.release()
-
-    def migrate(self) -> None:
-        """Bring the database to the schema of this code."""
-        self._schema = migrate(self._engine)
-
-    def outdated(self) -> bool:
-        """Whether a newer orchestrator has brought the database to a schema that this one does not know."""
-        with self._engine.connect() as connection:
-            return bool(connection.scalar(text("SELECT version_num FROM alembic_version")) != self._schema)
-
-    def lock(self) -> Lock:
-        """The lock of whoever leads over this database."""
-        return lock_of(self._engine)
-
-    def names(self) -> list[str]:
-        """Of all connections to this database by this user, whoever's; none with SQLite, which has no server."""
-        if self._engine.dialect.name != "postgresql":
-            return []
-        ours = "datname = current_database() AND usename = current_user"
-        with self._reader.connect() as connection:
-            asked = connection.scalars(text(f"SELECT DISTINCT application_name FROM pg_stat_activity WHERE {ours}"))  # noqa: S608
-            return [name for name in asked if name]
-
-    def agree(self, name: str, value: str) -> bool:
-        """Note a fact at first, and from then on say whether it is still the same."""
-        if self._insert(facts, {"name": name, "value": value}):
-            return True
-        with self._reader.connect() as connection:
-            return connection.scalar(select(facts.c.value).where(facts.c.name == name)) == value
-
-    def close(self) -> None:
-        self._engine.dispose()
-
-    def ping(self) -> None:
-        """Raise what the database raises, if it does not answer."""
-        with self._reader.connect() as connection:
-            connection.execute(text("SELECT 1"))
 
     # Instances
 
@@ -438,109 +343,6 @@ class Store:
         with self._reader.connect() as connection:
             return [_record(row) for row in connection.execute(query).mappings()]
 
-    # Catalogue
-
-    def services(self) -> dict[str, dict[str, Any]]:
-        """Manifests that were put, by name."""
-        with self._reader.connect() as connection:
-            return {row.name: row.manifest for row in connection.execute(select(services))}
-
-    def put_service(self, name: str, manifest: dict[str, Any]) -> None:
-        with self._writing() as connection:
-            connection.execute(delete(services).where(services.c.name == name))
-            connection.execute(insert(services).values(name=name, manifest=manifest))
-
-    def delete_service(self, name: str) -> None:
-        with self._writing() as connection:
-            connection.execute(delete(services).where(services.c.name == name))
-
-    # Sites
-
-    def sites(self) -> list[SiteCreate]:
-        with self._reader.connect() as connection:
-            rows = connection.execute(select(sites).order_by(sites.c.name)).mappings()
-            return [SiteCreate.model_validate(dict(row)) for row in rows]
-
-    def add_site(self, site: SiteCreate) -> bool:
-        """False if there is one of that name."""
-        return self._insert(sites, site.model_dump())
-
-    def delete_site(self, name: str) -> None:
-        with self._writing() as connection:
-            connection.execute(delete(sites).where(sites.c.name == name))
-
-    # Robots
-
-    def robots(self) -> list[RobotRow]:
-        with self._reader.connect() as connection:
-            return [_robot(row) for row in connection.execute(select(robots).order_by(robots.c.name))]
-
-    def robot(self, name: str) -> RobotRow | None:
-        with self._reader.connect() as connection:
-            row = connection.execute(select(robots).where(robots.c.name == name)).one_or_none()
-        return _robot(row) if row else None
-
-    def add_robot(self, robot: RobotRow, token: TokenRow) -> bool:
-        """With its first token; False if there is one of that name."""
-        row = {"name": robot.name, "services": list(robot.services), "created_at": robot.created_at}
-        try:
-            with self._writing() as connection:
-                connection.execute(insert(robots).values(**row))
-                connection.execute(insert(tokens).values(**_token_values(token)))
-        except IntegrityError:
-            return False
-        return True
-
-    def delete_robot(self, name: str) -> None:
-        with self._writing() as connection:
-            connection.execute(delete(robots).where(robots.c.name == name))
-
-    def seen(self, robot: str, now: float) -> None:
-        with self._writing() as connection:
-            connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
-
-    # Tokens
-
-    def tokens(self) -> list[TokenRow]:
-        with self._reader.connect() as connection:
-            return [_token(row) for row in connection.execute(select(tokens).order_by(tokens.c.created_at))]
-
-    def token(self, id_: str) -> TokenRow | None:
-        with self._reader.connect() as connection:
-            row = connection.execute(select(tokens).where(tokens.c.id == id_)).one_or_none()
-        return _token(row) if row else None
-
-    def holders(self, prefix: str) -> list[tuple[TokenRow, RobotRow | None]]:
-        """Tokens that begin so, at most one but for a freak of chance, each with the robot whose it is."""
-        with self._reader.connect() as connection:
-            rows = connection.execute(_HOLDERS, {"prefix": prefix}).all()
-        robots_ = (
-            RobotRow(row.robot, tuple(row.may_use), row.registered_at, row.last_seen_at) if row.robot else None
-            for row in rows
-        )
-        return [(_token(row), robot) for row, robot in zip(rows, robots_, strict=True)]
-
-    def add_token(self, token: TokenRow) -> bool:
-        """False if its robot is gone."""
-        return self._insert(tokens, _token_values(token))
-
-    def change_token(self, id_: str, **values: float | None) -> None:
-        """Set when it expires, or when it was last used."""
-        with self._writing() as connection:
-            connection.execute(update(tokens).where(tokens.c.id == id_).values(**values))
-
-    def delete_token(self, id_: str) -> None:
-        with self._writing() as connection:
-            connection.execute(delete(tokens).where(tokens.c.id == id_))
-
-    def _insert(self, table: Any, values: dict[str, Any]) -> bool:
-        try:
-            with self._writing() as connection:
-                connection.execute(insert(table).values(**values))
-        except IntegrityError:
-            return False
-        return True
-
 
 def _values(record: Record) -> dict[str, Any]:
     return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
@@ -551,22 +353,6 @@ _COLUMNS = [field.name for field in dataclasses.fields(Record)]
 
 def _record(row: RowMapping) -> Record:
     return Record(**{name: row[name] for name in _COLUMNS})
-
-
-def _robot(row: Row[Any]) -> RobotRow:
-    return RobotRow(row.name, tuple(row.services), row.created_at, row.last_seen_at)
-
-
-def _token(row: Row[Any]) -> TokenRow:
-    kept = TokenHash(row.prefix, row.sha256)
-    times = row.created_at, row.expires_at, row.last_used_at
-    return TokenRow(row.id, row.name, row.robot, tuple(row.scopes), kept, *times)
-
-
-def _token_values(token: TokenRow) -> dict[str, Any]:
-    plain = {"id": token.id, "name": token.name, "robot": token.robot, "scopes": list(token.scopes)}
-    times = {"created_at": token.created_at, "expires_at": token.expires_at}
-    return {**plain, **times, "prefix": token.hash.prefix, "sha256": token.hash.digest}
 
 
 def _add_event(connection: Connection, record: Record) -> None:

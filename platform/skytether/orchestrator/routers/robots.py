@@ -6,8 +6,8 @@ from fastapi import APIRouter, Response
 
 from skytether.api.rest import Robot, RobotCreate, RobotCreated
 
+from ..database import RobotRow
 from ..instances import utc
-from ..store import RobotRow
 from .deps import PREFIX, Core, Reader, RobotsOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))

@@ -6,8 +6,8 @@ from fastapi import APIRouter, Response
 
 from skytether.api.rest import Token, TokenCreate, TokenCreated, TokenRotate
 
+from ..database import TokenRow
 from ..instances import utc
-from ..store import TokenRow
 from .deps import PREFIX, Authenticated, Core, Reader, TokensOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/tokens", tags=["tokens"], responses=says(401, 403, 429))
