@@ -85,6 +85,11 @@ ROWS: dict[str, dict[str, Any]] = {
     "idempotency": {"owner": "robot:walker", "key": "k", "body_sha256": "0" * 64, "instance": "i1", "created_at": NOW},
     "reports": {"instance": "i1", "at": NOW, "report": {"rtt_s": 0.02}},
     "facts": {"name": "secret.key", "value": "f"},
+    "accounts": {
+        "robot": "walker",
+        "service": "toy",
+        "account": {"past": [[["control_overruns"], 3]], "lives": [["robot:a", [[["control_overruns"], 4]]]]},
+    },
     "tokens": {
         "id": "t1",
         "name": "walker",
@@ -130,11 +135,13 @@ def check(url: str, version: str) -> None:
     (record,) = store.live()
     assert {key: getattr(record, key) for key in INSTANCE} == {**INSTANCE, "state": State.RUNNING}
     assert [(r.name, r.services, r.last_seen_at) for r in store.robots()] == [("walker", ("*",), NOW + 2)]
-    (token,) = store.tokens_by_prefix(KEPT.prefix)
+    ((token, _),) = store.holders(KEPT.prefix)
     assert (token.robot, token.hash.matches(TOKEN)) == ("walker", True)
     assert store.services() == {"toy": MANIFEST}
     (site,) = store.sites()
     assert (site.name, site.options, site.speed, site.images) == ("lab", {"cpu": 2}, 1.0, ("*",))
+    sums = [account.sums() for account in store.accounts().values()]
+    assert sums == ([{("control_overruns",): 7}] if "accounts" in counts else [])
     assert [(e.id, e.state) for e in store.events("i1", 0)] == [(1, State.RUNNING)]
     again = store.made_with("robot:walker", "k", "0" * 64)
     assert again is not None
