@@ -52,7 +52,8 @@ def site(engine: OwnEngine, docker_images: Images) -> Iterator[DockerSite]:
 
 
 @pytest.fixture
-def programs(tmp_path: Path) -> Iterator[Callable[..., Program]]:
+def programs(tmp_path: Path, site: DockerSite) -> Iterator[Callable[..., Program]]:
+    """They end before their site is cleared: one that runs makes anew what it misses there."""
     made: list[Program] = []
 
     def make(name: str = "one", **settings: Any) -> Program:
