@@ -7,7 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from skytether.lab.bench.api import Spread, bench_api, passes_in
+from skytether.lab.bench.api import bench_api, passes_in
+from skytether.lab.bench.observe import Spread
 from skytether.lab.bench.requests import Held, Mix
 
 

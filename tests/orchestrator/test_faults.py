@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from fault_scene import Scene, ask, program_in, put_toy
+from fault_scene import Scene, ask, programs_in, put_toy
 from nothing_lost import assert_nothing_lost, processes, told
 from orchestrator_program import Program, until
 
@@ -22,15 +22,7 @@ TOY = "skytether.testing.toy_service"
 
 @pytest.fixture
 def programs(tmp_path: Path) -> Iterator[Callable[..., Program]]:
-    made: list[Program] = []
-
-    def make(name: str = "one", **settings: Any) -> Program:
-        made.append(program_in(tmp_path / name, local_site="false", **settings))
-        return made[-1]
-
-    yield make
-    for program in made:
-        program.clean_up()
+    yield from programs_in(tmp_path)
 
 
 def local(name: str, tier: Literal["edge", "cloud"] = "edge", **options: Any) -> SiteCreate:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from docker_site import DockerSite, Images
 from engine_ways import EngineProxy
-from fault_scene import Scene, ask, program_in, put_toy
+from fault_scene import Scene, ask, programs_in, put_toy
 from nothing_lost import assert_nothing_lost, containers, litter, processes, told
 from orchestrator_program import Program, until
 from own_engine import OwnEngine
@@ -54,15 +54,7 @@ def site(engine: OwnEngine, docker_images: Images) -> Iterator[DockerSite]:
 @pytest.fixture
 def programs(tmp_path: Path, site: DockerSite) -> Iterator[Callable[..., Program]]:
     """They end before their site is cleared: one that runs makes anew what it misses there."""
-    made: list[Program] = []
-
-    def make(name: str = "one", **settings: Any) -> Program:
-        made.append(program_in(tmp_path / name, local_site="false", **settings))
-        return made[-1]
-
-    yield make
-    for program in made:
-        program.clean_up()
+    yield from programs_in(tmp_path)
 
 
 def add_site(client: Client, site: DockerSite, name: str = "edge", **options: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,19 @@ def program_in(folder: Path, **settings: Any) -> Program:
     lines += ["timing:", *(f"  {key}: {value}" for key, value in timing.items())]
     (folder / "config.yaml").write_text("\n".join(lines) + "\n")
     return Program(folder / "state", "--config", str(folder / "config.yaml"))
+
+
+def programs_in(folder: Path) -> Iterator[Callable[..., Program]]:
+    """For a fixture: makes programs, each in a folder of its own and without the site `local`, and ends them."""
+    made: list[Program] = []
+
+    def make(name: str = "one", **settings: Any) -> Program:
+        made.append(program_in(folder / name, local_site="false", **settings))
+        return made[-1]
+
+    yield make
+    for program in made:
+        program.clean_up()
 
 
 def put_toy(client: Client, name: str = "toy", *, standby: int = 0, tier: str = "edge", **spec: Any) -> None:

@@ -390,22 +390,23 @@ class Client:
             httpx.TransportError: Nobody answers; the last one's.
         """
         first, count = self._at, len(self._urls)
+        alone = count == 1
         for turn in range(count + 1):
             at, last = (first + turn) % count, turn == count
             try:
                 asked = self._http.build_request(method, self._urls[at] + path, **request)
                 response = self._http.send(asked, stream=stream)
             except (httpx.ConnectError, httpx.ConnectTimeout):
-                if last or turn + 1 == count == 1:
+                if last or alone:
                     raise
             except httpx.TimeoutException:
-                if last or not again or count == 1:
+                if last or alone or not again:
                     raise
             except httpx.TransportError:  # a connection that was kept open, and that the other end has closed
                 if last or not again:
                     raise
             else:
-                if last or response.status_code not in _AWAY or not again or count == 1:
+                if last or alone or not again or response.status_code not in _AWAY:
                     self._at = at
                     return response
                 response.close()

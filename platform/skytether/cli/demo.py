@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .output import console, fail, print_json
+from .output import console, fail, print_json, silenced
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -74,7 +72,8 @@ def _walk(running: Demo) -> DemoResult:
         TimeElapsedColumn(),
         TextColumn("{task.fields[now]}"),
     )
-    with _silenced(robot_driver.__name__), Progress(*columns, console=console) as progress:
+    # Its warnings of hand-overs are told here in people's words.
+    with silenced(robot_driver.__name__), Progress(*columns, console=console) as progress:
         task = progress.add_task("walking", total=running.trail.length, now="")
 
         def show(s: float, status: AgentStatus) -> None:
@@ -88,20 +87,6 @@ def _walk(running: Demo) -> DemoResult:
             progress.update(task, completed=s, now=now)
 
         return running.walk(show)
-
-
-@contextmanager
-def _silenced(name: str) -> Iterator[None]:
-    """Without the log's warnings of hand-overs, which are told here in people's words."""
-    import logging
-
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 def _told(change: Transition, s: float) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .output import console, fail, print_json
+from .output import console, fail, print_json, silenced
 
 app = typer.Typer(help="Experiments and benchmarks on this machine.", no_args_is_help=True)
 bench = typer.Typer(help="Measure the real program, and print what was measured.", no_args_is_help=True)
@@ -180,9 +179,8 @@ def fleet(
     from skytether.lab.bench.pair import BenchError
     from skytether.lab.embedded import EmbeddedError
 
-    logging.getLogger("skytether.robot").setLevel(logging.ERROR)  # all that is done to the robots is on purpose
     try:
-        with console.status("starting ...") as line:
+        with silenced("skytether.robot"), console.status("starting ...") as line:
             row = bench_fleet(robots, seconds, line.update)
     except (BenchError, EmbeddedError) as error:
         fail(str(error))
@@ -223,9 +221,8 @@ def failover(
     from skytether.lab.bench.pair import BenchError
     from skytether.robot import driver
 
-    logging.getLogger(driver.__name__).setLevel(logging.ERROR)  # hand-overs are what is measured here
     try:
-        with console.status("starting ...") as line:
+        with silenced(driver.__name__), console.status("starting ...") as line:
             rows = bench_failover(rate or RATES_HZ, n, seed, lambda r, i: line.update(f"{r:g} Hz: cut {i} of {n}"))
     except ValueError as error:
         fail(str(error), 2)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -21,6 +22,18 @@ _WIDE = 10_000
 _PRIVATE = {"session": {"key"}}
 console = Console(stderr=True, highlight=False)
 """For people: progress, tables, notes. Standard output is kept for what programs read."""
+
+
+@contextmanager
+def silenced(logger: str) -> Iterator[None]:
+    """Without a log's warnings, where a command brings about what they warn of."""
+    log = logging.getLogger(logger)
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def fail(sentence: str, status: int = 1) -> NoReturn:

@@ -7,6 +7,7 @@ restarted adds to what was counted before, and no sum goes down (a grow-only cou
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -46,17 +47,13 @@ class Account:
         """
         known = self._lives.pop(life, {})
         series = self.sums()
-        number = dict.fromkeys((key[0] for key in [*series, *counts]), 0)
-        for key in series.keys() | known.keys():
-            number[key[0]] = number.get(key[0], 0) + 1
+        number = Counter(key[0] for key in series.keys() | known.keys())
         for key, value in counts.items():
-            if key not in known:
-                if key not in series:
-                    if number[key[0]] >= _MOST_SERIES:
-                        continue
-                    number[key[0]] += 1
-                known[key] = value
-            known[key] = max(known[key], value)
+            if key not in known and key not in series:
+                if number[key[0]] >= _MOST_SERIES:
+                    continue
+                number[key[0]] += 1
+            known[key] = max(known.get(key, value), value)
         self._lives[life] = known
         kind = life.partition(":")[0]
         same = [other for other in self._lives if other.partition(":")[0] == kind]

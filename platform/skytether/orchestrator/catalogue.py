@@ -130,8 +130,8 @@ class Catalogue:
         """Those that were put; parsed anew where they changed."""
         before, now = self._parsed, {}
         for name, document in self._store.services().items():
-            known = before.get(name)
-            now[name] = known if known and known[0] == document else (document, Manifest.model_validate(document))
+            read = before.get(name)
+            now[name] = read if read and read[0] == document else (document, Manifest.model_validate(document))
         self._parsed = now
         return {name: manifest for name, (_, manifest) in now.items()}
 

@@ -21,10 +21,10 @@ import numpy as np
 import psutil
 
 from skytether.api.client import Client
-from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.rest import InstanceCreate, RobotCreate, SiteCreate, State
 from skytether.lab.embedded import EmbeddedOrchestrator
 
+from .observe import Spread, cpu_seconds, instance_of
 from .open_loop import Answered, ask_openly
 from .pair import BenchError
 from .requests import MANIFEST, SERVICE, Held, Mix, healthz
@@ -38,22 +38,6 @@ _SETTLE_S = 2.0
 _SEED = 20
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Times in milliseconds."""
-
-    n: int
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
-
-    @classmethod
-    def of(cls, seconds: list[float]) -> Spread:
-        """Of at least one time."""
-        p50, p99, most = np.percentile(seconds, [50, 99, 100], method="inverted_cdf") * 1e3
-        return cls(len(seconds), round(float(p50), 2), round(float(p99), 2), round(float(most), 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,9 +169,9 @@ def _by_kind(answers: list[Answered]) -> dict[str, Spread]:
 
 def _busy(pid: int, act: Callable[[], T]) -> tuple[float, T]:
     """How many cores a process kept busy meanwhile."""
-    before, began = sum(psutil.Process(pid).cpu_times()[:2]), time.monotonic()
+    before, began = cpu_seconds(pid), time.monotonic()
     result = act()
-    return (sum(psutil.Process(pid).cpu_times()[:2]) - before) / (time.monotonic() - began), result
+    return (cpu_seconds(pid) - before) / (time.monotonic() - began), result
 
 
 def _peak_mb(pid: int) -> float:
@@ -198,17 +182,8 @@ def _peak_mb(pid: int) -> float:
 def _lost(operator: Client, held: list[str]) -> int:
     """Instances that are not running, as the orchestrator says, in exactly one process, as the kernel says."""
     running = {one.id for one in operator.instances() if one.state is State.RUNNING}
-    processes = Counter(_instance_of(process) for process in psutil.process_iter())
+    processes = Counter(instance_of(process) for process in psutil.process_iter())
     return sum(one not in running or processes[one] != 1 for one in held)
-
-
-def _instance_of(process: psutil.Process) -> str | None:
-    """Whose process this is, by its grant's path; None: no instance's."""
-    try:
-        grant = process.environ().get(GRANT_VARIABLE)
-    except psutil.Error:
-        return None
-    return Path(grant).parent.name if grant else None
 
 
 _PASS = re.compile(r"(\S+): pass of (\S+) ms$", re.MULTILINE)

@@ -25,8 +25,10 @@ from skytether.api.rest import InstanceCreate, RobotCreate, SiteCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.robot.tally import COUNTERS
 
-from .fleet_robot import LEASE_S, MANIFEST, SERVICE, Series, SimulatedRobot
+from .fleet_robot import LEASE_S, MANIFEST, Series, SimulatedRobot
+from .observe import Spread, cpu_seconds, instance_of
 from .pair import BenchError
+from .requests import SERVICE
 
 _PHASES = 4
 _QUIET_S = 5.0
@@ -138,7 +140,7 @@ class _Fleet:
         self._seen: Series = Counter()
         self._fallen = 0
         self._left_over = 0
-        self._cpu_s = -_cpu(orchestrator)  # its first start is no matter of the fleet
+        self._cpu_s = -cpu_seconds(orchestrator.pid)  # its first start is no matter of the fleet
         self.robots = []
         for i, client in enumerate(clients):
             request = InstanceCreate(robot=f"robot-{i}", service=SERVICE, lease_s=LEASE_S)
@@ -185,7 +187,7 @@ class _Fleet:
         self.wait(self.robots, "after the disturbances")
 
     def kill_orchestrator(self) -> None:
-        self._cpu_s += _cpu(self._orchestrator)
+        self._cpu_s += cpu_seconds(self._orchestrator.pid)
         self._orchestrator.kill()
 
     def start_orchestrator(self) -> None:
@@ -198,14 +200,14 @@ class _Fleet:
         text = self._operator.metrics()
         scrape = time.monotonic() - began
         exported = self._take(text)
-        self._cpu_s += _cpu(self._orchestrator)
+        self._cpu_s += cpu_seconds(self._orchestrator.pid)
         counted: Series = Counter()
         unexplained = 0
         for robot in self.robots:
             counted.update(robot.counted())
             unexplained += robot.unexplained()
         keys = {key for key in exported.keys() | counted.keys() if key[-1] in _MESSAGES}
-        answers = sorted(s for robot in self.robots for s in robot.answers)
+        answers = Spread.of([seconds for robot in self.robots for seconds in robot.answers])
         return FleetRow(
             robots=len(self.robots),
             seconds=seconds,
@@ -215,9 +217,9 @@ class _Fleet:
             miscounted=sum(robot.miscounted(exported) for robot in self.robots),
             fallen=self._fallen,
             left_over=self._left_over,
-            renewals=len(answers),
-            renew_p50_ms=round(answers[len(answers) // 2] * 1e3, 2),
-            renew_p99_ms=round(answers[len(answers) * 99 // 100] * 1e3, 2),
+            renewals=answers.n,
+            renew_p50_ms=answers.p50_ms,
+            renew_p99_ms=answers.p99_ms,
             cpu=round(self._cpu_s / took, 3),
             memory_mb=round(psutil.Process(self._orchestrator.pid).memory_info().rss / 2**20, 1),
             scrape_ms=round(scrape * 1e3, 1),
@@ -229,9 +231,8 @@ class _Fleet:
         """Kill -9 its process; the orchestrator begins another one for the same session."""
         instance = robot.instance.id
         for process in psutil.Process(self._orchestrator.pid).children():
-            with suppress(psutil.Error):
-                if instance in process.environ().get("SKYTETHER_GRANT", ""):
-                    process.kill()
+            if instance_of(process) == instance:
+                process.kill()
         deadline = time.monotonic() + _LIMIT_S
         while self._operator.get_instance(instance).restarts == 0:
             if time.monotonic() > deadline:
@@ -265,8 +266,3 @@ class _Fleet:
         self._fallen += sum(found[key] < before for key, before in self._seen.items() if key in found)
         self._seen = found
         return found
-
-
-def _cpu(orchestrator: EmbeddedOrchestrator) -> float:
-    """Seconds of processor time since its start."""
-    return sum(psutil.Process(orchestrator.pid).cpu_times()[:2])

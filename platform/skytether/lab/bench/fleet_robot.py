@@ -19,36 +19,29 @@ from skytether.robot.snapshot import report
 from skytether.robot.tally import COUNTERS, Tally
 from skytether.wire import Direction, Role, Session
 
+from .requests import sleeper
 from .traffic import TABLE4, Flow
 
-SERVICE = "sleeper"
 LEASE_S = 300.0
 """Longer than a robot of a large fleet waits for its turn."""
 _DRAIN_S = 3.0
 """Made-up seconds for what is under way when a session is let go."""
-MANIFEST: dict[str, Any] = {
-    "apiVersion": "skytether.io/v1",
-    "kind": "Service",
-    "metadata": {"name": SERVICE},
-    "spec": {
-        "entrypoint": "skytether.testing.toy_service",
-        "needs": {"cpu": 0.001, "memory_mb": 1},
-        "topics": [
-            {
-                "name": flow.name,
-                "type": "lab_msgs/msg/Bytes",
-                "direction": flow.direction.value,
-                "priority": 128 - flow.rank,
-                "depth": flow.depth,
-                "lifespan_ms": flow.lifespan * 1e3,
-                "delivery": flow.delivery,
-                "period_ms": 1e3 / flow.hz,
-            }
-            for flow in TABLE4
-        ],
-    },
-}
-"""Of a service that sleeps, with the topics of Table 4."""
+MANIFEST = sleeper(
+    [
+        {
+            "name": flow.name,
+            "type": "lab_msgs/msg/Bytes",
+            "direction": flow.direction.value,
+            "priority": 128 - flow.rank,
+            "depth": flow.depth,
+            "lifespan_ms": flow.lifespan * 1e3,
+            "delivery": flow.delivery,
+            "period_ms": 1e3 / flow.hz,
+        }
+        for flow in TABLE4
+    ]
+)
+"""With the topics of Table 4."""
 
 Series = Counter[tuple[str, ...]]
 """Messages (or bytes) by robot, topic, direction and outcome."""

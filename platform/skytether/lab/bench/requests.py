@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,17 +21,24 @@ _TOPICS = (
     ("/force", "geometry_msgs/msg/WrenchStamped", "in"),
     ("/cmd_vel", "geometry_msgs/msg/Twist", "out"),
 )
-MANIFEST: dict[str, Any] = {
-    "apiVersion": "skytether.io/v1",
-    "kind": "Service",
-    "metadata": {"name": SERVICE},
-    "spec": {
-        "entrypoint": "skytether.testing.toy_service",
-        "topics": [{"name": n, "type": t, "direction": d, "priority": 100} for n, t, d in _TOPICS],
-        "needs": {"cpu": 0.001, "memory_mb": 1},
-    },
-}
-"""Of a service that sleeps, with the topics of one that follows a walking person."""
+
+
+def sleeper(topics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The manifest of a service that sleeps, and of which any number fits on a site."""
+    return {
+        "apiVersion": "skytether.io/v1",
+        "kind": "Service",
+        "metadata": {"name": SERVICE},
+        "spec": {
+            "entrypoint": "skytether.testing.toy_service",
+            "topics": list(topics),
+            "needs": {"cpu": 0.001, "memory_mb": 1},
+        },
+    }
+
+
+MANIFEST = sleeper([{"name": n, "type": t, "direction": d, "priority": 100} for n, t, d in _TOPICS])
+"""With the topics of one that follows a walking person."""
 _SHARES = {"renew": 0.79, "show": 0.12, "list own": 0.04, "list all": 0.01, "create": 0.02, "delete": 0.02}
 """Of the requests; the operator's console lists all, and each creation is of a robot that lets go some time later."""
 _SCRAPE_EVERY = 500
