@@ -7,9 +7,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from skytether.api.manifest import Manifest
+from skytether.api.rest import Renew
 from skytether.lab.bench.api import bench_api, passes_in
 from skytether.lab.bench.observe import Spread
-from skytether.lab.bench.requests import Held, Mix
+from skytether.lab.bench.requests import MANIFEST, Held, Mix, report
 
 
 @pytest.mark.slow
@@ -42,3 +44,10 @@ def test_the_mix_lets_go_only_what_was_made():
     assert 700 < kinds["renew"] < 900
     assert kinds["scrape"] == 2
     assert 0 < kinds["delete"] <= kinds["create"] < 60
+
+
+def test_the_reports_topics_are_the_manifests_for_others_are_not_taken():
+    told = Renew.model_validate_json(report()).report
+    assert told is not None
+    rows = Manifest.model_validate(MANIFEST).spec.topics
+    assert [(t.topic, t.direction) for t in told.topics] == [(row.name, row.direction) for row in rows]

@@ -6,7 +6,7 @@ import json
 import queue
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from skytether.api.rest import Report, TopicReport
 from .open_loop import Request
 
 SERVICE = "sleeper"
-_TOPICS = (
+_TOPICS: tuple[tuple[str, str, Literal["in", "out"]], ...] = (
     ("/scan", "sensor_msgs/msg/LaserScan", "in"),
     ("/odom", "nav_msgs/msg/Odometry", "in"),
     ("/force", "geometry_msgs/msg/WrenchStamped", "in"),
@@ -104,7 +104,7 @@ def report() -> bytes:
     topics = tuple(
         TopicReport(
             topic=name,
-            direction="in" if direction == "out" else "out",  # as the robot sees it
+            direction=direction,
             priority=100,
             sent=36_000,
             delivered=35_990,
