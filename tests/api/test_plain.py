@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from datetime import date
 from math import inf, nan
 from typing import Any
@@ -42,3 +43,19 @@ def test_what_json_can_hold_is_left_alone(document: Any) -> None:
 )
 def test_what_it_cannot_is_named(document: Any, sentence: str) -> None:
     assert str(oddity(document)) == sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ('{"a": 1, "b": {"c:d": "e:f"}, "c": [{"a": ":"}]}', None),
+        ('{"a": 1, "a": 1}', "a"),
+        ('{"a": [{"b": {"c": 1, "\\u0063" : 2}}]}', "c"),
+        ('{"a": {"b": 1}, "b": 2, "a": {}}', "a"),
+        ('{"' + "k" * 99 + '": 1, "' + "k" * 99 + '": 1}', "k" * 40),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_key_that_comes_twice(text: str, key: str | None, encoding: str) -> None:
+    fault = oddity(json.loads(text), text.encode(encoding))
+    assert str(fault) == (f"the key '{key}' comes twice: leave one of them out" if key else "None")

@@ -29,6 +29,7 @@ def http(shared: Any) -> Any:
         (r'"\u0000"', "params.mass: holds a NUL character: leave it out"),
         (r'"\ud800"', "params.mass: holds half a character (a lone surrogate): leave it out"),
         ("[" * 300 + "]" * 300, "params.mass.0: is nested more than 64 levels deep"),
+        ('1, "mass": 2', "the key 'mass' comes twice: leave one of them out"),
         (f'["{"x" * 20_000}", NaN]', "params.mass.1: must be a finite number, not nan"),
     ],
 )

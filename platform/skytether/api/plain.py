@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from math import isfinite
 from typing import Any
 
@@ -12,18 +14,25 @@ DEPTH = 64
 _WHOLE = 1 << 63
 
 
-def oddity(document: Any) -> Fault | None:
+def oddity(document: Any, text: bytes = b"") -> Fault | None:
     """What JSON, a database or UTF-8 has no word for; None: all is well.
 
     A NaN would arrive as null, and half of a character or a number with a thousand digits could be stored, but never
-    read again.
+    read again. Of a key that comes twice readers take one and say nothing.
+
+    Args:
+        document: What was read.
+        text: The JSON that it was read from, where somebody wrote one.
     """
+    keys = 0
     waiting: list[tuple[Any, tuple[str, ...]]] = [(document, ())]
     while waiting:
         value, place = waiting.pop()
         if isinstance(value, dict | list):
             if len(place) >= DEPTH:
                 return Fault(".".join(place[:3]), f"is nested more than {DEPTH} levels deep")
+            if isinstance(value, dict):
+                keys += len(value)
             for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
                 trouble = _of_text(key) if isinstance(key, str) else None
                 if trouble:
@@ -33,7 +42,19 @@ def oddity(document: Any) -> Fault | None:
             trouble = _of_scalar(value)
             if trouble:
                 return Fault(".".join(place), trouble)
-    return None
+    # A colon follows each key: no more colons than keys, and none was dropped; then there is no need to look again.
+    return _doubled(text) if text.count(b":") > keys else None
+
+
+def _doubled(text: bytes) -> Fault | None:
+    twice: list[str] = []
+
+    def look(pairs: list[tuple[str, Any]]) -> None:
+        counts = Counter(key for key, _ in pairs)
+        twice.extend(key for key, count in counts.items() if count > 1)
+
+    json.loads(text, object_pairs_hook=look)
+    return Fault("", f"the key '{twice[0]:.40}' comes twice: leave one of them out") if twice else None
 
 
 def _of_scalar(value: Any) -> str | None:

@@ -98,6 +98,6 @@ async def plain_request(request: Request) -> None:
         document = await request.json() if body else None
     except ValueError:
         return  # whoever wants it says what it should have been
-    fault = oddity(document) if len(body) < _LARGE else await asyncio.to_thread(oddity, document)
+    fault = oddity(document, body) if len(body) < _LARGE else await asyncio.to_thread(oddity, document, body)
     if fault is not None:
         raise InvalidError([fault])
