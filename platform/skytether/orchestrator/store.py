@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
     Connection,
+    Float,
     RowMapping,
+    and_,
     bindparam,
     delete,
     exists,
@@ -25,6 +28,7 @@ from sqlalchemy import (
     update,
 )
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.sql.dml import ReturningUpdate
 
 from skytether.api.report_metrics import Counts
 from skytether.api.rest import State
@@ -64,14 +68,41 @@ class Told:
     counts: Counts
 
 
+# Made once: what every request asks. To make a statement takes longer than to run it.
+_SERVES = and_(*(instances.c.state != state for state in (*_FINAL, State.STOPPING)))
 _INSTANCE = select(instances).where(instances.c.id == bindparam("instance"))
 _SUCCESSOR = (
     select(instances.c.id)
-    .where(instances.c.replaces == bindparam("instance"), instances.c.state.not_in([*_FINAL, State.STOPPING]))
+    .where(instances.c.replaces == bindparam("instance"), _SERVES)
     .order_by(instances.c.created_at.desc())
     .limit(1)
 )
-"""Made once: what every request asks."""
+_THEIRS = (accounts.c.robot == bindparam("of_robot")) & (accounts.c.service == bindparam("of_service"))
+_ACCOUNT = select(accounts.c.account).where(_THEIRS).with_for_update()
+"""Locked, for two orchestrators may be told of the same robot at once."""
+_NEW_ACCOUNT = text(
+    "INSERT INTO accounts (robot, service, account) VALUES (:of_robot, :of_service, '{}') ON CONFLICT DO NOTHING"
+)
+_KEEP_ACCOUNT = update(accounts).where(_THEIRS).values(account=bindparam("account"))
+_REPORT = (
+    update(reports)
+    .where(reports.c.instance == bindparam("of_instance"))
+    .values(at=bindparam("at"), report=bindparam("report"))
+)
+
+
+@cache
+def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdate[Any]:
+    """Renews a lease, perhaps with another length, only for a robot, with new measurements."""
+    lease_s = bindparam("length", type_=Float) if length else instances.c.lease_s
+    statement = update(instances).where(instances.c.id == bindparam("instance"), _SERVES)
+    if robot:
+        statement = statement.where(instances.c.robot == bindparam("of_robot"))
+    if measurements:
+        statement = statement.values(measurements=bindparam("measured"))
+    # The version counts up, so that whoever is about to end it for its old lease has to look again.
+    ends = {"lease_s": lease_s, "lease_expires_at": bindparam("now", type_=Float) + lease_s}
+    return statement.values(**ends, version=instances.c.version + 1).returning(instances)
 
 
 class KeyReusedError(Exception):
@@ -234,26 +265,19 @@ class Store(Database):
         Returns:
             The instance; None if it is not there, not the robot's, or has ended or ends.
         """
-        alive = instances.c.state.not_in([*_FINAL, State.STOPPING])
-        length = instances.c.lease_s if lease_s is None else lease_s
-        statement = update(instances).where(instances.c.id == instance, alive)
-        if robot is not None:
-            statement = statement.where(instances.c.robot == robot)
-        if measurements is not None:
-            statement = statement.values(measurements=measurements)
-        # The version counts up, so that whoever is about to end it for its old lease has to look again.
-        statement = statement.values(lease_s=length, lease_expires_at=now + length, version=instances.c.version + 1)
+        statement = _renewal(length=lease_s is not None, robot=robot is not None, measurements=measurements is not None)
+        values = {"instance": instance, "now": now, "length": lease_s, "of_robot": robot, "measured": measurements}
         with self._writing() as connection:
-            row = connection.execute(statement.returning(instances)).mappings().one_or_none()
+            row = connection.execute(statement, values).mappings().one_or_none()
             if row is None:
                 return None
             record = _record(row)
             if told is not None:
                 heard = told(record)
                 self._count(connection, record, [(heard.life, heard.counts)])
-                values = {"at": now, "report": heard.report}
-                if connection.execute(update(reports).where(reports.c.instance == instance), values).rowcount == 0:
-                    connection.execute(insert(reports).values(instance=instance, **values))
+                of, what = {"of_instance": instance}, {"at": now, "report": heard.report}
+                if connection.execute(_REPORT, of | what).rowcount == 0:
+                    connection.execute(insert(reports).values(instance=instance, **what))
         return record
 
     def reports(self, control: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
@@ -271,19 +295,15 @@ class Store(Database):
             self._count(connection, record, counted)
 
     def _count(self, connection: Connection, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
-        mine = (accounts.c.robot == record.robot) & (accounts.c.service == record.service)
-        # Locked, for two orchestrators may be told of the same robot at once; the first makes the row.
-        kept = connection.scalar(select(accounts.c.account).where(mine).with_for_update())
+        whose = {"of_robot": record.robot, "of_service": record.service}
+        kept = connection.scalar(_ACCOUNT, whose)
         if kept is None:
-            made = (
-                "INSERT INTO accounts (robot, service, account) VALUES (:robot, :service, '{}') ON CONFLICT DO NOTHING"
-            )
-            connection.execute(text(made).bindparams(robot=record.robot, service=record.service))
-            kept = connection.scalar(select(accounts.c.account).where(mine).with_for_update())
+            connection.execute(_NEW_ACCOUNT, whose)
+            kept = connection.scalar(_ACCOUNT, whose)
         account = Account(kept)
         for life, counts in counted:
             account.merge(life, counts)
-        connection.execute(update(accounts).where(mine).values(account=account.document()))
+        connection.execute(_KEEP_ACCOUNT, whose | {"account": account.document()})
 
     def accounts(self) -> dict[tuple[str, str], Account]:
         """What is known, by robot and service."""
