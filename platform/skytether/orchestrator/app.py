@@ -14,7 +14,6 @@ from .logs import Audit
 from .routers import catalog, health, instances, robots, sites, tokens
 from .routers.deps import plain_request
 
-
 _NO_TELEMETRY: TelemetryConfig = {"tracing": False, "metrics": False, "logs": False}
 """FastAPI's own (OpenTelemetry) costs each request a twentieth, even where nobody exports it."""
 
