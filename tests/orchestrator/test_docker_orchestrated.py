@@ -123,3 +123,28 @@ def test_a_site_without_its_engine_is_unreachable_and_its_instances_wait(house: 
     after = house.until(instance, State.RUNNING)
     assert (after.port, after.attempt, after.restarts) == (before.port, 1, 0)
     assert len(house.docker.containers()) == 2
+
+
+def test_what_a_machine_lacks_another_site_has(house: House) -> None:
+    """The device is not plugged in at the first machine; the other site is this machine itself."""
+    options = {**house.docker.options(), "owner": f"{house.docker.owner}-bare", "devices": ["/dev/unplugged"]}
+    house.core.sites.add(SiteCreate(name="bare", tier="edge", runtime="docker", options=options))
+    house.core.sites.add(SiteCreate(name="other", tier="edge", runtime="process"))
+    toy = house.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
+    toy["spec"] |= {"entrypoint": "skytether.testing.toy_service", "needs": {"devices": ["/dev/unplugged"]}}
+    house.core.catalogue.put("toy", Manifest.model_validate(toy))
+    instance = house.ask()
+    record = house.until(instance, State.RUNNING)
+    refused = {refusal["site"]: refusal for refusal in record.refused}
+    assert (record.site, refused["bare"]["reason"]) == ("other", "start")
+    assert "no such file or directory; plug it in" in refused["bare"]["detail"]
+    events = house.core.store.events(instance, 0)
+    assert sum(event.state is State.STARTING and not event.reason for event in events) == 2  # once at each
+    house.core.instances.delete(OPERATOR, instance)
+    house.until(instance, State.STOPPED)
+    left = f"label=skytether.io/owner={options['owner']}"
+    deadline = time.monotonic() + PATIENCE
+    while docker("ps", "-aq", "--filter", left):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    house.core.sites.delete("bare")

@@ -117,6 +117,53 @@ def test_a_site_that_cannot_start_it_fails_it_in_words(bench: Any, new_record: N
     assert "could not be started: no space left on the site" in b.record().reason
 
 
+NO_SPACE = "could not be started: no space left on the site"
+
+
+def test_what_cannot_be_started_at_a_site_runs_at_another(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path)
+    add(b, new_record())
+    b.step(3)
+    b.reconciler.site_step(other)
+    b.reconciler.site_step(other)
+    record = b.record()
+    assert (record.state, record.site, record.restarts) == (State.RUNNING, "other", 0)
+    assert record.refused == [{"site": "lab", "reason": "start", "detail": NO_SPACE}]
+    assert ("pending", f"site lab: the service {NO_SPACE}; trying another site") in b.reasons()
+    assert other.runtime.started == [("i1", 3)]
+    assert 'placement_refusals_total{reason="start",service="toy",site="lab"} 1.0' in b.metrics.text().decode()
+
+
+def test_what_no_site_can_start_fails_with_all_reasons(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path, RefusingRuntime)
+    add(b, new_record(lease_expires_at=b.clock() + 100))
+    for _ in range(40):
+        b.step()
+        b.reconciler.site_step(other)
+        b.clock.forward(0.25)
+    assert b.record().state is State.FAILED
+    assert b.record().reason == f"no site can start it: lab: {NO_SPACE}; other: {NO_SPACE}"
+
+
+def test_what_cannot_be_started_waits_for_a_site_that_is_full(
+    bench: Any, new_record: NewRecord, tmp_path: Path
+) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path, cpu=1)
+    add(b, new_record("i1", pinned="other"))
+    b.step()
+    b.reconciler.site_step(other)
+    add(b, new_record("i2", lease_expires_at=b.clock() + 100))
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    waiting = b.record("i2")
+    assert (waiting.state, waiting.site) == (State.PENDING, None)
+    assert waiting.reason == f"waiting for a site: lab: {NO_SPACE}; other: needs 1 cores, 0 of 1 are free"
+
+
 def test_a_robot_that_vanishes_frees_what_it_held(bench: Any, new_record: NewRecord) -> None:
     b = bench()
     add(b, new_record())

@@ -35,7 +35,7 @@ class FixedSites:
 
 
 class Bench:
-    """A reconciler over one site, ``lab``."""
+    """A reconciler over one site, ``lab``; a test may add others."""
 
     def __init__(self, folder: Path, store: Store, clock: Any, kind: type[FakeRuntime] = FakeRuntime, **options: Any):
         self.store, self.clock = store, clock
@@ -61,10 +61,23 @@ class Bench:
     def _site(self) -> Site:
         asked = SiteCreate(name="lab", tier="edge", runtime="fake")
         site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
-        sites = self.reconciler.sites = FixedSites(site)  # type: ignore[assignment]
+        self._let_know(site)
         weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
+        sites = self.reconciler.sites
         self.reconciler.moves = Moves(self.store, catalogue, lambda: sites, weigh, self.clock, Timing(), Weights())
         return site
+
+    def _let_know(self, *sites: Site) -> None:
+        self.reconciler.sites = FixedSites(*sites)  # type: ignore[assignment]
+
+    def beside(self, folder: Path, kind: type[FakeRuntime] = FakeRuntime, **options: Any) -> Site:
+        """Another site, ``other``; at equal scores it comes second."""
+        asked = SiteCreate(name="other", tier="edge", runtime="fake")
+        runtime = kind("other", folder, FakeOptions(**options))
+        other = Site(asked, runtime, self.reconciler.site_step, silent_after=1e9)
+        self._let_know(self.site, other)
+        self.reconciler.site_step(other)
+        return other
 
     def _wake(self) -> None:
         self.woken += 1

@@ -69,7 +69,7 @@ class Refusal(Strict):
     site: str
     reason: str
     """Bounded, for metrics: ``tier``, ``architecture``, ``image``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``,
-    ``runtime``, ``unreachable``."""
+    ``runtime``, ``start``, ``unreachable``."""
     detail: str
 
 

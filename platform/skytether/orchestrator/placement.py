@@ -17,6 +17,8 @@ from .runtimes.base import Capacity
 from .settings import Weights
 
 NOTHING = Capacity(0.0, 0)
+UNSTARTED = "start"
+"""Reason of a refusal by a site that was tried: it stays with the instance."""
 _TIER_ORDER: Mapping[Tier, int] = {"robot": 0, "edge": 1, "cloud": 2}
 """Nearer first, where nothing was measured."""
 _FULLEST = 0.95
@@ -31,6 +33,8 @@ class Candidate:
     tier: Tier
     cannot_run: str | None = None
     """Why its runtime cannot run this service at all; None: it can."""
+    unstarted: str | None = None
+    """Why this very instance could not be started there; None: it was not tried, or could."""
     unreachable: str | None = None
     """Why it does not answer; None: it does."""
     total: Capacity = NOTHING
@@ -119,6 +123,8 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("tier", f"is of tier {site.tier}, needed is {' or '.join(needs.tiers)}")
     if site.cannot_run is not None:
         return no("runtime", site.cannot_run)
+    if site.unstarted is not None:
+        return no(UNSTARTED, site.unstarted)
     if image is not None and not any(fnmatchcase(image, pattern) for pattern in site.images):
         return no("image", f"allows images {', '.join(site.images) or '(none)'}, asked for is {image}")
     if needs.architectures and site.total.architecture and site.total.architecture not in needs.architectures:

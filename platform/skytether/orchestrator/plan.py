@@ -61,6 +61,8 @@ class Crash:
     why: str
     """Continues "the service ..."."""
     for_good: bool = False
+    unstarted: bool = False
+    """It could not even be begun, and nothing is left of it: another site may do better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +168,8 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
     if seen.phase is Phase.RUNNING:
         return Ready(record, seen.host, seen.port)
     if seen.phase is Phase.EXITED:
-        return Crash(record, how_it_ended(seen), for_good=seen.exit_status == BAD_GRANT_STATUS)
+        for_good = seen.exit_status == BAD_GRANT_STATUS
+        return Crash(record, how_it_ended(seen), for_good, seen.unstarted)
     if seen.detail and seen.detail != record.reason:
         return Progress(record, seen.detail)
     if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:

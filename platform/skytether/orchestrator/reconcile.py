@@ -7,6 +7,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from skytether.api.grant import Grant
 from skytether.api.rest import Measurement, Refusal, State
@@ -16,7 +18,7 @@ from .clocks import SetClock
 from .db import GONE
 from .metrics import Metrics
 from .moves import Moves
-from .placement import NOTHING, Decision, place
+from .placement import NOTHING, UNSTARTED, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
 from .runtimes.base import Capacity, Launch, Observation, Phase, RuntimeFailure, SiteSilentError
@@ -27,6 +29,8 @@ from .store import Store
 
 log = logging.getLogger(__name__)
 
+_TRIES = 2
+"""Failures in a row, the last of them to start at all, until another site is tried: one may be an accident."""
 _TIDY = 1.0
 """Seconds between two calls of a runtime's ``tidy``."""
 _SPARE_IDLE = 86_400.0
@@ -162,7 +166,8 @@ class Reconciler:
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
         used = _used(others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
-        sites = [site.candidate(record.spec, used.get(site.name, NOTHING)) for site in allowed]
+        tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
+        sites = [site.candidate(record.spec, used.get(site.name, NOTHING), tried.get(site.name)) for site in allowed]
         spec = record.spec
         return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
 
@@ -270,7 +275,7 @@ class Reconciler:
                 case Stop(instance, force):
                     site.runtime.stop(instance, force=force)
                 case Remove(instance):
-                    log.info("site %s: removing %s, which no robot asked for", site.name, instance)
+                    log.info("site %s: removing %s, which nobody wants there", site.name, instance)
                     site.runtime.remove(instance)
                 case Place():
                     raise TypeError("what is at a site is placed already")
@@ -288,7 +293,7 @@ class Reconciler:
         except SiteSilentError:
             raise  # no fault of the service: it is started when the site answers again
         except RuntimeFailure as error:
-            self._crash(site, Crash(noted, f"could not be started: {error}"))
+            self._crash(site, Crash(noted, f"could not be started: {error}", unstarted=True))
 
     def _launch(self, record: Record) -> Launch:
         spec = record.spec
@@ -317,6 +322,8 @@ class Reconciler:
 
     def _crash(self, site: Site, crash: Crash) -> None:
         changes = after_crash(crash, self._clock(), self._timing)
+        if crash.unstarted and changes["failures"] >= _TRIES:
+            changes |= self._elsewhere(crash, gives_up=changes["state"] is State.FAILED)
         after = self._store.change(crash.record, self._clock(), **changes)
         if after is None:
             return
@@ -324,11 +331,34 @@ class Reconciler:
         if after.restarts:
             self._store.count(after, [of_instance(after)])
         self.moves.fail_over(after, after.reason)
+        if after.site is None:
+            self._wake_placer()
         if after.state.final:
             site.runtime.stop(after.id, force=True)
             if after.spare:
                 self.moves.spare_failed(after)
             self._wake_placer()
+
+    def _elsewhere(self, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
+        """What else changes where a run cannot be started: the site is refused, if that leaves another one to try."""
+        record = crash.record
+        refusal = Refusal(site=record.site or "", reason=UNSTARTED, detail=crash.why)
+        decision = self.weigh(replace(record, refused=[*record.refused, refusal.model_dump()]))
+        if decision.site is None and (decision.hopeless or not gives_up):
+            several = gives_up and len(decision.refused) > 1
+            return {"reason": f"no site can start it: {told(decision.refused)}"} if several else {}
+        self._metrics.refused(record.service, decision.refused)
+        return {
+            "state": State.PENDING,
+            "site": None,
+            "host": None,
+            "port": None,
+            "reason": f"site {record.site}: the service {crash.why}; trying another site",
+            "refused": [refused.model_dump() for refused in decision.refused],
+            "failures": 0,
+            "restarts": 0,
+            "start_at": 0.0,
+        }
 
     def _expire(self, record: Record) -> None:
         now = self._clock()

@@ -17,13 +17,14 @@ from skytether.api.rest import State
 MOVES: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.PLACING, State.STOPPED}),
     State.PLACING: frozenset({State.PENDING, State.STARTING, State.STOPPED}),
-    State.STARTING: frozenset({State.RUNNING, State.STOPPING, State.FAILED}),
+    State.STARTING: frozenset({State.PENDING, State.RUNNING, State.STOPPING, State.FAILED}),
     State.RUNNING: frozenset({State.STARTING, State.STOPPING, State.FAILED}),
     State.STOPPING: frozenset({State.STOPPED}),
     State.STOPPED: frozenset(),
     State.FAILED: frozenset(),
 }
-"""Nothing runs before STARTING, so what is pending or placing stops without stopping."""
+"""Nothing runs before STARTING, so what is pending or placing stops without stopping. What could not be started at one
+site is PENDING again, for another."""
 
 
 class IllegalMoveError(Exception):
@@ -72,6 +73,7 @@ class Record:
     failures: int = 0
     """Quick ones in a row."""
     restarts: int = 0
+    """At this site."""
     start_at: float = 0.0
     """The present run is not launched before this (back-off)."""
     started_at: float | None = None

@@ -124,12 +124,13 @@ class Site:
             return self.failure
         return f"it has not answered for {silent:.0f} s" if self.capacity else "it has not answered yet"
 
-    def candidate(self, spec: ServiceSpec, used: Capacity) -> Candidate:
-        """As placement sees it for one service."""
+    def candidate(self, spec: ServiceSpec, used: Capacity, unstarted: str | None = None) -> Candidate:
+        """As placement sees it for one service; ``unstarted``: why the instance could not be started here."""
         return Candidate(
             name=self.name,
             tier=self.asked.tier,
             cannot_run=self.runtime.refuses(spec),
+            unstarted=unstarted,
             unreachable=self.unreachable or None,
             total=self.capacity or NOTHING,
             used=used,

@@ -49,6 +49,8 @@ class Observation:
     """STARTING: what it waits for ("pulling x: 12 of 80 MB"); as long as this changes, the start makes progress.
     RUNNING: what its own health check finds wrong; empty: it is well. EXITED: how it ended, where the status does not
     tell; continues "the service ..."."""
+    unstarted: bool = False
+    """EXITED: it could not even be begun, and nothing of it or of earlier runs is left: another site may do better."""
     cpu_s: float | None = None
     """Processor time of this run so far."""
     memory_bytes: int | None = None

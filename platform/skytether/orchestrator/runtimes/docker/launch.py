@@ -58,6 +58,8 @@ class Job:
         """Why nothing runs, when it has ended that way."""
         self.unanswered = False
         """It came to nothing, or nobody knows to what, because the engine did not answer: to be started again."""
+        self.unstarted = False
+        """It came to nothing, and nothing of earlier runs is left either."""
         self.detail = ""
         self._engine = engine
         self._options = options
@@ -87,11 +89,14 @@ class Job:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        cleared = False
         try:
             if self._before is not None:
                 self._before.cancel()
                 self._before.join(_END_S + 2 * self._options.timeout_s)
                 self._before = None
+            self._clear()
+            cleared = True
             self._launch()
         except StoppedError:
             self.failure = "was stopped before it ran"
@@ -101,6 +106,7 @@ class Job:
             self.unanswered = True
         except RuntimeFailure as error:
             self.failure = f"could not be started: {advised(str(error))}"
+            self.unstarted = cleared
         except Exception as error:
             log.exception("start of %s failed", self.launch.instance)
             self.failure = f"could not be started: {error}"
@@ -114,7 +120,6 @@ class Job:
         self.detail = detail
 
     def _launch(self) -> None:
-        self._clear()
         self._go_on()
         image = ensure_image(self._engine, self._options, str(self.launch.spec.image), self._tell)
         self.detail = ""

@@ -128,7 +128,7 @@ class DockerRuntime(Runtime):
             if job.unanswered:
                 continue  # as if it had not been begun: it is, once the engine answers
             if job.failure:
-                found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure)
+                found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure, unstarted=job.unstarted)
             else:
                 found[instance] = Observation(job.attempt, Phase.STARTING, detail=job.detail)
         return found
