@@ -255,6 +255,18 @@ def test_a_wrong_site_is_refused(shared: Any, runtime: str, options: dict[str, A
     assert "wrong" not in [s.name for s in shared.operator.sites()]
 
 
+def test_a_site_that_can_start_nothing_says_why(served: Any) -> None:
+    runtime = served.site(runtime="blocked")
+    operator = served.operator
+    assert [(s.state, s.reason, s.cpu) for s in operator.sites()] == [("blocked", "the network is missing", 64)]
+    waiting = operator.create_instance(ASK)
+    with pytest.raises(NotRunning, match=r"is pending after 0.2 s: waiting for a site: lab: the network is missing"):
+        operator.wait_running(waiting.id, timeout=0.2)
+    runtime.obstacle = ""
+    assert operator.wait_running(waiting.id, timeout=5).state is State.RUNNING
+    assert (operator.get_site("lab").state, operator.get_site("lab").reason) == ("ready", "")
+
+
 def test_services(served: Any, manifest: Any) -> None:
     operator = served.operator
     assert operator.get_service("toy").spec.entrypoint == "skytether.testing.toy_service"

@@ -18,7 +18,7 @@ from skytether.orchestrator.access import Principal
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Runtime
-from skytether.orchestrator.runtimes.docker import DockerRuntime
+from skytether.orchestrator.runtimes.docker import DockerRuntime, runtime
 from skytether.orchestrator.settings import Settings
 from skytether.orchestrator.sites import load_runtime
 
@@ -55,6 +55,16 @@ class House:
     def restart(self) -> None:
         self.core.stop()
         self.core = self._open()
+
+    def needs_device(self, path: str) -> None:
+        """From now on the toy, which any kind of site can run, needs one."""
+        toy = self.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
+        toy["spec"] |= {"entrypoint": "skytether.testing.toy_service", "needs": {"devices": [path]}}
+        self.core.catalogue.put("toy", Manifest.model_validate(toy))
+
+    def end(self, instance: str) -> None:
+        self.core.instances.delete(OPERATOR, instance)
+        self.until(instance, State.STOPPED)
 
     def ask(self) -> str:
         asked = InstanceCreate(robot="walker", service="toy", lease_s=600)
@@ -98,8 +108,7 @@ def test_an_instance_outlives_the_orchestrator_and_is_started_again_when_it_dies
     assert (again.restarts, again.port) == (1, before.port)
     events: list[Any] = house.core.store.events(instance, 0)
     assert any("was killed by signal 9" in event.reason for event in events)
-    house.core.instances.delete(OPERATOR, instance)
-    house.until(instance, State.STOPPED)
+    house.end(instance)
     assert docker("ps", "-q", "--filter", f"label=skytether.io/instance={instance}") == ""
 
 
@@ -130,9 +139,7 @@ def test_what_a_machine_lacks_another_site_has(house: House) -> None:
     options = {**house.docker.options(), "owner": f"{house.docker.owner}-bare", "devices": ["/dev/unplugged"]}
     house.core.sites.add(SiteCreate(name="bare", tier="edge", runtime="docker", options=options))
     house.core.sites.add(SiteCreate(name="other", tier="edge", runtime="process"))
-    toy = house.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
-    toy["spec"] |= {"entrypoint": "skytether.testing.toy_service", "needs": {"devices": ["/dev/unplugged"]}}
-    house.core.catalogue.put("toy", Manifest.model_validate(toy))
+    house.needs_device("/dev/unplugged")
     instance = house.ask()
     record = house.until(instance, State.RUNNING)
     refused = {refusal["site"]: refusal for refusal in record.refused}
@@ -140,11 +147,33 @@ def test_what_a_machine_lacks_another_site_has(house: House) -> None:
     assert "no such file or directory; plug it in" in refused["bare"]["detail"]
     events = house.core.store.events(instance, 0)
     assert sum(event.state is State.STARTING and not event.reason for event in events) == 2  # once at each
-    house.core.instances.delete(OPERATOR, instance)
-    house.until(instance, State.STOPPED)
+    house.end(instance)
     left = f"label=skytether.io/owner={options['owner']}"
     deadline = time.monotonic() + PATIENCE
     while docker("ps", "-aq", "--filter", left):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     house.core.sites.delete("bare")
+
+
+def test_a_site_without_its_guard_says_so_and_starts_what_waits_when_it_is_there(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runtime, "_AGAIN_S", 0.2)
+    guard, late = house.docker.images.name("guard"), house.docker.images.name("late-guard")
+    new = {"owner": f"{house.docker.owner}-late", "network": f"{house.docker.network}-late", "guard_image": late}
+    options = house.docker.options(**new, devices=["/dev/null"])
+    site = house.core.sites.add(SiteCreate(name="late", tier="edge", runtime="docker", options=options))
+    house.needs_device("/dev/null")
+    instance = house.ask()
+    house.until(instance, State.PENDING, lambda record: "late: the network of the instances cannot" in record.reason)
+    assert "`make images` builds it" in site.runtime.blocked()
+    assert not site.unreachable
+    docker("tag", guard, late)
+    try:
+        assert house.until(instance, State.RUNNING).site == "late"
+        assert site.runtime.blocked() == ""
+        house.end(instance)
+        house.core.sites.delete("late")
+    finally:
+        docker("image", "rm", late)

@@ -15,6 +15,7 @@ from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.store import Store
 from skytether.testing.runtimes import (
+    BlockedRuntime,
     CrashingRuntime,
     NeverReadyRuntime,
     RefusingRuntime,
@@ -162,6 +163,26 @@ def test_what_cannot_be_started_waits_for_a_site_that_is_full(
     waiting = b.record("i2")
     assert (waiting.state, waiting.site) == (State.PENDING, None)
     assert waiting.reason == f"waiting for a site: lab: {NO_SPACE}; other: needs 1 cores, 0 of 1 are free"
+
+
+def test_nothing_is_placed_at_a_site_that_is_blocked_until_it_is_not(
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(BlockedRuntime)
+    add(b, new_record("i1", lease_expires_at=b.clock() + 100))
+    monkeypatch.setattr(b.runtime, "blocked", lambda: "")  # it is placed before anybody knows
+    b.step()
+    monkeypatch.undo()
+    add(b, new_record("i2", lease_expires_at=b.clock() + 100))
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    for instance in ("i1", "i2"):
+        assert b.record(instance).state is State.PENDING
+        assert b.record(instance).reason == "waiting for a site: lab: the network is missing"
+    b.runtime.obstacle = ""
+    b.step(3)
+    assert {b.record(instance).state for instance in ("i1", "i2")} == {State.RUNNING}
 
 
 def test_a_robot_that_vanishes_frees_what_it_held(bench: Any, new_record: NewRecord) -> None:

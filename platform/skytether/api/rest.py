@@ -69,7 +69,7 @@ class Refusal(Strict):
     site: str
     reason: str
     """Bounded, for metrics: ``tier``, ``architecture``, ``image``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``,
-    ``runtime``, ``start``, ``unreachable``."""
+    ``runtime``, ``start``, ``unreachable``, ``blocked``."""
     detail: str
 
 
@@ -240,8 +240,10 @@ class SiteCreate(Strict):
 class Site(SiteCreate):
     """A site and what is known of it."""
 
-    state: Literal["ready", "unreachable"] = "ready"
+    state: Literal["ready", "unreachable", "blocked"] = "ready"
+    """Blocked: it answers, and what runs there runs on, but nothing can be started."""
     reason: str = ""
+    """Why it is not ready."""
     cpu: float | None = None
     memory_mb: int | None = None
     gpu: int | None = None

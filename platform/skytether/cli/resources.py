@@ -69,8 +69,10 @@ def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False
     if json:
         print_json([plain(site) for site in found])
         return
-    rows = [(s.name, s.tier, s.runtime, s.state, or_dash(s.cpu), or_dash(s.memory_mb), s.instances) for s in found]
-    print_table(("site", "tier", "runtime", "state", "cores", "MiB", "instances"), rows)
+    rows = [
+        (s.name, s.tier, s.runtime, s.state, or_dash(s.cpu), or_dash(s.memory_mb), s.instances, s.reason) for s in found
+    ]
+    print_table(("site", "tier", "runtime", "state", "cores", "MiB", "instances", "reason"), rows)
 
 
 @site_app.command("show")

@@ -37,6 +37,8 @@ class Candidate:
     """Why this very instance could not be started there; None: it was not tried, or could."""
     unreachable: str | None = None
     """Why it does not answer; None: it does."""
+    blocked: str | None = None
+    """Why it can start nothing at present, though it answers; None: it can."""
     total: Capacity = NOTHING
     used: Capacity = NOTHING
     """What the instances that are there asked for."""
@@ -136,6 +138,8 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("loss", f"loss measured {measured.loss:.1%}, at most {needs.max_loss:.1%} allowed")
     if site.unreachable is not None:
         return no("unreachable", site.unreachable, for_good=False)
+    if site.blocked is not None:
+        return no("blocked", site.blocked, for_good=False)
     amounts = (
         ("cpu", "cores", needs.cpu, site.total.cpu, site.used.cpu),
         ("memory", "MiB of memory", needs.memory_mb, site.total.memory_mb, site.used.memory_mb),

@@ -323,7 +323,7 @@ class Reconciler:
     def _crash(self, site: Site, crash: Crash) -> None:
         changes = after_crash(crash, self._clock(), self._timing)
         if crash.unstarted and changes["failures"] >= _TRIES:
-            changes |= self._elsewhere(crash, gives_up=changes["state"] is State.FAILED)
+            changes |= self._elsewhere(site, crash, gives_up=changes["state"] is State.FAILED)
         after = self._store.change(crash.record, self._clock(), **changes)
         if after is None:
             return
@@ -339,11 +339,15 @@ class Reconciler:
                 self.moves.spare_failed(after)
             self._wake_placer()
 
-    def _elsewhere(self, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
-        """What else changes where a run cannot be started: the site is refused, if that leaves another one to try."""
-        record = crash.record
-        refusal = Refusal(site=record.site or "", reason=UNSTARTED, detail=crash.why)
-        decision = self.weigh(replace(record, refused=[*record.refused, refusal.model_dump()]))
+    def _elsewhere(self, site: Site, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
+        """What else changes where a run cannot be started: the site is refused, if that leaves another one to try.
+
+        A site that can start nothing at all is not refused for good: it says so itself, until it can.
+        """
+        record, refused = crash.record, list(crash.record.refused)
+        if not site.runtime.blocked():
+            refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
+        decision = self.weigh(replace(record, refused=refused))
         if decision.site is None and (decision.hopeless or not gives_up):
             several = gives_up and len(decision.refused) > 1
             return {"reason": f"no site can start it: {told(decision.refused)}"} if several else {}
@@ -353,8 +357,8 @@ class Reconciler:
             "site": None,
             "host": None,
             "port": None,
-            "reason": f"site {record.site}: the service {crash.why}; trying another site",
-            "refused": [refused.model_dump() for refused in decision.refused],
+            "reason": f"site {site.name}: the service {crash.why}; trying another site",
+            "refused": [refusal.model_dump() for refusal in decision.refused],
             "failures": 0,
             "restarts": 0,
             "start_at": 0.0,

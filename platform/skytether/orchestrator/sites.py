@@ -132,6 +132,7 @@ class Site:
             cannot_run=self.runtime.refuses(spec),
             unstarted=unstarted,
             unreachable=self.unreachable or None,
+            blocked=self.runtime.blocked() or None,
             total=self.capacity or NOTHING,
             used=used,
             load=self.load or 0.0,

@@ -156,3 +156,19 @@ class RefusingRuntime(FakeRuntime):
     @override
     def start(self, launch: Launch) -> None:
         raise RuntimeFailure("no space left on the site")
+
+
+class BlockedRuntime(FakeRuntime):
+    """Nothing can be started, and it says so, until ``obstacle`` is emptied."""
+
+    obstacle = "the network is missing"
+
+    @override
+    def blocked(self) -> str:
+        return self.obstacle
+
+    @override
+    def start(self, launch: Launch) -> None:
+        if self.obstacle:
+            raise RuntimeFailure(self.obstacle)
+        super().start(launch)

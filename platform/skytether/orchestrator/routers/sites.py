@@ -16,6 +16,7 @@ router = APIRouter(prefix=f"{PREFIX}/sites", tags=["sites"])
 
 def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
     asked, total = site.asked, site.capacity
+    unreachable, blocked = site.unreachable, site.runtime.blocked()
     return Site(
         name=asked.name,
         tier=asked.tier,
@@ -24,8 +25,8 @@ def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
         speed=asked.speed,
         cost=asked.cost,
         images=asked.images,
-        state="unreachable" if site.unreachable else "ready",
-        reason=site.unreachable,
+        state="unreachable" if unreachable else "blocked" if blocked else "ready",
+        reason=unreachable or blocked,
         cpu=total.cpu if total else None,
         memory_mb=total.memory_mb if total else None,
         gpu=total.gpu if total else None,

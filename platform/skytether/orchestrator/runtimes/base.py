@@ -1,9 +1,9 @@
 """What a runtime is: six calls, and what each of them means.
 
 A runtime starts, stops and observes instances on one site. It decides nothing: when to start again, how long to wait
-for an end, what to do with strangers is the reconciler's. All calls come from the site's own thread, except ``logs``
-and ``refuses``, which may come from any. No call waits for a service: what takes long is begun, and ``observe`` tells
-how far it is.
+for an end, what to do with strangers is the reconciler's. All calls come from the site's own thread, except ``logs``,
+``refuses`` and ``blocked``, which may come from any. No call waits for a service: what takes long is begun, and
+``observe`` tells how far it is.
 
 A runtime is found by its entry point in group ``skytether.runtimes``; ``tests/contracts`` is the suite each must
 pass.
@@ -140,6 +140,10 @@ class Runtime(ABC):
     @abstractmethod
     def refuses(self, spec: ServiceSpec) -> str | None:
         """Why this runtime cannot run the service at all (no image, no entry point); None: it can. Pure."""
+
+    def blocked(self) -> str:
+        """Why nothing can be started at present, though the site answers; empty: nothing is known. From any thread."""
+        return ""
 
     @abstractmethod
     def capacity(self) -> Capacity:

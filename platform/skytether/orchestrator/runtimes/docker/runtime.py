@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import secrets
 import threading
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from typing_extensions import override
 from skytether.api.manifest import ServiceSpec, Strict
 
 from ..base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
-from .engine import Engine
+from .engine import Engine, EngineGoneError
 from .follow import Follower
 from .images import check_credentials
 from .launch import Job, kill, remove
@@ -25,6 +28,9 @@ from .objects import Seen, observation, refusal
 from .options import DockerOptions
 
 log = logging.getLogger(__name__)
+
+_AGAIN_S = 10.0
+"""Seconds between two attempts to make the network of a site ready that could not be."""
 
 
 class DockerRuntime(Runtime):
@@ -56,6 +62,9 @@ class DockerRuntime(Runtime):
         """Containers that were asked to end."""
         self._network_lock = threading.Lock()
         self._network_ready = False
+        self._blocked = ""
+        """Why the network cannot be made ready, as far as is known."""
+        self._tried_at = -math.inf
         self._early: threading.Thread | None = None
         self._follower = Follower(self._engine, self._owner, self._on_connect, options.timeout_s)
         self._follower.start()
@@ -67,20 +76,35 @@ class DockerRuntime(Runtime):
 
     def _on_connect(self) -> None:
         self._network_ready = False  # the engine's machine may have been started anew, without our filter
+        self._begin_early()
+
+    def _begin_early(self) -> None:
+        self._tried_at = time.monotonic()
         self._early = threading.Thread(target=self._prepare_early, name="docker-network", daemon=True)
         self._early.start()
 
     def _prepare_early(self) -> None:
-        try:
+        with suppress(RuntimeFailure):  # each start tries again, and says it to who asked
             self._prepare()
-        except RuntimeFailure as error:  # each start tries again, and says it to who asked
-            log.warning("site %s: nothing can be started yet: %s", self._site, error)
 
     def _prepare(self, *, anew: bool = False) -> None:
         with self._network_lock:
             if anew or not self._network_ready:
-                ensure_network(self._engine, self._options)
-                self._network_ready = True
+                self._network_ready = False
+                try:
+                    ensure_network(self._engine, self._options)
+                except EngineGoneError:
+                    raise
+                except RuntimeFailure as error:
+                    if str(error) != self._blocked:
+                        log.warning("site %s: nothing can be started: %s", self._site, error)
+                    self._blocked = str(error)
+                    raise
+                self._network_ready, self._blocked = True, ""
+
+    @override
+    def blocked(self) -> str:
+        return self._blocked
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return refusal(spec, self._options)
@@ -180,7 +204,14 @@ class DockerRuntime(Runtime):
 
     @override
     def tidy(self) -> None:
-        """Remove what was made and never begun: an orchestrator was killed, or an engine answered too late."""
+        """Remove what was begun by halves, and see whether what the network lacked is there by now."""
+        self._remove_unbegun()
+        trying = self._early is not None and self._early.is_alive()
+        if self._blocked and not trying and time.monotonic() - self._tried_at >= _AGAIN_S:
+            self._begin_early()
+
+    def _remove_unbegun(self) -> None:
+        """What was made and never begun: an orchestrator was killed, or an engine answered too late."""
         with self._lock:
             busy = {instance for instance, job in self._jobs.items() if not job.ended}
         for seen in self._follower.seen(self._options.timeout_s):
@@ -189,7 +220,7 @@ class DockerRuntime(Runtime):
 
     @override
     def dismantle(self) -> None:
-        self.tidy()
+        self._remove_unbegun()
         remove_network(self._engine, self._options)
 
     @override
