@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-
+from .exposition import Family, Sample, Sums, counter, gauge
 from .rest import Report
 
 OUTCOMES = ("sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded", "duplicate")
@@ -42,39 +41,11 @@ Counts = Mapping[tuple[str, ...], float]
 """Counters by metric and labels."""
 
 
-class Sums(dict[tuple[str, ...], float]):
-    """Samples by labels. A robot may hold two instances of one service: counts add up, and of gauges the last stays."""
-
-    def add(self, labels: tuple[str, ...], value: float) -> None:
-        """One more."""
-        self[labels] = self.get(labels, 0.0) + value
-
-    def put(self, labels: tuple[str, ...], value: float | None) -> None:
-        """The value now, if it is known."""
-        if value is not None:
-            self[labels] = value
-
-
-def gauge(name: str, text: str, labels: Iterable[str], samples: Mapping[tuple[str, ...], float]) -> Metric:
-    """A gauge of ours with its samples."""
-    family = GaugeMetricFamily(f"skytether_{name}", text, labels=list(labels))
-    for key, value in samples.items():
-        family.add_metric(key, value)
-    return family
-
-
-def counter(name: str, text: str, labels: Iterable[str], samples: Mapping[tuple[str, ...], float]) -> Metric:
-    """A counter of ours with its samples."""
-    family = CounterMetricFamily(f"skytether_{name}", text, labels=list(labels))
-    for key, value in samples.items():
-        family.add_metric(key, value)
-    return family
-
-
-def of_reports(reports: Sequence[tuple[Labels, Report]]) -> Iterator[Metric]:
-    """All that robots have reported."""
-    yield from gauges_of(reports)
-    yield from counters_of([((labels[0], labels[1]), counts_of(report)) for labels, report in reports])
+def of_report(labels: Labels, report: Report) -> Iterator[Family]:
+    """All that a robot has reported."""
+    robot, service, _ = labels
+    yield from gauges_of([(labels, report)])
+    yield from counters_of({(robot, service): counts_of(report)})
 
 
 def counts_of(report: Report) -> dict[tuple[str, ...], float]:
@@ -92,21 +63,29 @@ def counts_of(report: Report) -> dict[tuple[str, ...], float]:
     return counts
 
 
-def counters_of(
-    accounts: Iterable[tuple[Owner, Counts]], table: Mapping[str, Described] = COUNTERS
-) -> Iterator[Metric]:
+def counters_of(accounts: Mapping[Owner, Counts], table: Mapping[str, Described] = COUNTERS) -> Iterator[Family]:
     """Those counters of robots' services that a table describes."""
-    sums = {name: Sums() for name in table}
-    for (robot, service), counts in accounts:
-        for (name, *labels), value in counts.items():
-            if name in sums:
-                sums[name].add((robot, *labels) if table[name].robots else (robot, service, *labels), value)
+    samples: dict[str, list[Sample]] = {name: [] for name in table}
+    for owner, counts in accounts.items():
+        for key, value in counts.items():
+            if key[0] in samples:
+                samples[key[0]].append(((*owner, *key[1:]), value))
     for name, described in table.items():
-        owner = ("robot",) if described.robots else ("robot", "service")
-        yield counter(name, described.text, (*owner, *described.labels), sums[name])
+        if described.robots:
+            yield counter(name, described.text, ("robot", *described.labels), _of_robots(samples[name]).items())
+        else:
+            yield counter(name, described.text, ("robot", "service", *described.labels), samples[name])
 
 
-def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Metric]:
+def _of_robots(samples: Iterable[Sample]) -> Sums:
+    """Whatever the service."""
+    sums = Sums()
+    for (robot, _, *labels), value in samples:
+        sums.add((robot, *labels), value)
+    return sums
+
+
+def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
     """What is so now."""
     rtt, source, load, battery, delay, jitter = Sums(), Sums(), Sums(), Sums(), Sums(), Sums()
     for (robot, service, site), report in reports:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from functools import reduce
+from math import inf
 from typing import Any
 
 from skytether.api.report_metrics import Counts
@@ -46,26 +48,33 @@ class Account:
             counts: By metric and labels.
         """
         known = self._lives.pop(life, {})
-        series = self.sums()
-        number = Counter(key[0] for key in series.keys() | known.keys())
+        if not counts.keys() <= known.keys():
+            counts = self._with_room(counts, known)
         for key, value in counts.items():
-            if key not in known and key not in series:
-                if number[key[0]] >= _MOST_SERIES:
-                    continue
-                number[key[0]] += 1
-            known[key] = max(known.get(key, value), value)
+            if value > known.get(key, -inf):
+                known[key] = value
         self._lives[life] = known
         kind = life.partition(":")[0]
         same = [other for other in self._lives if other.partition(":")[0] == kind]
         for oldest in same[: -_MOST_LIVES[kind]]:
-            _add(self._past, self._lives.pop(oldest))
+            self._past = _added(self._past, self._lives.pop(oldest))
+
+    def _with_room(self, counts: Counts, known: Counts) -> Counts:
+        """Without new ones of a metric that has too many."""
+        series = self.sums().keys() | known.keys()
+        number = Counter(key[0] for key in series)
+        room = {}
+        for key, value in counts.items():
+            if key not in series:
+                if number[key[0]] >= _MOST_SERIES:
+                    continue
+                number[key[0]] += 1
+            room[key] = value
+        return room
 
     def sums(self) -> dict[tuple[str, ...], float]:
         """By metric and labels."""
-        sums = dict(self._past)
-        for counts in self._lives.values():
-            _add(sums, counts)
-        return sums
+        return reduce(_added, self._lives.values(), self._past)
 
 
 def of_run(record: Record, seen: Observation) -> tuple[str, Counts]:
@@ -89,9 +98,13 @@ def of_robot(report: Report) -> str:
     return f"robot:{report.life}"
 
 
-def _add(sums: dict[tuple[str, ...], float], counts: Counts) -> None:
-    for key, value in counts.items():
+def _added(one: dict[tuple[str, ...], float], other: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
+    """The sums of both; less work where one of them has few."""
+    small, large = sorted((one, other), key=len)
+    sums = dict(large)
+    for key, value in small.items():
         sums[key] = sums.get(key, 0) + value
+    return sums
 
 
 def _counts(rows: Iterable[tuple[list[str], float]]) -> dict[tuple[str, ...], float]:

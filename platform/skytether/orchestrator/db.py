@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic_core import from_json
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
@@ -40,14 +41,18 @@ def make_engine(url: str, name: str = NAME) -> Engine:
     sync to disk (a power cut may lose the last moments, a crash of the program does not). Transactions on an engine
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
 
+    JSON is read by pydantic's reader, in half the time of Python's; what it refuses (half a character, hundreds of
+    levels) was refused before it was stored.
+
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
     it under ``name``.
     """
     address = make_url(url)
     if address.get_backend_name() == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
-        return create_engine(address, pool_pre_ping=True, connect_args={**_POSTGRES, "application_name": name})
-    engine = create_engine(address)
+        connect_args = {**_POSTGRES, "application_name": name}
+        return create_engine(address, pool_pre_ping=True, connect_args=connect_args, json_deserializer=from_json)
+    engine = create_engine(address, json_deserializer=from_json)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)
         event.listen(engine, "begin", _begin_sqlite)

@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import Metric
-from prometheus_client.registry import Collector
 
+from skytether.api.exposition import Family, Sums, exposition, gauge
 from skytether.api.manifest import ANY_TOPIC
-from skytether.api.report_metrics import INSTANCE, Described, Owner, Sums, counters_of, gauge, gauges_of
+from skytether.api.report_metrics import INSTANCE, Described, Owner, counters_of, gauges_of
 from skytether.api.rest import Refusal, Report
 
 from .accounts import Account, of_instance, of_run
@@ -51,7 +50,7 @@ class SiteGauges:
     load: float | None
 
 
-class Metrics(Collector):
+class Metrics:
     """The registry of one orchestrator, and what feeds it."""
 
     def __init__(
@@ -97,11 +96,10 @@ class Metrics(Collector):
             ("service", "site", "reason"),
             registry=self._registry,
         )
-        self._registry.register(self)
 
     def text(self) -> bytes:
         """In Prometheus' text format."""
-        return generate_latest(self._registry)
+        return generate_latest(self._registry) + exposition(self._families())
 
     def phase(self, record: Record, phase: str, seconds: float) -> None:
         """One part of an instance's start; a clock that was set back gives no negative ones."""
@@ -141,11 +139,7 @@ class Metrics(Collector):
         self._start.remove_by_labels({"service": service})
         self._refusals.remove_by_labels({"service": service})
 
-    def describe(self) -> Iterable[Metric]:
-        """Nothing: the registry would otherwise collect once at registration."""
-        return ()
-
-    def collect(self) -> Iterator[Metric]:
+    def _families(self) -> Iterator[Family]:
         running = list(self._running())
         # After the look at what runs: a run's use is in the account before the run is seen no more.
         accounts, known = dict(self._accounts()), self._reports()
@@ -158,11 +152,11 @@ class Metrics(Collector):
             if one.observation:
                 account.merge(*of_run(one.record, one.observation))
             places.add((*owner, one.record.site or ""))
-        sums = [(owner, account.sums()) for owner, account in counted.items()]
-        used = [
-            (owner, {key: n for key, n in counts.items() if key[0] in USED and (*owner, key[1]) in places})
-            for owner, counts in sums
-        ]
+        sums = {owner: account.sums() for owner, account in counted.items()}
+        used = {
+            owner: {key: n for key, n in counts.items() if key[0] in USED and (*owner, key[1]) in places}
+            for owner, counts in sums.items()
+        }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
         yield from counters_of(used, USED)
@@ -171,7 +165,7 @@ class Metrics(Collector):
         yield from gauges_of([((r.robot, r.service, r.site or ""), report) for r, report in reports])
 
 
-def _memory(running: Iterable[Running]) -> Metric:
+def _memory(running: Iterable[Running]) -> Family:
     memory = Sums()
     for one in running:
         if one.observation and one.observation.memory_bytes is not None:
@@ -180,7 +174,7 @@ def _memory(running: Iterable[Running]) -> Metric:
     return gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
 
 
-def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Metric]:
+def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Family]:
     up, cores, memory, load, promised, count = Sums(), Sums(), Sums(), Sums(), Sums(), Sums()
     for site in sites:
         labels = (site.name,)

@@ -5,11 +5,12 @@ Wall-clock, not monotonic: leases and back-off must mean the same after a restar
 
 from __future__ import annotations
 
-import json
 import secrets
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
+
+from pydantic_core import to_json
 
 from skytether.api.manifest import Manifest, ServiceSpec
 from skytether.api.rest import State
@@ -92,11 +93,11 @@ class Record:
 
     @cached_property
     def spec(self) -> ServiceSpec:
-        return _spec(json.dumps(self.manifest))
+        return _spec(to_json(self.manifest))
 
 
 @lru_cache(maxsize=256)
-def _spec(manifest: str) -> ServiceSpec:
+def _spec(manifest: bytes) -> ServiceSpec:
     """Parsed once: a pass over many instances asks again and again, and few services are theirs."""
     return Manifest.model_validate_json(manifest).spec
 

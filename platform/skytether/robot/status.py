@@ -8,17 +8,14 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from math import isfinite
 from typing import Any
 
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import Metric
-from prometheus_client.registry import Collector
-
 from skytether.api import rest
-from skytether.api.report_metrics import Sums, counter, gauge, of_reports
+from skytether.api.exposition import Family, Sums, counter, exposition, gauge
+from skytether.api.report_metrics import of_report
 
 from .snapshot import AgentStatus
 from .task_manager import Decision, Option
@@ -87,9 +84,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
 
 def metrics(robot: str, service: str, status: AgentStatus, report: rest.Report) -> bytes:
     """What ``/metrics`` says: the report that the orchestrator gets too, and what is the robot's own business."""
-    registry = CollectorRegistry()
-    registry.register(_Once(_families(robot, service, status, report)))
-    return generate_latest(registry)
+    return exposition(_families(robot, service, status, report))
 
 
 class StatusServer:
@@ -150,18 +145,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Looks are not logged."""
 
 
-class _Once(Collector):
-    def __init__(self, families: Iterable[Metric]) -> None:
-        self._families = list(families)
-
-    def collect(self) -> Iterable[Metric]:
-        return self._families
-
-
-def _families(robot: str, service: str, status: AgentStatus, report: rest.Report) -> Iterator[Metric]:
+def _families(robot: str, service: str, status: AgentStatus, report: rest.Report) -> Iterator[Family]:
     instance = status.instance
     site = instance.placement.site if instance and instance.placement else ""
-    yield from of_reports([((robot, service, site), report)])
+    yield from of_report((robot, service, site), report)
     seconds, connected, errors, cost = Sums(), Sums(), Sums(), Sums()
     for source, spent in status.driver.seconds.items():
         seconds.add((robot, service, source), spent)
@@ -170,9 +157,9 @@ def _families(robot: str, service: str, status: AgentStatus, report: rest.Report
         errors.add((robot, part), count)
     for option in status.decision.options if status.decision else ():
         cost.put((robot, service, option.name), option.cost)
-    yield counter("control_seconds", "Time under each source", ("robot", "service", "source"), seconds)
+    yield counter("control_seconds", "Time under each source", ("robot", "service", "source"), seconds.items())
     yield gauge("session_connected", "1 while the bridge has a session", ("robot", "service"), connected)
-    yield counter("control_errors", "Exceptions caught in the control loop", ("robot", "part"), errors)
+    yield counter("control_errors", "Exceptions caught in the control loop", ("robot", "part"), errors.items())
     labels = ("robot", "service", "option")
     yield gauge("task_cost", "What the task manager reckons for each site and for local; +Inf: ruled out", labels, cost)
 
