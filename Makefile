@@ -9,15 +9,24 @@ export PYTHONDONTWRITEBYTECODE :=
 
 AGAIN := --reruns 2 --reruns-delay 3
 UNIT := $(BIN)/pytest -m "not slow"
+SLOW := $(BIN)/pytest $(AGAIN) --durations 30 -m "slow
 
-.PHONY: demo test unit images fuzz check fmt docs lock clean
+.PHONY: demo test slow-engine-ros1 slow-others unit images fuzz check fmt docs lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) -n 2 --dist loadfile || { echo "once more, those that failed:"; $(UNIT) --last-failed; }
-	$(BIN)/pytest -m slow $(AGAIN) --durations 30
+	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
+	$(MAKE) --no-print-directory --jobs 2 --output-sync slow-engine-ros1 slow-others
+	$(SLOW) and not together"
+
+slow-engine-ros1: $(READY)
+	$(SLOW) and together and (docker or ros1)"
+
+slow-others: $(READY)
+	$(SLOW) and together and not docker and not ros1"
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile

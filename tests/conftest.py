@@ -27,6 +27,52 @@ settings.register_profile("skytether", deadline=None, max_examples=30)
 settings.load_profile("skytether")
 
 
+TOGETHER = (
+    "bridge/test_mtu.py",
+    "cli/test_completion.py",
+    "cli/test_doctor.py",
+    "cli/test_relay.py",
+    "cli/test_resources.py",
+    "contracts/",
+    "e2e/test_compose.py",
+    "e2e/test_replay.py",
+    "lab/test_bench_bridge.py",
+    "lab/test_bench_fleet.py",
+    "lab/test_bench_start.py",
+    "lab/test_embedded.py",
+    "lab/test_world.py",
+    "orchestrator/test_backup.py",
+    "orchestrator/test_docker.py",
+    "orchestrator/test_docker_orchestrated.py",
+    "orchestrator/test_faults_engine.py",
+    "orchestrator/test_images.py",
+    "orchestrator/test_migrations.py",
+    "orchestrator/test_moves.py",
+    "orchestrator/test_plan.py",
+    "orchestrator/test_process.py",
+    "orchestrator/test_tls_and_logs.py",
+    "robot/safety/test_footprint.py",
+    "robot/safety/test_rules.py",
+    "robot/test_arbiter.py",
+    "robot/test_ros2.py",
+    "robot/test_supervisor.py",
+    "ros/",
+    "service/test_calls.py",
+    "services/",
+    "wire/",
+)
+"""Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `make test` runs two at a time."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.is_relative_to(here) and item.path.relative_to(here).as_posix().startswith(TOGETHER):
+            item.add_marker(pytest.mark.together)
+
+
 def pytest_configure() -> None:
     """Started in the background of a script, a program has its interrupt signal ignored, and so have its children."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
