@@ -35,6 +35,7 @@ TOGETHER = (
     "cli/test_resources.py",
     "contracts/",
     "e2e/test_compose.py",
+    "e2e/test_demo.py::test_demo_prints_one_json_object",
     "e2e/test_replay.py",
     "lab/test_bench_bridge.py",
     "lab/test_bench_fleet.py",
@@ -50,6 +51,7 @@ TOGETHER = (
     "orchestrator/test_moves.py",
     "orchestrator/test_plan.py",
     "orchestrator/test_process.py",
+    "orchestrator/test_replicas.py",
     "orchestrator/test_tls_and_logs.py",
     "robot/safety/test_footprint.py",
     "robot/safety/test_rules.py",
@@ -69,8 +71,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what `make test` runs two at a time."""
     here = Path(__file__).parent
     for item in items:
-        if item.path.is_relative_to(here) and item.path.relative_to(here).as_posix().startswith(TOGETHER):
-            item.add_marker(pytest.mark.together)
+        if item.path.is_relative_to(here):
+            name = f"{item.path.relative_to(here).as_posix()}::{item.name}"
+            if name.startswith(TOGETHER):
+                item.add_marker(pytest.mark.together)
 
 
 def pytest_configure() -> None:
