@@ -107,6 +107,7 @@ def test_small_verbs(script: Script, client: Client) -> None:
     assert 0 < client.probe("lab") < 5
     assert client.logs("i1", tail=7) == "grün\n"
     script.answers["GET", "/api/v1/instances/i1/logs?tail=7&follow=true"] = (200, "text/plain", b"as it comes\n")
+    script.says("GET", "/api/v1/instances/i1", INSTANCE)
     assert "".join(client.follow_logs("i1", tail=7)) == "as it comes\n"
 
 
@@ -219,6 +220,34 @@ def test_waiting_gives_the_running_instance_or_says_why_not(script: Script, clie
     script.answers["GET", path] = (200, "text/event-stream", events("pending", "failed"))
     with pytest.raises(NotRunning, match=r"^instance i1 is failed: r2$"):
         client.wait_running("i1", timeout=5)
+
+
+@contextmanager
+def answering(*answers: bytes) -> Iterator[str]:
+    """A server that gives these answers, whatever it is asked, and closes the connection after each; its address."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            for answer in answers:
+                connection, _ = listener.accept()
+                with connection:
+                    connection.recv(65536)
+                    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n" + answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        thread.join()
+
+
+def test_a_log_is_followed_on_after_its_orchestrator_was_away() -> None:
+    document = json.dumps(INSTANCE).encode()
+    instance = b"Content-Length: %d\r\n\r\n%s" % (len(document), document)
+    cut_off = b"Transfer-Encoding: chunked\r\n\r\n4\r\none\n\r\n"
+    said: list[str] = []
+    with answering(instance, cut_off, b"Content-Length: 8\r\n\r\none\ntwo\n") as url, Client(url) as client:
+        said.extend(client.follow_logs("i1", on_resume=lambda: said.append("again: ")))
+    assert "".join(said) == "one\nagain: one\ntwo\n"
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from skytether.api import client
 from skytether.api.rest import InstanceCreate
 from skytether.orchestrator.runtimes.base import LogStream
 from skytether.orchestrator.runtimes.process import FileLog
@@ -59,10 +60,16 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Script:
     return made
 
 
-def test_it_goes_over_http(served: Any, script: Script) -> None:
-    served.site()
+def test_it_goes_over_http_until_the_run_ends(served: Any, script: Script, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_END_SEEN_S", 0.2)
+    runtime = served.site()
     robot = served.robot()
     made = robot.create_instance(InstanceCreate(robot="walker", service="toy"))
     robot.wait_running(made.id)
-    assert "".join(robot.follow_logs(made.id)) == "one\ntwo\n"
+    text = ""
+    for piece in robot.follow_logs(made.id):
+        text += piece
+        if text.endswith("two\n"):
+            runtime.crash(made.id)
+    assert text == "one\ntwo\n"
     assert script.closed

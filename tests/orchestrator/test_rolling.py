@@ -225,8 +225,17 @@ def test_a_rolling_update_to_a_new_schema_is_noticed_by_nobody(
             except Exception as error:
                 seen.append(repr(error))
 
-        watcher = threading.Thread(target=watch, daemon=True)
-        watcher.start()
+        log: list[str] = []
+
+        def follow() -> None:
+            try:
+                log.extend(connect(proxy.url).follow_logs(held[0].id, on_resume=lambda: log.append("(again) ")))
+            except Exception as error:
+                log.append(repr(error))
+
+        followers = [threading.Thread(target=stream, daemon=True) for stream in (watch, follow)]
+        for follower in followers:
+            follower.start()
         try:
             handed_over = replace(one, two, newer, leads=True)
             # The other one, which leads still, finds another schema under its feet.
@@ -249,9 +258,13 @@ def test_a_rolling_update_to_a_new_schema_is_noticed_by_nobody(
         assert {i.id for i in operator.instances()} <= {*asked, *(i.id for i in held)}, "nothing was made twice"
         until(lambda: services(tmp_path / "instances") == pids)
         operator.delete_instance(held[0].id)
-        watcher.join(30)
+        for follower in followers:
+            follower.join(30)
         until(lambda: operator.get_instance(held[0].id).state is State.STOPPED)
     assert seen == ["pending", "placing", "starting", "running", "stopping", "stopped"], "one stream, over all of it"
+    assert not any(follower.is_alive() for follower in followers)
+    assert set("".join(log).split("(again) ")) == {"toy service\n"}, "so is the log, once for each connection"
+    assert "(again) " in log
     assert "Traceback" not in one.log + two.log
     status, line = old_over_new(pair[0])
     assert status == 1

@@ -49,6 +49,8 @@ _PING_LIMIT = 45.0
 _RESUME_S = 30.0
 """How long an event stream that was lost is tried again [s]: an orchestrator is restarted in less."""
 _RESUME_PAUSE_S = 0.2
+_END_SEEN_S = 1.0
+"""By when an orchestrator has seen that a run has ended [s]."""
 _AWAY = (502, 503, 504)
 """Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
 _REPEATABLE = ("/renew", "/migrate")
@@ -165,14 +167,56 @@ class Client:
         """The last lines that it wrote."""
         return self._request("GET", f"/instances/{instance_id}/logs?tail={tail}").text
 
-    def follow_logs(self, instance_id: str, tail: int = 200) -> Iterator[str]:
-        """The last lines of its present run, then what that writes as it comes, until it ends."""
+    def follow_logs(
+        self, instance_id: str, tail: int = 200, on_resume: Callable[[], None] = lambda: None
+    ) -> Iterator[str]:
+        """The last lines of its present run, then what that writes as it comes, until it ends.
+
+        An orchestrator that ends meanwhile is waited for, or another one asked. The last lines come once more then.
+
+        Args:
+            instance_id: Which.
+            tail: How many lines.
+            on_resume: Called before what another connection brings.
+        """
         path = f"/instances/{instance_id}/logs?tail={tail}&follow=true"
-        try:
-            with self._stream(path, None) as response:
-                yield from response.iter_text()
-        except httpx.TransportError as error:
-            raise self._unreachable(error) from error
+        run = self._run(instance_id)
+        reached, silent_since = False, None
+        while True:
+            try:
+                with self._stream(path, None) as response:
+                    if reached:
+                        on_resume()
+                    reached, silent_since = True, None
+                    yield from response.iter_text()
+                    if "content-length" in response.headers:
+                        return  # nothing runs, or it cannot be followed: that was all there is
+                # The stream has ended with the run, or with the orchestrator; which, is known a moment later.
+                time.sleep(_END_SEEN_S)
+                if self._run(instance_id) != run:
+                    return
+            except (httpx.TransportError, Unreachable, ApiError) as error:
+                silent_since = silent_since or time.monotonic()
+                self._must_return(error, reached, silent_since)
+                time.sleep(_RESUME_PAUSE_S)
+
+    def _run(self, instance_id: str) -> int | None:
+        """Which run of an instance is the present one; None: it has ended."""
+        instance = self.get_instance(instance_id)
+        return None if instance.state.final else instance.restarts
+
+    def _must_return(self, error: Exception, reached: bool, silent_since: float) -> None:
+        """After an error of a stream: return, if whoever sent it can be expected back.
+
+        Raises:
+            ApiError: It said that it will not.
+            Unreachable: It was never there, or has been away for too long.
+        """
+        away = not isinstance(error, ApiError) or error.problem.status in _AWAY
+        if not (reached and away) or time.monotonic() - silent_since > _RESUME_S:
+            if isinstance(error, httpx.TransportError):
+                raise self._unreachable(error) from error
+            raise error
 
     def watch(self, instance_id: str, after: int = 0, *, timeout: float | None = None) -> Iterator[InstanceEvent]:
         """Every change so far after event ``after``, then each as it comes, until the instance has ended.
@@ -203,11 +247,7 @@ class Client:
                 if now >= deadline:
                     return
                 silent_since = silent_since or now
-                away = not isinstance(error, ApiError) or error.problem.status in _AWAY
-                if not (reached and away) or now - silent_since > _RESUME_S:
-                    if isinstance(error, httpx.TransportError):
-                        raise self._unreachable(error) from error
-                    raise
+                self._must_return(error, reached, silent_since)
                 time.sleep(min(_RESUME_PAUSE_S, max(0.0, deadline - now)))
 
     def _watch(self, instance_id: str, after: int, deadline: float) -> Iterator[InstanceEvent]:

@@ -26,6 +26,7 @@ SiteName = Annotated[str, typer.Argument(help="Its name.", autocompletion=names.
 InstanceId = Annotated[str, typer.Argument(help="Its id.", autocompletion=names.instances)]
 Wait = Annotated[bool, typer.Option(help="Wait until it runs, and show how far it is.")]
 Timeout = Annotated[float, typer.Option("--timeout-s", min=0.1, help="How long to wait.")]
+_RESUMED = "the orchestrator was away: connected again, the last lines once more"
 _TIMEOUT_S = 600.0
 """A large image is pulled in that time."""
 
@@ -219,7 +220,7 @@ def show_logs(
         fail("--follow prints as it comes: leave --json out", 2)
     with connected(url, token_file) as client:
         if follow:
-            for text in client.follow_logs(instance, tail):
+            for text in client.follow_logs(instance, tail, lambda: console.print(_RESUMED)):
                 typer.echo(text, nl=False)
             return
         text = client.logs(instance, tail)
