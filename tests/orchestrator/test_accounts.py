@@ -8,7 +8,7 @@ from typing import Any
 
 from skytether.api.rest import State
 from skytether.orchestrator.accounts import Account
-from skytether.orchestrator.store import Store, Told
+from skytether.orchestrator.store import Store
 
 KEY = ("topic_messages", "scan", "64", "in", "sent")
 
@@ -65,14 +65,14 @@ def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store,
     record = store.add(new_record(state=State.RUNNING), "robot:walker", None, "")
     now = record.created_at
     for value in (5, 4):
-        store.renew(record.id, now, None, told=lambda _, value=value: Told({}, "robot:a", {KEY: value}))
+        store.hear({record.id: (now, {})}, {("walker", "toy"): [("robot:a", {KEY: value})]})
     store.count(record, [("run:i1:1", {("instance_cpu_seconds", "lab"): 2.5})])
     assert store.accounts()["walker", "toy"].sums() == {KEY: 5, ("instance_cpu_seconds", "lab"): 2.5}
     store.prune(now, ended_age=10, ended_count=10, events_count=10)
     assert ("walker", "toy") in store.accounts()
     record = store.get(record.id)
     assert record is not None
-    assert store.renew(record.id, now, None, robot="other", told=lambda _: Told({}, "x", {KEY: 9})) is None
+    assert store.renew(record.id, now, None, robot="other") is None
     stopping = store.change(record, now, state=State.STOPPING)
     assert stopping is not None
     assert store.change(stopping, now, state=State.STOPPED)

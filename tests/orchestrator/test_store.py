@@ -16,7 +16,7 @@ from skytether.orchestrator.models import metadata
 from skytether.orchestrator.moves import FOREVER
 from skytether.orchestrator.records import IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
-from skytether.orchestrator.store import KeyReusedError, Store, Told
+from skytether.orchestrator.store import KeyReusedError, Store
 
 NewRecord = Callable[..., Record]
 NOW = 1_700_000_000.0
@@ -96,8 +96,7 @@ def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecor
     assert [r.id for r in store.spares("toy")] == ["warm"]
     for name, source in (("a", "cloud"), ("b", "stop"), ("c", None)):
         store.add(new_record(name, state=State.RUNNING), "operator", None, "")
-        told = Told({"control_source": source}, "robot:a", {})
-        store.renew(name, NOW, None, told=lambda _, told=told: told)  # type: ignore[misc]
+        store.hear({name: (NOW, {"control_source": source})}, {("walker", "toy"): [("robot:a", {})]})
     assert store.reports() == {n: {"control_source": s} for n, s in (("a", "cloud"), ("b", "stop"), ("c", None))}
     assert store.reports(("stop", "fallback")) == {"b": {"control_source": "stop"}}
 
@@ -182,11 +181,11 @@ def test_a_renewal_beats_who_was_about_to_end_it(store: Store, new_record: NewRe
     record = store.add(new_record(site="lab", state=State.RUNNING), "operator", None, "")
     renewed = store.renew("i1", NOW + 14, None)
     assert renewed is not None
-    assert renewed.lease_expires_at == NOW + 29
+    assert renewed.record.lease_expires_at == NOW + 29
     assert store.change(record, NOW + 15, state=State.STOPPING) is None
     longer = store.renew("i1", NOW + 20, 60)
     assert longer is not None
-    assert (longer.lease_s, longer.lease_expires_at) == (60, NOW + 80)
+    assert (longer.record.lease_s, longer.record.lease_expires_at) == (60, NOW + 80)
 
 
 def test_what_ends_is_not_renewed(store: Store, new_record: NewRecord) -> None:

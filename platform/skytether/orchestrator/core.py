@@ -25,6 +25,7 @@ from .loops import Loop
 from .metrics import Metrics, Running, SiteGauges
 from .moves import Moves
 from .reconcile import Reconciler
+from .reports import PERIOD, Reports
 from .runtimes.base import Runtime
 from .security import SecretFileError, Secrets
 from .settings import Settings
@@ -67,6 +68,7 @@ class Orchestrator:
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise))
+        self.reports = Reports(self.store)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -106,6 +108,7 @@ class Orchestrator:
         )
         self.reconciler.moves = moves
         self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_step), time.monotonic)
+        self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
         self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(
             self.store,
@@ -114,6 +117,7 @@ class Orchestrator:
             self.reconciler,
             moves,
             self.metrics,
+            self.reports,
             secrets,
             clock,
             self._wake_placer,
@@ -139,6 +143,11 @@ class Orchestrator:
         self.elector.wait_first(_FIRST_LOOK)
         self.sites.start(self.settings.local_site)
         self.placer.start()
+        self.writer.start()
+
+    def _write_reports(self) -> float:
+        self.reports.write()
+        return PERIOD
 
     def _elect(self) -> float:
         if self.look_outdated():
@@ -194,9 +203,17 @@ class Orchestrator:
         if self.settings.stop_instances:
             self._stop_instances()
         self.sites.stop()
+        self.writer.stop(timeout=1.0)
+        self._write_last()
         self.elector.stop(timeout=1.0)
         self.leadership.end()
         self.store.close()
+
+    def _write_last(self) -> None:
+        try:
+            self._unless_outdated(self._write_reports)()
+        except GONE as error:
+            log.warning("the robots' last reports are lost, for the database does not answer: %s", error)
 
     def _stop_instances(self) -> None:
         # Twice the grace: once for the services, once for what comes before and after.
@@ -227,6 +244,7 @@ class Orchestrator:
         return targets(advertised(self.store.names()), self.settings.advertise, asked)
 
     def _running(self) -> list[Running]:
+        self.reports.write()  # what robots told before a scrape is in it
         if not self.leadership.leads:
             return []  # the one that leads exports them
         running = []

@@ -69,15 +69,15 @@ class Database:
         self._schema = ""
 
     @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        """A transaction that changes something.
+    def _writing(self, *, alone: bool = False) -> Iterator[Connection]:
+        """A transaction that changes something; ``alone``: for one statement, which needs none around it.
 
         SQLite has one writer at a time, and lets the others ask again and again after growing pauses, in no order: here
         they queue. One that waits for another program's lock does not keep the queue for longer than that may take.
         """
         turn = self._engine.dialect.name == "sqlite" and self._turn.acquire(timeout=SQLITE_PATIENCE)
         try:
-            with self._writer.begin() as connection:
+            with self._reader.connect() if alone else self._writer.begin() as connection:
                 yield connection
         finally:
             if turn:

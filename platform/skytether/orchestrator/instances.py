@@ -16,7 +16,6 @@ from skytether.api.rest import (
     Placement,
     Refusal,
     Renew,
-    Report,
     Score,
     Session,
     State,
@@ -31,10 +30,11 @@ from .moves import Moves
 from .placement import Decision
 from .reconcile import Reconciler, told
 from .records import Record, new_record
+from .reports import Reports
 from .runtimes.base import LogStream, RuntimeFailure
 from .security import Secrets
 from .sites import Sites
-from .store import KeyReusedError, Store, Told
+from .store import KeyReusedError, Store
 from .validation import check_params
 
 
@@ -54,6 +54,7 @@ class Instances:
         reconciler: Reconciler,
         moves: Moves,
         metrics: Metrics,
+        reports: Reports,
         secrets_: Secrets,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
@@ -64,6 +65,7 @@ class Instances:
         self._reconciler = reconciler
         self._moves = moves
         self._metrics = metrics
+        self._reports = reports
         self._secrets = secrets_
         self._clock = clock
         self._wake_placer = wake_placer
@@ -177,7 +179,7 @@ class Instances:
         """Newest first; a robot's own, or all for the operator."""
         return self._store.all(principal.robot)
 
-    def renew(self, principal: Principal, instance: str, renew: Renew) -> Record:
+    def renew(self, principal: Principal, instance: str, renew: Renew) -> Instance:
         """Keep an instance's lease, and take the robot's report. One that has ended, or is ending, stays as it is.
 
         Raises:
@@ -187,20 +189,15 @@ class Instances:
         if renew.measurements:
             measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
             measurements = {**self.get(principal, instance).measurements, **measured}
-        report = renew.report
-        renewed = self._store.renew(
-            instance,
-            self._clock(),
-            renew.lease_s,
-            robot=principal.robot,
-            measurements=measurements,
-            told=(lambda record: self._told(record, report)) if report else None,
-        )
-        return renewed or self.get(principal, instance)
-
-    def _told(self, record: Record, report: Report) -> Told:
-        kept = self._metrics.bounded(record, report)
-        return Told(kept.model_dump(mode="json"), of_robot(report), counts_of(kept))
+        now = self._clock()
+        renewed = self._store.renew(instance, now, renew.lease_s, robot=principal.robot, measurements=measurements)
+        if renewed is None:
+            return self.show(self.get(principal, instance))
+        if renew.report is not None:
+            kept = self._metrics.bounded(renewed.record, renew.report)
+            report = kept.model_dump(mode="json")
+            self._reports.take(renewed.record, now, report, of_robot(renew.report), counts_of(kept))
+        return self._shown(renewed.record, self._session(renewed.record), renewed.successor)
 
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.
@@ -208,6 +205,7 @@ class Instances:
         Raises:
             NotFoundError: As for ``get``.
         """
+        self._reports.write()  # what its robot told last is to be counted
         record: Record | None = None
         while record is None:  # the reconciler may be at it too: look again, and it is one step further
             record = self.end(self.get(principal, instance), "")
@@ -251,8 +249,15 @@ class Instances:
         except RuntimeFailure as error:
             raise SilentSiteError(str(error)) from error
 
-    def show(self, record: Record, *, with_session: bool = True) -> Instance:
-        """As REST tells it."""
+    def show(self, record: Record) -> Instance:
+        """As REST tells it to whom it concerns."""
+        return self._shown(record, self._session(record), self._store.successor(record.id))
+
+    def outline(self, record: Record) -> Instance:
+        """Without its session and its successor, for lists."""
+        return self._shown(record)
+
+    def _shown(self, record: Record, session: Session | None = None, successor: str | None = None) -> Instance:
         refused = tuple(Refusal.model_validate(refusal) for refusal in record.refused)
         scores = tuple(Score.model_validate(score) for score in record.scores)
         return Instance(
@@ -263,9 +268,9 @@ class Instances:
             reason=record.reason,
             params=record.params,
             placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
-            session=self._session(record) if with_session else None,
+            session=session,
             replaces=record.replaces,
-            successor=self._store.successor(record.id) if with_session else None,
+            successor=successor,
             restarts=record.restarts,
             created_at=utc(record.created_at),
             updated_at=utc(record.updated_at),

@@ -7,7 +7,7 @@ seen the last change gets None and looks again. Each change of state or reason l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,6 +16,7 @@ from sqlalchemy import (
     ColumnElement,
     Connection,
     Float,
+    FromClause,
     RowMapping,
     and_,
     bindparam,
@@ -30,7 +31,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql.dml import ReturningUpdate
 
-from skytether.api.report_metrics import Counts
+from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import State
 
 from .accounts import Account
@@ -59,50 +60,65 @@ class EventRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What a robot told of an instance."""
+class Renewed:
+    """An instance whose lease was renewed."""
 
-    report: dict[str, Any]
-    life: str
-    """Whose counting it is, and what is counted: see `accounts.Account.merge`."""
-    counts: Counts
+    record: Record
+    successor: str | None
+    """The id of the one that replaces it and has not ended."""
+
+
+def _serves(table: FromClause) -> ColumnElement[bool]:
+    return and_(*(table.c.state != state for state in (*_FINAL, State.STOPPING)))
 
 
 # Made once: what every request asks. To make a statement takes longer than to run it.
-_SERVES = and_(*(instances.c.state != state for state in (*_FINAL, State.STOPPING)))
 _INSTANCE = select(instances).where(instances.c.id == bindparam("instance"))
-_SUCCESSOR = (
-    select(instances.c.id)
-    .where(instances.c.replaces == bindparam("instance"), _SERVES)
-    .order_by(instances.c.created_at.desc())
+_later = instances.alias()
+_SUCCEEDS = (
+    select(_later.c.id)
+    .where(_later.c.replaces == instances.c.id, _serves(_later))
+    .order_by(_later.c.created_at.desc())
     .limit(1)
+    .correlate(instances)
+    .scalar_subquery()
+    .label("successor")
 )
-_THEIRS = (accounts.c.robot == bindparam("of_robot")) & (accounts.c.service == bindparam("of_service"))
-_ACCOUNT = select(accounts.c.account).where(_THEIRS).with_for_update()
-"""Locked, for two orchestrators may be told of the same robot at once."""
+_SUCCESSOR = select(_SUCCEEDS).where(instances.c.id == bindparam("instance"))
+_LOCKED_ACCOUNTS = (
+    select(accounts)
+    .where(accounts.c.robot.in_(bindparam("robots", expanding=True)))
+    .order_by(accounts.c.robot, accounts.c.service)
+    .with_for_update()
+)
+"""Locked, for two orchestrators may be told of the same robots at once; in order, lest each waits for the other."""
 _NEW_ACCOUNT = text(
     "INSERT INTO accounts (robot, service, account) VALUES (:of_robot, :of_service, '{}') ON CONFLICT DO NOTHING"
 )
-_KEEP_ACCOUNT = update(accounts).where(_THEIRS).values(account=bindparam("account"))
-_REPORT = (
-    update(reports)
-    .where(reports.c.instance == bindparam("of_instance"))
-    .values(at=bindparam("at"), report=bindparam("report"))
+_KEEP_ACCOUNT = (
+    update(accounts)
+    .where(accounts.c.robot == bindparam("of_robot"), accounts.c.service == bindparam("of_service"))
+    .values(account=bindparam("account"))
 )
+_HEAR = text(
+    "INSERT INTO reports (instance, at, report) SELECT id, :at, :report FROM instances WHERE id = :of_instance"
+    " ON CONFLICT (instance) DO UPDATE SET at = excluded.at, report = excluded.report"
+).bindparams(bindparam("report", type_=reports.c.report.type))
+"""Nothing for an instance that was forgotten meanwhile."""
 
 
 @cache
 def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdate[Any]:
-    """Renews a lease, perhaps with another length, only for a robot, with new measurements."""
+    """Renews a lease, perhaps with another length, only for a robot, with new measurements; tells the successor too."""
     lease_s = bindparam("length", type_=Float) if length else instances.c.lease_s
-    statement = update(instances).where(instances.c.id == bindparam("instance"), _SERVES)
+    statement = update(instances).where(instances.c.id == bindparam("instance"), _serves(instances))
     if robot:
         statement = statement.where(instances.c.robot == bindparam("of_robot"))
     if measurements:
         statement = statement.values(measurements=bindparam("measured"))
     # The version counts up, so that whoever is about to end it for its old lease has to look again.
     ends = {"lease_s": lease_s, "lease_expires_at": bindparam("now", type_=Float) + lease_s}
-    return statement.values(**ends, version=instances.c.version + 1).returning(instances)
+    return statement.values(**ends, version=instances.c.version + 1).returning(instances, _SUCCEEDS)
 
 
 class KeyReusedError(Exception):
@@ -250,9 +266,8 @@ class Store(Database):
         *,
         robot: str | None = None,
         measurements: dict[str, Any] | None = None,
-        told: Callable[[Record], Told] | None = None,
-    ) -> Record | None:
-        """Keep an instance's lease, and its robot's report instead of the one before; whoever leads exports that.
+    ) -> Renewed | None:
+        """Keep an instance's lease.
 
         Args:
             instance: Which.
@@ -260,25 +275,31 @@ class Store(Database):
             lease_s: From now on; None: as before.
             robot: Whose it must be; None: anybody's.
             measurements: Instead of those before; None: as before.
-            told: What to take of the robot's report for the instance as it is; None: there is none.
 
         Returns:
-            The instance; None if it is not there, not the robot's, or has ended or ends.
+            None if it is not there, not the robot's, or has ended or ends.
         """
         statement = _renewal(length=lease_s is not None, robot=robot is not None, measurements=measurements is not None)
         values = {"instance": instance, "now": now, "length": lease_s, "of_robot": robot, "measured": measurements}
-        with self._writing() as connection:
+        with self._writing(alone=True) as connection:
             row = connection.execute(statement, values).mappings().one_or_none()
-            if row is None:
-                return None
-            record = _record(row)
-            if told is not None:
-                heard = told(record)
-                self._count(connection, record, [(heard.life, heard.counts)])
-                of, what = {"of_instance": instance}, {"at": now, "report": heard.report}
-                if connection.execute(_REPORT, of | what).rowcount == 0:
-                    connection.execute(insert(reports).values(instance=instance, **what))
-        return record
+        return None if row is None else Renewed(_record(row), row["successor"])
+
+    def hear(
+        self,
+        heard: Mapping[str, tuple[float, Mapping[str, Any]]],
+        counted: Mapping[Owner, Iterable[tuple[str, Counts]]],
+    ) -> None:
+        """Keep robots' reports instead of those before; whoever leads exports them.
+
+        Args:
+            heard: By instance, the time [s since the epoch] and the report.
+            counted: By robot and service: lives and what each has counted by now.
+        """
+        rows = [{"of_instance": i, "at": at, "report": report} for i, (at, report) in sorted(heard.items())]
+        with self._writing() as connection:
+            self._count(connection, counted)
+            connection.execute(_HEAR, rows)
 
     def reports(self, control: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
         """The last report on each instance that has not ended; only of robots that one of these controls, if given."""
@@ -292,18 +313,22 @@ class Store(Database):
     def count(self, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
         """Add to what is known of an instance's robot and service: lives and what each has counted by now."""
         with self._writing() as connection:
-            self._count(connection, record, counted)
+            self._count(connection, {(record.robot, record.service): counted})
 
-    def _count(self, connection: Connection, record: Record, counted: Iterable[tuple[str, Counts]]) -> None:
-        whose = {"of_robot": record.robot, "of_service": record.service}
-        kept = connection.scalar(_ACCOUNT, whose)
-        if kept is None:
-            connection.execute(_NEW_ACCOUNT, whose)
-            kept = connection.scalar(_ACCOUNT, whose)
-        account = Account(kept)
-        for life, counts in counted:
-            account.merge(life, counts)
-        connection.execute(_KEEP_ACCOUNT, whose | {"account": account.document()})
+    def _count(self, connection: Connection, counted: Mapping[Owner, Iterable[tuple[str, Counts]]]) -> None:
+        owners = sorted(counted)
+        kept = _kept(connection, owners)
+        new = [{"of_robot": robot, "of_service": service} for robot, service in owners if (robot, service) not in kept]
+        if new:
+            connection.execute(_NEW_ACCOUNT, new)
+            kept = _kept(connection, owners)
+        rows = []
+        for owner in owners:
+            account = Account(kept[owner])
+            for life, counts in counted[owner]:
+                account.merge(life, counts)
+            rows.append({"of_robot": owner[0], "of_service": owner[1], "account": account.document()})
+        connection.execute(_KEEP_ACCOUNT, rows)
 
     def accounts(self) -> dict[tuple[str, str], Account]:
         """What is known, by robot and service."""
@@ -362,6 +387,11 @@ class Store(Database):
     def _records(self, query: Any) -> list[Record]:
         with self._reader.connect() as connection:
             return [_record(row) for row in connection.execute(query).mappings()]
+
+
+def _kept(connection: Connection, owners: Iterable[Owner]) -> dict[Owner, dict[str, Any]]:
+    rows = connection.execute(_LOCKED_ACCOUNTS, {"robots": list({robot for robot, _ in owners})})
+    return {(row.robot, row.service): row.account for row in rows}
 
 
 def _values(record: Record) -> dict[str, Any]:

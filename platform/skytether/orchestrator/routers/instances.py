@@ -43,7 +43,7 @@ def create(
 @router.get("")
 def list_instances(core: Core, caller: Caller) -> list[Instance]:
     """Newest first, without sessions; a robot sees its own."""
-    return [core.instances.show(record, with_session=False) for record in core.instances.all(caller)]
+    return [core.instances.outline(record) for record in core.instances.all(caller)]
 
 
 def _own(core: Core, caller: Caller, instance: str) -> Record:
@@ -69,7 +69,7 @@ def delete(core: Core, caller: Actor, instance: str) -> None:
 @router.post("/{instance}/renew", responses=says(404, 422))
 def renew(core: Core, caller: Actor, instance: str, asked: Renew) -> Instance:
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
-    return core.instances.show(core.instances.renew(caller, instance, asked))
+    return core.instances.renew(caller, instance, asked)
 
 
 @router.post("/{instance}/migrate", status_code=201, responses=says(403, 404, 409, 422))
