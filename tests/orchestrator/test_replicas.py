@@ -97,7 +97,7 @@ def test_one_leads_all_answer_and_when_the_leader_is_killed_another_adopts(
     host, port = running(first, made.id).session.host, running(first, made.id).session.port
     assert running(second, made.id).session == running(first, made.id).session
     second.renew_instance(made.id, Renew(report=Report(rtt_s=0.02, control_source="cloud")))
-    assert "skytether_path_rtt_seconds{" in first.metrics()
+    until(lambda: "skytether_path_rtt_seconds{" in first.metrics())
     assert "skytether_path_rtt_seconds{" not in second.metrics()
 
     assert one.process is not None
