@@ -83,6 +83,13 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Why a test was run again; pytest keeps that to itself where it then passed."""
+    for report in terminalreporter.stats.get("rerun", ()):
+        why = getattr(getattr(report.longrepr, "reprcrash", None), "message", report.longrepr)
+        terminalreporter.write_line(f"run again: {report.nodeid}, for {' '.join(str(why).split())[:500]}")
+
+
 def require(name: str, reason: str) -> NoReturn:
     """Skip the test because the means ``name`` is not here; fail where it was promised to be.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -119,19 +121,32 @@ def fill(engine: sa.Engine) -> dict[str, int]:
     return counts
 
 
-def check(url: str, version: str) -> None:
+@contextmanager
+def engine_for(url: str) -> Iterator[sa.Engine]:
+    """Closed however the test ends: a connection that it leaves open fails another test, when it is collected."""
     engine = make_engine(url)
-    migrate(engine, version)
-    counts = fill(engine)
-    migrate(engine)
-    with engine.connect() as connection:
-        assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
-        for table, count in counts.items():
-            rows = connection.scalar(sa.select(sa.func.count()).select_from(sa.table(table)))
-            assert rows == count, f"from {version}: {table}"
-    engine.dispose()
-    store = Store(url)
-    store.migrate()
+    try:
+        yield engine
+    finally:
+        engine.dispose()
+
+
+def check(url: str, version: str) -> None:
+    with engine_for(url) as engine:
+        migrate(engine, version)
+        counts = fill(engine)
+        migrate(engine)
+        with engine.connect() as connection:
+            assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+            for table, count in counts.items():
+                rows = connection.scalar(sa.select(sa.func.count()).select_from(sa.table(table)))
+                assert rows == count, f"from {version}: {table}"
+    with closing(Store(url)) as store:
+        store.migrate()
+        look_through(store, counts)
+
+
+def look_through(store: Store, counts: dict[str, int]) -> None:
     (record,) = store.live()
     assert {key: getattr(record, key) for key in INSTANCE} == {**INSTANCE, "state": State.RUNNING}
     assert [(r.name, r.services, r.last_seen_at) for r in store.robots()] == [("walker", ("*",), NOW + 2)]
@@ -155,7 +170,6 @@ def check(url: str, version: str) -> None:
     assert store.tokens() == []
     store.prune(NOW + 1000, ended_age=1, ended_count=0, events_count=0)
     assert store.all() == []
-    store.close()
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -167,8 +181,6 @@ def test_from_every_schema_of_sqlite(tmp_path: Path, version: str) -> None:
 def test_from_every_schema_of_postgresql(postgres: str) -> None:
     for version in VERSIONS:
         check(postgres, version)
-        engine = make_engine(postgres)
-        with engine.begin() as connection:
+        with engine_for(postgres) as engine, engine.begin() as connection:
             connection.exec_driver_sql("DROP SCHEMA public CASCADE")
             connection.exec_driver_sql("CREATE SCHEMA public")
-        engine.dispose()
