@@ -87,6 +87,10 @@ def test_looking_again_reads_only_what_changed(store: Store, new_record: NewReco
     now = store.live()
     assert [old is new for old, new in zip(before, now, strict=True)] == [True, False, False]
     assert now == [store.get(name) for name in ("a", "b", "c")]
+    store.change(now[2], NOW, state=State.STOPPED)
+    listed = store.all()
+    assert listed == [store.get(name) for name in ("a", "b", "c")]
+    assert [old is new for old, new in zip(now, listed, strict=True)] == [True, True, False]
 
 
 def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:

@@ -43,7 +43,8 @@ from .records import Record, check_move
 _FINAL = [state for state in State if state.final]
 _REASON_LENGTH = 1024
 _SEEN = 4096
-"""Records that are remembered, so that looking at many instances again and again reads only those that changed."""
+"""Records that are remembered, of what has not ended, so that looking at many again and again reads only those that
+changed."""
 _FETCHED = 500
 """Rows that one query names at most."""
 
@@ -181,10 +182,10 @@ class Store(Database):
 
     def all(self, robot: str | None = None) -> list[Record]:
         """Newest first; of one robot, or of all."""
-        query = select(instances).order_by(instances.c.created_at.desc(), instances.c.id)
-        if robot is not None:
-            query = query.where(instances.c.robot == robot)
-        return self._records(query)
+        if robot is None:
+            return sorted(self._look(), key=lambda record: -record.created_at)
+        query = select(instances).where(instances.c.robot == robot)
+        return self._records(query.order_by(instances.c.created_at.desc(), instances.c.id))
 
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
@@ -381,7 +382,7 @@ class Store(Database):
                 found |= {row["id"]: _record(row) for row in connection.execute(these).mappings()}
         if len(self._seen) > _SEEN:
             self._seen = {}
-        self._seen |= {id_: record for id_ in changed if (record := found[id_]) is not None}
+        self._seen |= {id_: record for id_ in changed if (record := found[id_]) is not None and not record.state.final}
         return [record for record in found.values() if record is not None]
 
     def _records(self, query: Any) -> list[Record]:
