@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic_core import from_json
+from pydantic_core import from_json, to_json
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
@@ -34,15 +34,21 @@ SQLITE_PATIENCE = 10
 """Seconds that a statement waits for another program that writes."""
 
 
+def _json(document: Any) -> str:
+    return to_json(document).decode()
+
+
+_JSON: dict[str, Any] = {"json_serializer": _json, "json_deserializer": from_json}
+"""Pydantic's reader and writer take a half and a tenth of the time of Python's, and each renewal needs both. What they
+refuse (half a character, hundreds of levels) was refused before it was stored."""
+
+
 def make_engine(url: str, name: str = NAME) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
     sync to disk (a power cut may lose the last moments, a crash of the program does not). Transactions on an engine
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
-
-    JSON is read by pydantic's reader, in half the time of Python's; what it refuses (half a character, hundreds of
-    levels) was refused before it was stored.
 
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
     it under ``name``.
@@ -51,8 +57,8 @@ def make_engine(url: str, name: str = NAME) -> Engine:
     if address.get_backend_name() == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
         connect_args = {**_POSTGRES, "application_name": name}
-        return create_engine(address, pool_pre_ping=True, connect_args=connect_args, json_deserializer=from_json)
-    engine = create_engine(address, json_deserializer=from_json)
+        return create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
+    engine = create_engine(address, **_JSON)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
