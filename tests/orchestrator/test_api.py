@@ -166,6 +166,7 @@ def test_renewing_keeps_the_lease_and_does_not_revive(served: Any) -> None:
     assert robot.renew_instance(made.id).state is State.STOPPED
 
 
+@pytest.mark.slow
 def test_an_instance_that_is_not_renewed_ends(served: Any) -> None:
     served.site()
     robot = served.robot()

@@ -31,6 +31,7 @@ def test_the_last_lines_then_what_is_new_then_the_end(tmp_path: Path) -> None:
     assert log.read() is None
 
 
+@pytest.mark.slow
 def test_a_silent_log_says_so_and_a_closed_one_ends(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_text("")

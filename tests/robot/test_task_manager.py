@@ -153,6 +153,7 @@ QUALITY = st.builds(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.lists(st.tuples(QUALITY, QUALITY, st.floats(0, 1), st.booleans()), max_size=30))
 def test_the_choice_never_changes_more_often_than_hysteresis_allows(looks):

@@ -124,7 +124,7 @@ def test_random_loss(world, loss, camera, seed, seconds):
     assert measured.rate == 100e6
 
 
-@short_and_long(1, 2)
+@only_long(1, 2)
 def test_jitter_on_a_link_of_20_mbit(world, seed, seconds):
     measured = Measured(world, link_of("private"), seed=seed, seconds=seconds)
     assert measured.small >= 0.999
@@ -156,6 +156,7 @@ def test_thirty_percent(world, seed, seconds):
     assert measured.rate == 100e6
 
 
+@pytest.mark.slow
 def test_a_clean_link_costs_next_to_nothing(world):
     measured = Measured(world, LinkConditions(delay=0.02), seed=1, seconds=5.0, warm_up=5.0)
     assert set(measured.delivered.values()) == {1.0}

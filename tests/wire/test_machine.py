@@ -2,6 +2,7 @@
 
 from random import Random
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
@@ -120,4 +121,4 @@ class TwoEnds(RuleBasedStateMachine):
 
 
 TwoEnds.TestCase.settings = settings(max_examples=12, stateful_step_count=15, deadline=None)
-test_two_ends = TwoEnds.TestCase
+test_two_ends = pytest.mark.slow(TwoEnds.TestCase)

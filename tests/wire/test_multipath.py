@@ -126,6 +126,7 @@ def test_a_planned_switch_is_made_before_the_break(two):
         assert [e for _, e in link.events[role] if isinstance(e, PathSwitched)] == [PathSwitched(1, "cheaper")]
 
 
+@pytest.mark.slow
 def test_a_cheaper_path_that_comes_back_is_used_again_once_it_is_stable(two):
     link = two(cost=10)
     link.roads[0].set(CUT)
@@ -144,6 +145,7 @@ def test_a_cheaper_path_that_comes_back_is_used_again_once_it_is_stable(two):
     assert switched[0] - back >= Config().path_stable
 
 
+@pytest.mark.slow
 def test_a_much_worse_path_is_left_and_one_as_bad_is_not(two):
     link = two(first=LinkConditions(delay=0.03), second=LinkConditions(delay=0.032))
     link.run(10)
@@ -165,6 +167,7 @@ def test_losses_alone_make_no_path_flap(two):
     assert len(fate()[0]) < 0.06 * 2000  # those of the link
 
 
+@pytest.mark.slow
 def test_an_interface_that_vanishes_and_another_that_comes(two):
     link = two()
     safe, plain = stream(link, "safe", 3.0), stream(link, "plain", 3.0)

@@ -83,7 +83,7 @@ def test_a_latched_value_published_before_there_was_a_session_is_kept(world):
     link = make(world, connect=False, up=LinkConditions(cut=True), down=LinkConditions(cut=True))
     assert link.publish(SERVICE, "param", b"old")
     assert link.publish(SERVICE, "param", b"new")
-    link.run(200)  # longer than its lifespan
+    link.run(70)  # longer than its lifespan
     link.models[ROBOT].conditions = link.models[SERVICE].conditions = LinkConditions()
     link.run(3)
     assert received(link, ROBOT, "param") == [b"new"]

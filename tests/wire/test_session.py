@@ -370,6 +370,7 @@ def test_a_topic_that_the_peer_does_not_have_is_not_sent(world, topics):
     assert link.publish(ROBOT, "log", memoryview(b"x")) is True
 
 
+@pytest.mark.slow
 def test_the_largest_message_arrives(world, fast):
     link = world.link(robot={"config": fast}, service={"config": fast}, down=LinkConditions(loss=0.03))
     payload = world.random.randbytes(16 * 2**20)
