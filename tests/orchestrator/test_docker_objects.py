@@ -21,6 +21,7 @@ from skytether.api.manifest import ServiceSpec
 from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
+from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
@@ -402,8 +403,17 @@ def test_every_service_with_an_image_has_its_dockerfile() -> None:
 
 
 def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def cannot(*_: Any) -> None:
+        raise RuntimeFailure("no guard")
+
+    monkeypatch.setattr(docker_runtime, "ensure_network", cannot)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
         runtime._prepare_early()
-    assert "site edge: nothing can be started yet: the Docker engine at unix://" in caplog.text
+        runtime._prepare_early()
+        assert runtime.blocked() == "no guard"
+        monkeypatch.setattr(docker_runtime, "ensure_network", lambda *_: None)
+        runtime._prepare_early()
+        assert runtime.blocked() == ""
+    assert caplog.text.count("site edge: nothing can be started: no guard") == 1, "said once"
