@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -105,6 +106,23 @@ def test_an_ended_run_is_seen_until_it_is_removed(kit: Kit) -> None:
     runtime.remove("i1")
     assert runtime.observe() == {}
     assert runtime.logs("i1", 10) == ""
+
+
+def test_some_are_looked_at_as_all_are(kit: Kit) -> None:
+    runtime = kit.open()
+    for instance in ("i1", "i2"):
+        runtime.start(kit.launch(instance))
+    for instance in ("i1", "i2"):
+        kit.until(runtime, Phase.RUNNING, instance)
+    seen = runtime.look_at({"i2", "nobody"})
+    assert list(seen) == ["i2"]
+    assert (seen["i2"].phase, seen["i2"].port) == (Phase.RUNNING, runtime.observe()["i2"].port)
+    assert runtime.look_at(()) == {}
+    runtime.stop("i2", force=True)
+    deadline = time.monotonic() + kit.patience
+    while runtime.look_at(["i2"])["i2"].phase is not Phase.EXITED:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
 
 
 def test_the_next_attempt_takes_the_place_of_the_last_and_keeps_its_port_and_log(kit: Kit) -> None:

@@ -92,7 +92,7 @@ class Orchestrator:
         self.sites = Sites(
             settings.state_dir / "sites",
             self.store,
-            self._unless_outdated(self.reconciler.site_step),
+            self._unless_outdated(self.reconciler.site_turn),
             settings.timing,
             find_runtime,
         )
@@ -107,7 +107,7 @@ class Orchestrator:
             settings.weights,
         )
         self.reconciler.moves = moves
-        self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_step), time.monotonic)
+        self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
         self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(

@@ -219,7 +219,7 @@ class Instances:
         ended = self._store.change(record, now, state=to, stopping_at=now, reason=reason)
         if ended is not None:
             site = self._sites.find(ended.site)
-            (site.loop.wake if site else self._wake_placer)()
+            (site.wake if site else self._wake_placer)()
         return ended
 
     def end_all(self, robot: str) -> None:

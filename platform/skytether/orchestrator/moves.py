@@ -60,6 +60,8 @@ class Moves:
         self._weights = weights
         self._not_before: dict[str, float] = {}
         """By service: no spare before this, because the last one failed."""
+        self.warms = True
+        """Whether any service has standbys, or is to have some, as of the last look."""
         self._bad_since: dict[str, float] = {}
         """By instance: since when its robot has driven by itself."""
 
@@ -91,13 +93,15 @@ class Moves:
         good = [s for s in same if s.site in scores and scores[s.site] <= limit and self._reachable(s)]
         return sorted(good, key=lambda spare: (scores[spare.site or ""], spare.created_at))
 
-    def keep_spares(self, live: Sequence[Record]) -> None:
+    def keep_spares(self) -> None:
         """Start the spares that are missing, and end those that nobody would get."""
         now = self._clock()
         kept: dict[str, int] = {}
         catalogue = {manifest.metadata.name: manifest for manifest in self._catalogue.all()}
-        for spare in live:
-            if not spare.spare or spare.state is State.STOPPING:
+        spares = self._store.live_spares()
+        self.warms = bool(spares) or any(manifest.spec.needs.standby for manifest in catalogue.values())
+        for spare in spares:
+            if spare.state is State.STOPPING:
                 continue
             manifest = catalogue.get(spare.service)
             wanted = manifest.spec.needs.standby if manifest else 0
@@ -110,14 +114,14 @@ class Moves:
                 self._end(spare, now)
         for name, manifest in catalogue.items():
             if kept.get(name, 0) < manifest.spec.needs.standby and now >= self._not_before.get(name, 0.0):
-                self._add_spare(manifest, live, now)
+                self._add_spare(manifest, now)
 
     def _stale(self, spare: Record, now: float) -> bool:
         """It has other parameters than the last request, and has had its time."""
         params = self._store.last_params(spare.service)
         return params is not None and params != spare.params and abs(now - spare.created_at) > _SETTLED
 
-    def _add_spare(self, manifest: Manifest, live: Sequence[Record], now: float) -> None:
+    def _add_spare(self, manifest: Manifest, now: float) -> None:
         name = manifest.metadata.name
         params = self._store.last_params(name) or {}
         try:
@@ -135,7 +139,7 @@ class Moves:
             lease_expires_at=FOREVER,
             spare=True,
         )
-        if self._weigh(spare, live).site is not None:  # robots come first: a spare does not wait for room
+        if self._weigh(spare, self._store.live()).site is not None:  # robots come first: a spare does not wait for room
             self._store.add(spare, "", None, "")
 
     def _end(self, spare: Record, now: float) -> None:

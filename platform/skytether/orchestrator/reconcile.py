@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +34,9 @@ _TRIES = 2
 """Failures in a row, the last of them to start at all, until another site is tried: one may be an accident."""
 _TIDY = 1.0
 """Seconds between two calls of a runtime's ``tidy``."""
+_WHOLE = 1.0
+"""Seconds between two whole passes over a site: within this, leases that ran out are seen, and what other orchestrators
+over the same database did."""
 _SPARE_IDLE = 86_400.0
 """Seconds that a standby waits for a robot before it ends by itself, should the orchestrator be gone for good."""
 _PRUNE = 60.0
@@ -76,17 +80,44 @@ class Reconciler:
         self._set_clock = SetClock(clock(), steady())
         self._times_set = 0
         """How often the clock was set: what was read before the last time is dated by another one."""
+        self._placed_at = -math.inf
+        """Steady seconds: when the placer's last whole pass ended."""
         self._pruned_at = -_PRUNE
         self._database_gone = False
 
-    def place_step(self) -> float:
-        """One pass of the placer; returns seconds until the next."""
-        return self._with_database(self._place_pass)
+    def place_turn(self) -> float:
+        """As much of a pass of the placer as is due: woken between two whole ones, it places what waits only."""
+        due = self._placed_at + self._timing.place - self._steady()
+        if due <= 0:
+            return self.place_step()
+        return min(due, self.place_step(whole=False))
 
-    def site_step(self, site: Site) -> float:
-        """One pass over a site; returns seconds until the next."""
+    def place_step(self, *, whole: bool = True) -> float:
+        """One pass of the placer; returns seconds until the next."""
+        return self._with_database(lambda: self._place_pass(whole))
+
+    def site_turn(self, site: Site) -> float:
+        """As much of a pass over a site as is due; returns seconds until the next.
+
+        All of it once a second. In between, all that is there is looked at by its period, and what starts or stops more
+        often; as long as the runtime finds it as it was, and nobody called, the database is not asked.
+        """
+        now = self._steady()
+        due, look = site.passed_at + _WHOLE - now, site.watched_at + self._timing.observe - now
+        called, site.called = site.called, False  # before the look: a call during it is not lost
+        if due <= 0 or (look <= 0 and not _all_as_it_was(site)):
+            return self.site_step(site)
+        if look <= 0:
+            site.watched_at, look = now, self._timing.observe
+            called |= bool(site.awaited)  # how long it has been so may matter by now
+        if called or not _as_it_was(site):
+            return min(due, look, self.site_step(site, whole=False))
+        return min(due, look, self._timing.observe_changing) if site.awaited else min(due, look)
+
+    def site_step(self, site: Site, *, whole: bool = True) -> float:
+        """One pass over a site, or over what starts or stops there; returns seconds until the next."""
         began = time.monotonic()
-        delay = self._with_database(lambda: self._site_pass(site))
+        delay = self._with_database(lambda: self._site_pass(site, whole))
         self._metrics.reconciled(site.name, time.monotonic() - began)
         return delay
 
@@ -125,9 +156,14 @@ class Reconciler:
 
     # What has no site yet
 
-    def _place_pass(self) -> float:
-        self.sites.refresh()
+    def _place_pass(self, whole: bool) -> float:
+        if whole:
+            self.sites.refresh()
         if not self._leads():
+            return self._timing.place
+        if not whole and not self._store.waits():  # woken for a standby, or for room that nobody waits for
+            if self.moves.warms:
+                self.moves.keep_spares()
             return self._timing.place
         times_set = self._times_set
         live = self._store.live()
@@ -136,7 +172,8 @@ class Reconciler:
             return 0.0  # what was read is dated by another clock
         waiting = [record for record in live if record.site is None]
         placed = [record for record in live if record.site is not None]
-        self._give_up_siteless(placed, now)
+        if whole:
+            self._give_up_siteless(placed, now)
         for action in plan(waiting, {}, (), now, self._timing):
             if isinstance(action, Place):
                 chosen = self._place(action.record, placed)
@@ -144,11 +181,15 @@ class Reconciler:
                     placed.append(chosen)
             elif isinstance(action, Expire):
                 self._expire(action.record)
-        self.moves.keep_spares(live)
+        if whole or self.moves.warms:
+            self.moves.keep_spares()
+        if not whole:
+            return self._timing.place
         self.moves.watch(live)
         if self._steady() - self._pruned_at >= _PRUNE:
             self._pruned_at = self._steady()
             self._prune(now)
+        self._placed_at = self._steady()
         return self._timing.place
 
     def _give_up_siteless(self, placed: Sequence[Record], now: float) -> None:
@@ -201,26 +242,31 @@ class Reconciler:
 
     def _prune(self, now: float) -> None:
         limits = self._limits
-        for _, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
-            if name is not None:
-                # The site's own pass finds it as a stranger, and removes it.
-                self._wake_site(name)
+        for instance, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
+            site = self.sites.find(name)
+            if site is not None:
+                site.ended -= {instance}  # the site's next whole pass finds it as a stranger, and removes it
 
     def _wake_site(self, name: str) -> None:
         site = self.sites.find(name)
         if site is not None:
-            site.loop.wake()
+            site.wake()
 
     # What is at a site
 
-    def _site_pass(self, site: Site) -> float:
+    def _site_pass(self, site: Site, whole: bool) -> float:
         times_set = self._times_set
-        live = self._store.live_at(site.name)  # before the look: nothing can be observed that is not in it
+        site.awaited = None  # whatever ends this pass early, or is left to do
+        if whole:
+            site.passed_at = -math.inf
+        # Before the look: nothing can be observed that is not in it.
+        live = self._store.live_at(site.name, changing=not whole)
         try:
             if site.capacity is None:
                 site.capacity = site.runtime.capacity()
-            observed = site.runtime.observe()
-            if due := time.monotonic() - site.tidied_at >= _TIDY:
+            ids = {record.id for record in live}
+            looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
+            if due := whole and time.monotonic() - site.tidied_at >= _TIDY:
                 site.load = site.runtime.load()
         except RuntimeFailure as error:
             if str(error) != site.failure:
@@ -228,11 +274,13 @@ class Reconciler:
             site.failure = str(error)
             site.capacity = site.load = None  # it may come back as another machine
             site.seen_since = None
+            site.passed_at = -math.inf
             return self._timing.place
         if self._leads():
-            for record, seen in _ended(live, site.observed, observed):
+            for record, seen in _ended(live, site.observed, looked):
                 self._store.count(record, [of_run(record, seen)])
-        site.observed, site.failure, site.looked_at = observed, "", time.monotonic()
+        others = {} if whole else {i: seen for i, seen in site.observed.items() if i not in ids}
+        site.observed, site.failure, site.looked_at = {**others, **looked}, "", time.monotonic()
         if not self._leads():
             return self._timing.observe
         now = self._now()
@@ -240,22 +288,31 @@ class Reconciler:
             return 0.0  # what was read is dated by another clock
         if site.seen_since is None or site.seen_since[0] != times_set:
             site.seen_since = (times_set, now)
-        strangers = observed.keys() - {record.id for record in live}
-        ended = self._store.known(strangers) if strangers else set()
-        actions = plan(live, observed, ended, now, self._timing, site.seen_since[1])
-        for action in actions:
-            self._act(site, action)
+        if whole:
+            site.ended = self._ended_of(looked.keys() - ids, frozenset() if due else site.ended)
+        actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
+        done = [action for action in actions if self._act(site, action)]
         if due:
             site.tidied_at = time.monotonic()
             try:
                 site.runtime.tidy()
             except RuntimeFailure as error:
                 log.warning("site %s: %s", site.name, error)
-        if actions or any(r.state in (State.STARTING, State.STOPPING) for r in live):
-            return self._timing.observe_changing
-        return self._timing.observe
+        changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
+        changing -= {action.record.id for action in done if isinstance(action, Ready | End)}
+        if len(done) == len(actions):
+            site.awaited = changing
+            if whole:
+                site.passed_at = site.watched_at = self._steady()
+        return self._timing.observe_changing if actions or changing else self._timing.observe
 
-    def _act(self, site: Site, action: Action) -> None:
+    def _ended_of(self, strangers: Set[str], ended: frozenset[str]) -> frozenset[str]:
+        """Those that have ended of what is at a site and not expected there; of some that is known already."""
+        unknown = strangers - ended
+        return frozenset(strangers & ended | (self._store.known(unknown) if unknown else set()))
+
+    def _act(self, site: Site, action: Action) -> bool:
+        """Do it; False: the next pass has to see what comes of it, or to try again."""
         try:
             match action:
                 case Start(record):
@@ -263,7 +320,7 @@ class Reconciler:
                 case Progress(record, detail):
                     self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
                 case Ready(record, host, port):
-                    self._ready(record, host, port)
+                    return self._ready(record, host, port)
                 case Crash():
                     self._crash(site, action)
                 case Expire(record):
@@ -272,16 +329,20 @@ class Reconciler:
                     site.runtime.stop(record.id, force=True)  # what its main process left behind
                     if self._store.change(record, self._clock(), state=State.STOPPED):
                         self._wake_placer()  # there is room for another
+                        return True
                 case Stop(instance, force):
                     site.runtime.stop(instance, force=force)
+                    return True
                 case Remove(instance):
                     log.info("site %s: removing %s, which nobody wants there", site.name, instance)
                     site.runtime.remove(instance)
+                    return True
                 case Place():
                     raise TypeError("what is at a site is placed already")
         except RuntimeFailure as error:
             # The next pass sees what is still to be done.
             log.warning("site %s: %s", site.name, error)
+        return False
 
     def _start(self, site: Site, record: Record) -> None:
         # Noted first: an orchestrator killed in between finds either nothing, and starts, or its run, and adopts.
@@ -311,14 +372,17 @@ class Reconciler:
         )
         return Launch(record.attempt, spec, grant)
 
-    def _ready(self, record: Record, host: str | None, port: int | None) -> None:
+    def _ready(self, record: Record, host: str | None, port: int | None) -> bool:
         now = self._clock()
         running_at = record.running_at if record.state is State.RUNNING else now
         changes = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at, "reason": ""}
-        if self._store.change(record, now, **changes) and record.state is State.STARTING:
+        if self._store.change(record, now, **changes) is None:
+            return False
+        if record.state is State.STARTING:
             self._metrics.phase(record, "starting", now - (record.started_at or now))
             if record.attempt == 1:
                 self._metrics.phase(record, "total", now - record.created_at)
+        return True
 
     def _crash(self, site: Site, crash: Crash) -> None:
         changes = after_crash(crash, self._clock(), self._timing)
@@ -372,6 +436,40 @@ class Reconciler:
             log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)
 
 
+def _as_it_was(site: Site) -> bool:
+    """Whether what starts or stops at a site is as in the last pass."""
+    if site.awaited is None:
+        return False
+    try:
+        seen = site.runtime.look_at(site.awaited) if site.awaited else {}
+    except RuntimeFailure:
+        return False  # the pass says so
+    return all(_same(seen.get(instance), site.observed.get(instance)) for instance in site.awaited)
+
+
+def _all_as_it_was(site: Site) -> bool:
+    """Whether all at a site is as in the last pass; if so, what it used by now is taken."""
+    try:
+        seen = site.runtime.observe()
+    except RuntimeFailure:
+        return False
+    if seen.keys() != site.observed.keys() or not all(_same(one, site.observed[i]) for i, one in seen.items()):
+        return False
+    site.observed, site.looked_at = seen, time.monotonic()
+    return True
+
+
+def _same(one: Observation | None, other: Observation | None) -> bool:
+    """Whether there is nothing to be done between the two looks: what was used meanwhile does not matter."""
+    if one is other:
+        return True
+    return one is not None and other is not None and _phase(one) == _phase(other)
+
+
+def _phase(seen: Observation) -> tuple[object, ...]:
+    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port
+
+
 def _ended(
     records: Iterable[Record], before: Mapping[str, Observation], after: Mapping[str, Observation]
 ) -> list[tuple[Record, Observation]]:
@@ -387,14 +485,12 @@ def _ended(
 
 def _used(records: Sequence[Record]) -> dict[str, Capacity]:
     """What the instances at each site asked for."""
-    used: dict[str, Capacity] = {}
+    sums: dict[str, tuple[float, int, int]] = {}
     for record in records:
         if record.site is not None:
-            sofar, needs = used.get(record.site, NOTHING), record.spec.needs
-            used[record.site] = Capacity(
-                sofar.cpu + needs.cpu, sofar.memory_mb + needs.memory_mb, sofar.gpu + needs.gpu
-            )
-    return used
+            needs, (cpu, memory_mb, gpu) = record.spec.needs, sums.get(record.site, (0.0, 0, 0))
+            sums[record.site] = cpu + needs.cpu, memory_mb + needs.memory_mb, gpu + needs.gpu
+    return {site: Capacity(*sum_) for site, sum_ in sums.items()}
 
 
 def told(refused: Sequence[Refusal]) -> str:

@@ -6,6 +6,8 @@ Wall-clock, not monotonic: leases and back-off must mean the same after a restar
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -90,6 +92,12 @@ class Record:
     """Warm, and nobody's yet: it has no robot and no lease."""
     version: int = 1
     """Counts changes: who changes a record must have seen the last one."""
+
+    def after(self, changes: Mapping[str, Any]) -> Record:
+        """As it is after changes of other fields than the manifest, which is not parsed again."""
+        changed = copy(self)
+        vars(changed).update(changes)
+        return changed
 
     @cached_property
     def spec(self) -> ServiceSpec:

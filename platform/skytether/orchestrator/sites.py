@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -108,6 +108,17 @@ class Site:
         """Monotonic seconds of the last look that did not fail."""
         self.seen_since: tuple[int, float] | None = None
         """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
+        self.ended: frozenset[str] = frozenset()
+        """Those of the observed that the store knows as ended."""
+        self.awaited: Collection[str] | None = None
+        """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
+        self.called = False
+        """Somebody started or ended an instance here since the last pass began."""
+        self.passed_at = -math.inf
+        """Seconds of the reconciler's steady clock: when the last whole pass ended; minus infinity: with something left
+        to do, or not at all."""
+        self.watched_at = -math.inf
+        """The same of the last look at all that is here."""
         self.tidied_at = -math.inf
         self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
         self._silent_after = silent_after
@@ -115,6 +126,11 @@ class Site:
     @property
     def name(self) -> str:
         return self.asked.name
+
+    def wake(self) -> None:
+        """Look at once at what starts or stops here; from any thread."""
+        self.called = True
+        self.loop.wake()
 
     @property
     def unreachable(self) -> str:

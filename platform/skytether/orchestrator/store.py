@@ -18,6 +18,7 @@ from sqlalchemy import (
     Float,
     FromClause,
     RowMapping,
+    Select,
     and_,
     bindparam,
     delete,
@@ -122,6 +123,33 @@ def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdat
     return statement.values(**ends, version=instances.c.version + 1).returning(instances, _SUCCEEDS)
 
 
+_LIVE = instances.c.state.not_in(_FINAL)
+_CHANGE = update(instances).where(
+    instances.c.id == bindparam("seen_id"), instances.c.version == bindparam("seen_version")
+)
+_EVENT = insert(events)
+
+
+def _versions(*conditions: ColumnElement[bool]) -> Select[str, int]:
+    """Which instances, oldest first, and how often each was changed."""
+    found = select(instances.c.id, instances.c.version).where(*conditions)
+    return found.order_by(instances.c.created_at, instances.c.id)
+
+
+_WHOLE = select(instances).where(instances.c.id.in_(bindparam("ids", expanding=True)))
+_CHANGEABLE = select(*(column for column in instances.c if column is not instances.c.manifest)).where(
+    instances.c.id.in_(bindparam("ids", expanding=True))
+)
+"""All but the manifest, which is the largest part and stays as it is."""
+_EVERY = _versions()
+_ALL_LIVE = _versions(_LIVE)
+_LIVE_AT = _versions(_LIVE, instances.c.site == bindparam("site"))
+_CHANGING_AT = _versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
+_WAITING = select(instances.c.id).where(instances.c.state.in_([State.PENDING, State.PLACING])).limit(1)
+_LIVE_SPARES = _versions(_LIVE, instances.c.spare)
+_SPARES = _versions(instances.c.spare, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
+
+
 class KeyReusedError(Exception):
     """An idempotency key came again with another body."""
 
@@ -156,6 +184,7 @@ class Store(Database):
             if earlier is None:
                 raise
             return earlier
+        self._remember(record)
         self.on_change(record.id)
         return record
 
@@ -183,21 +212,30 @@ class Store(Database):
     def all(self, robot: str | None = None) -> list[Record]:
         """Newest first; of one robot, or of all."""
         if robot is None:
-            return sorted(self._look(), key=lambda record: -record.created_at)
+            return sorted(self._look(_EVERY), key=lambda record: -record.created_at)
         query = select(instances).where(instances.c.robot == robot)
         return self._records(query.order_by(instances.c.created_at.desc(), instances.c.id))
 
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
-        return self._look(instances.c.state.not_in(_FINAL))
+        return self._look(_ALL_LIVE)
 
-    def live_at(self, site: str) -> list[Record]:
-        """All at one site that has not ended, oldest first."""
-        return self._look(instances.c.state.not_in(_FINAL), instances.c.site == site)
+    def live_at(self, site: str, *, changing: bool = False) -> list[Record]:
+        """All at one site that has not ended, oldest first; with ``changing`` only what is starting or stopping."""
+        return self._look(_CHANGING_AT if changing else _LIVE_AT, site=site)
+
+    def waits(self) -> bool:
+        """Whether anything has no site yet."""
+        with self._reader.connect() as connection:
+            return connection.scalar(_WAITING) is not None
+
+    def live_spares(self) -> list[Record]:
+        """Those that are nobody's and have not ended, oldest first."""
+        return self._look(_LIVE_SPARES)
 
     def spares(self, service: str) -> list[Record]:
         """Those of a service that run and are nobody's, oldest first."""
-        return self._look(instances.c.spare, instances.c.service == service, instances.c.state == State.RUNNING)
+        return self._look(_SPARES, service=service)
 
     def known(self, ids: Iterable[str]) -> set[str]:
         """Those that the store has a row of, ended or not."""
@@ -213,18 +251,17 @@ class Store(Database):
         Raises:
             IllegalMoveError: The move of state is not in the table.
         """
-        new = dataclasses.replace(record, version=record.version + 1, **changes)
-        check_move(record.state, new.state)
-        new = dataclasses.replace(new, reason=new.reason[:_REASON_LENGTH])
-        told = new.state is not record.state or new.reason != record.reason
-        if told:
-            new = dataclasses.replace(new, updated_at=now)
-        seen = (instances.c.id == record.id) & (instances.c.version == record.version)
+        state, reason = changes.get("state", record.state), changes.get("reason", record.reason)[:_REASON_LENGTH]
+        check_move(record.state, state)
+        told = state is not record.state or reason != record.reason
+        changes |= {"version": record.version + 1, "reason": reason, "updated_at": now if told else record.updated_at}
+        new = record.after(changes)
         with self._writing() as connection:
-            if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
+            if connection.execute(_CHANGE, {**changes, **_as_seen(record)}).rowcount == 0:
                 return None
             if told:
                 _add_event(connection, new)
+        self._remember(new)
         if told:
             self.on_change(new.id)
         return new
@@ -233,11 +270,11 @@ class Store(Database):
         self, spare: Record, changes: dict[str, Any], now: float, owner: str, key: str | None, body_sha256: str
     ) -> Record | None:
         """Give a spare to a robot; None if another request was quicker."""
-        new = dataclasses.replace(spare, version=spare.version + 1, updated_at=now, spare=False, **changes)
-        seen = (instances.c.id == spare.id) & (instances.c.version == spare.version)
+        changes = {**changes, "version": spare.version + 1, "updated_at": now, "spare": False}
+        new = spare.after(changes)
         try:
             with self._writing() as connection:
-                if connection.execute(update(instances).where(seen).values(**_values(new))).rowcount == 0:
+                if connection.execute(_CHANGE, {**changes, **_as_seen(spare)}).rowcount == 0:
                     return None
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": new.id}
@@ -284,7 +321,11 @@ class Store(Database):
         values = {"instance": instance, "now": now, "length": lease_s, "of_robot": robot, "measured": measurements}
         with self._writing(alone=True) as connection:
             row = connection.execute(statement, values).mappings().one_or_none()
-        return None if row is None else Renewed(_record(row), row["successor"])
+        if row is None:
+            return None
+        renewed = Renewed(_record(row), row["successor"])
+        self._remember(renewed.record)
+        return renewed
 
     def hear(
         self,
@@ -370,20 +411,33 @@ class Store(Database):
             connection.execute(delete(events).where(events.c.id <= newest - events_count))
         return gone
 
-    def _look(self, *conditions: ColumnElement[bool]) -> list[Record]:
+    def _look(self, versions: Select[str, int], **named: str) -> list[Record]:
         """Oldest first. Of those that have not changed since they were seen last, only the version is read."""
-        newest = select(instances.c.id, instances.c.version).where(*conditions)
         with self._reader.connect() as connection:
-            rows = connection.execute(newest.order_by(instances.c.created_at, instances.c.id)).all()
+            rows = connection.execute(versions, named).all()
             found = {id_: self._seen.get(id_) for id_, _ in rows}
             changed = [id_ for id_, version in rows if (seen := found[id_]) is None or seen.version != version]
             for start in range(0, len(changed), _FETCHED):
-                these = select(instances).where(instances.c.id.in_(changed[start : start + _FETCHED]))
-                found |= {row["id"]: _record(row) for row in connection.execute(these).mappings()}
-        if len(self._seen) > _SEEN:
-            self._seen = {}
-        self._seen |= {id_: record for id_ in changed if (record := found[id_]) is not None and not record.state.final}
+                these = changed[start : start + _FETCHED]
+                known = {id_: seen for id_ in these if (seen := found[id_]) is not None}
+                if known:
+                    newer = connection.execute(_CHANGEABLE, {"ids": list(known)}).mappings()
+                    found |= {row["id"]: known[row["id"]].after(dict(row)) for row in newer}
+                if new := [id_ for id_ in these if id_ not in known]:
+                    found |= {row["id"]: _record(row) for row in connection.execute(_WHOLE, {"ids": new}).mappings()}
+        for id_ in changed:
+            if (record := found[id_]) is not None:
+                self._remember(record)
         return [record for record in found.values() if record is not None]
+
+    def _remember(self, record: Record) -> None:
+        """As it is stored; a version that is not the newest any more does no harm. What has ended is not looked at."""
+        if record.state.final:
+            self._seen.pop(record.id, None)
+            return
+        if len(self._seen) >= _SEEN:
+            self._seen = {}
+        self._seen[record.id] = record
 
     def _records(self, query: Any) -> list[Record]:
         with self._reader.connect() as connection:
@@ -406,6 +460,11 @@ def _record(row: RowMapping) -> Record:
     return Record(**{name: row[name] for name in _COLUMNS})
 
 
+def _as_seen(record: Record) -> dict[str, Any]:
+    """That it is changed only if it is still so."""
+    return {"seen_id": record.id, "seen_version": record.version}
+
+
 def _add_event(connection: Connection, record: Record) -> None:
     row = {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}
-    connection.execute(insert(events).values(**row))
+    connection.execute(_EVENT, row)

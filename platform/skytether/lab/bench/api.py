@@ -55,7 +55,7 @@ class ApiRow:
         kinds: The same by kind of request.
         client_p50_ms: Median time of ``/healthz``, asked in the same way: the client's own share.
         client_p99_ms: 99th percentile of that.
-        pass_p50_ms: Median reconcile pass over the site, while requests came.
+        pass_p50_ms: Median reconcile pass over the site, while requests came; most look only at what starts or stops.
         pass_max_ms: The slowest.
         placer_max_ms: Slowest pass of the placer, which looks at all instances.
         cpu_idle: Cores that the orchestrator kept busy before the requests.

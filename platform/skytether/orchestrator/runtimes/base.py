@@ -12,7 +12,7 @@ pass.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -168,6 +168,14 @@ class Runtime(ABC):
         Raises:
             RuntimeFailure: The site does not answer.
         """
+
+    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+        """What ``observe`` tells, of these only: asked again and again while they start or stop, so it should be cheap.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+        return {instance: seen for instance, seen in self.observe().items() if instance in instances}
 
     @abstractmethod
     def stop(self, instance: str, *, force: bool) -> None:

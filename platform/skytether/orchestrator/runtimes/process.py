@@ -22,7 +22,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,7 +41,7 @@ _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
-_MEASURE = 1.0
+_MEASURE = 2.0
 """Seconds between two readings of processor time, memory and ready file of a child that runs; whether it still does is
 looked at each time."""
 _LAST_LINE = 300
@@ -84,6 +84,8 @@ class _Run:
 
     attempt: int
     process: ProcessId | None
+    folder: str
+    """Of the instance; all that is looked at again and again is named by text, for paths are slow to put together."""
     data: str = ""
     """Folder for what the service produces."""
     child: subprocess.Popen[bytes] | None = None
@@ -91,16 +93,19 @@ class _Run:
     asked_to_end: bool = False
     seen: Observation | None = None
     """As it was when it was read last."""
+    ready: tuple[tuple[int, int, int], int] | None = None
+    """Which ready file was read (inode, time of change [ns], size), and its port."""
 
     @property
     def ended(self) -> Observation | None:
         """Its end, which cannot change any more; nothing on the machine does. None: it has not."""
         return self.seen if self.seen and self.seen.phase is Phase.EXITED else None
 
-    @property
-    def runs_on(self) -> bool:
-        """A child that was running, and has not ended since: one system call tells."""
-        return bool(self.seen and self.seen.phase is Phase.RUNNING and self.child and self.child.poll() is None)
+    def runs_on(self, all_run: bool) -> bool:
+        """A child that was running, and has not ended since: one system call tells, or that no child has ended."""
+        if not (self.seen and self.seen.phase is Phase.RUNNING and self.child):
+            return False
+        return (self.child.returncode if all_run else self.child.poll()) is None
 
 
 class ProcessRuntime(Runtime):
@@ -141,7 +146,7 @@ class ProcessRuntime(Runtime):
                 process = find_by_environment(GRANT_VARIABLE, str(folder / "grant.json"))
                 if process is not None:
                     _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-        return _Run(int(noted.get("attempt", 0)), process, data=str(noted.get("data", "")))
+        return _Run(int(noted.get("attempt", 0)), process, str(folder), data=str(noted.get("data", "")))
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return None if spec.entrypoint else "the service has no entrypoint, only an image: it needs a container site"
@@ -178,7 +183,7 @@ class ProcessRuntime(Runtime):
             _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
-        self._runs[launch.instance] = _Run(launch.attempt, process, str(data), child)
+        self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), child)
 
     def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None) -> None:
         ready = folder / "ready.json"
@@ -216,20 +221,30 @@ class ProcessRuntime(Runtime):
         now = time.monotonic()
         if measure := now - self._measured_at >= _MEASURE:
             self._measured_at = now
-        for instance, run in self._runs.items():
-            if not run.ended and (measure or not run.runs_on):
-                run.seen = self._look(instance, run)
-        return {instance: run.seen for instance, run in self._runs.items() if run.seen}
+        all_run = _all_children_run()
+        runs = self._runs.items()
+        return {i: seen for i, run in runs if (seen := self._seen(run, measure=measure, all_run=all_run))}
 
-    def _look(self, instance: str, run: _Run) -> Observation:
-        folder = self._folder / instance
+    @override
+    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+        runs = ((instance, self._runs.get(instance)) for instance in instances)
+        return {i: seen for i, run in runs if run and (seen := self._seen(run))}
+
+    def _seen(self, run: _Run, *, measure: bool = False, all_run: bool = False) -> Observation | None:
+        if not run.ended and (measure or not run.runs_on(all_run)):
+            run.seen = self._look(run)
+        return run.seen
+
+    def _look(self, run: _Run) -> Observation:
         stat = run.process and stat_of(run.process)
         if not stat or stat.zombie:
             status = run.child.poll() if run.child else None
             if run.child and status is None:
                 return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
-            return Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(folder / "log"))
-        port = _port(folder / "ready.json")
+            return Observation(
+                run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(Path(run.folder, "log"))
+            )
+        port = _ready_port(run)
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
         return Observation(run.attempt, phase, host, port, cpu_s=stat.cpu_s, memory_bytes=stat.memory_bytes)
@@ -278,11 +293,11 @@ class ProcessRuntime(Runtime):
         _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
 
     def tidy(self) -> None:
-        for instance in self._runs:
-            log = self._folder / instance / "log"
+        for run in self._runs.values():
+            log = f"{run.folder}/log"
             with contextlib.suppress(FileNotFoundError):
-                if log.stat().st_size > self._options.log_bytes:
-                    _keep_newer_half(log, self._options.log_bytes // 2)
+                if os.stat(log).st_size > self._options.log_bytes:
+                    _keep_newer_half(Path(log), self._options.log_bytes // 2)
 
 
 class FileLog(LogStream):
@@ -332,6 +347,14 @@ _left_running: list[subprocess.Popen[bytes]] = []
 """Children that outlive the runtime that started them: the standard library warns of one that is dropped."""
 
 
+def _all_children_run() -> bool:
+    """Whether none of this program's children has ended since it was last waited for: one system call for all."""
+    try:
+        return os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    except ChildProcessError:
+        return False  # it has none; those that an earlier program started are each looked at
+
+
 def _kill_all(run: _Run) -> None:
     """End a run and everything in its session."""
     if run.process is None:
@@ -379,6 +402,20 @@ def _free_or_zero(host: str, port: int | None) -> int:
         except OSError:
             return 0
     return port
+
+
+def _ready_port(run: _Run) -> int | None:
+    """Where a run listens; its ready file is read again where it was written again."""
+    path = f"{run.folder}/ready.json"
+    try:
+        stat = os.stat(path)
+    except OSError:
+        return None
+    written = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
+    if run.ready is None or run.ready[0] != written:
+        port = _port(Path(path))
+        run.ready = None if port is None else (written, port)
+    return run.ready[1] if run.ready else None
 
 
 def _port(path: Path) -> int | None:
