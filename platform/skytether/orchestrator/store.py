@@ -77,16 +77,14 @@ def _serves(table: FromClause) -> ColumnElement[bool]:
 # Made once: what every request asks. To make a statement takes longer than to run it.
 _INSTANCE = select(instances).where(instances.c.id == bindparam("instance"))
 _later = instances.alias()
-_SUCCEEDS = (
+_SUCCESSOR = (
     select(_later.c.id)
-    .where(_later.c.replaces == instances.c.id, _serves(_later))
+    .where(_later.c.replaces == bindparam("instance"), _serves(_later))
     .order_by(_later.c.created_at.desc())
     .limit(1)
-    .correlate(instances)
-    .scalar_subquery()
-    .label("successor")
 )
-_SUCCESSOR = select(_SUCCEEDS).where(instances.c.id == bindparam("instance"))
+_SUCCEEDS = _SUCCESSOR.scalar_subquery().label("successor")
+"""Not by the renewed row's own id: names after RETURNING lose their table's on SQLite, and would be the subquery's."""
 _LOCKED_ACCOUNTS = (
     select(accounts)
     .where(accounts.c.robot.in_(bindparam("robots", expanding=True)))
