@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -191,6 +192,12 @@ class PostgresServer:
 
     def stop(self, mode: str = "immediate") -> None:
         self.control("-m", mode, "stop")
+
+    def signal(self, number: int) -> None:
+        """To all of its processes."""
+        server = psutil.Process(int((self.folder / "data/postmaster.pid").read_text().split()[0]))
+        for process in (server, *server.children()):
+            process.send_signal(number)
 
 
 def as_postgres() -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +15,12 @@ import httpx
 import pytest
 from nothing_lost import assert_nothing_lost, processes, told
 from orchestrator_program import PATIENCE, Program, environment, until, with_toy
+from sqlalchemy.exc import OperationalError
 
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
 from skytether.orchestrator.db import make_engine
+from skytether.orchestrator.postgres import Connection
 from skytether.orchestrator.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]
@@ -174,6 +177,42 @@ def test_the_database_is_away_for_longer_than_a_lease_and_nothing_is_lost(
     assert_nothing_lost(told(client), {made.id: State.RUNNING}, processes(program.folder))
     assert program.log.count("the database does not answer, trying again") <= 3
     assert "Traceback" not in program.log
+
+
+def test_a_server_that_hangs_is_given_up_and_then_one_at_a_time_waits_for_it(
+    postgres: str, postgres_server: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Connection, "patience_s", 0.5)
+    engine = make_engine(postgres)
+    done = threading.Event()
+
+    def ask() -> int:
+        with engine.connect() as connection:
+            return int(connection.exec_driver_sql("SELECT 1").scalar_one())
+
+    def go_on_asking() -> None:
+        while not done.is_set():
+            outcome(ask)
+
+    assert ask() == 1
+    other = threading.Thread(target=go_on_asking, daemon=True)
+    postgres_server.signal(signal.SIGSTOP)
+    try:
+        other.start()
+        until(lambda: "the server does not answer" in outcome(ask))
+    finally:
+        postgres_server.signal(signal.SIGCONT)
+    until(lambda: outcome(ask) == "1")
+    done.set()
+    other.join(PATIENCE)
+    engine.dispose()
+
+
+def outcome(ask: Callable[[], int]) -> str:
+    try:
+        return str(ask())
+    except OperationalError as error:
+        return str(error)
 
 
 def test_a_database_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from pydantic_core import from_json, to_json
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
@@ -18,16 +18,19 @@ _LOCK_MS = 120_000
 """How long a migration waits for a table, or for another migration."""
 MIGRATING, LEADING = 0x736B7901, 0x736B7902
 """Keys of PostgreSQL's advisory locks: who migrates, who leads."""
+STATEMENT_S = 10
+"""Seconds that PostgreSQL gives a statement before it ends it."""
 _POSTGRES = {
     "client_encoding": "utf8",
     "connect_timeout": 5,
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
-    "options": "-c statement_timeout=10000 -c idle_in_transaction_session_timeout=30000",
+    "options": f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout=30000"
+    " -c tcp_keepalives_idle=5 -c tcp_keepalives_interval=2 -c tcp_keepalives_count=3",
 }
-"""A server that is gone is noticed within seconds, and a statement that hangs is ended (milliseconds). In a database
-without an encoding (``SQL_ASCII``) text would come back as bytes."""
+"""A server that is gone is noticed within seconds, and by a server a leader that is gone; for one that hangs see
+``postgres.py``. In a database without an encoding (``SQL_ASCII``) text would come back as bytes."""
 
 
 SQLITE_PATIENCE = 10
@@ -57,7 +60,11 @@ def make_engine(url: str, name: str = NAME) -> Engine:
     if address.get_backend_name() == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
         connect_args = {**_POSTGRES, "application_name": name}
-        return create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
+        made = create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
+        from .postgres import Server  # its driver is an extra
+
+        event.listen(made, "do_connect", Server().connect)
+        return made
     engine = create_engine(address, **_JSON)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)
@@ -105,6 +112,8 @@ def migrate(engine: Engine, to: str = "head") -> str:
     with engine.execution_options(immediate=True).begin() as connection:
         if engine.dialect.name == "postgresql":
             # A large table takes its time; requests of others that run still are waited for, but not for ever.
+            cast(Any, connection.connection.driver_connection).patience_s = None
+            connection.detach()  # closed at the end, and not used for what has to be quick
             connection.execute(text(f"SET LOCAL statement_timeout = 0; SET LOCAL lock_timeout = {_LOCK_MS}"))
             connection.execute(text(f"SELECT pg_advisory_xact_lock({MIGRATING})"))
         config.attributes["connection"] = connection
