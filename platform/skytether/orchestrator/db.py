@@ -42,7 +42,7 @@ def _json(document: Any) -> str:
 
 
 _JSON: dict[str, Any] = {"json_serializer": _json, "json_deserializer": from_json}
-"""Pydantic's reader and writer take a half and a tenth of the time of Python's, and each renewal needs both. What they
+"""Pydantic's reader and writer take half and a quarter of the time of Python's, and each renewal needs both. What they
 refuse (half a character, hundreds of levels) was refused before it was stored."""
 
 
