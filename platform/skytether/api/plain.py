@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterable
 from math import isfinite
 from typing import Any
 
@@ -12,6 +13,9 @@ from .faults import Fault
 DEPTH = 64
 """Levels of a document: what is deeper would exhaust the stack of some reader. People need ten."""
 _WHOLE = 1 << 63
+
+_Odd = tuple[list[str], str]
+"""The place, its innermost part first, and what is wrong there."""
 
 
 def oddity(document: Any, text: bytes = b"") -> Fault | None:
@@ -25,23 +29,35 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
         text: The JSON that it was read from, where somebody wrote one.
     """
     keys = 0
-    waiting: list[tuple[Any, tuple[str, ...]]] = [(document, ())]
-    while waiting:
-        value, place = waiting.pop()
-        if isinstance(value, dict | list):
-            if len(place) >= DEPTH:
-                return Fault(".".join(place[:3]), f"is nested more than {DEPTH} levels deep")
-            if isinstance(value, dict):
-                keys += len(value)
-            for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-                trouble = _of_text(key) if isinstance(key, str) else None
-                if trouble:
-                    return Fault(".".join(place), f"one of its keys {trouble}")
-                waiting.append((inner, (*place, str(key))))
+
+    def look(value: Any, depth: int) -> _Odd | None:
+        """Where a request holds a hundred numbers: no place is written down before something is wrong there."""
+        nonlocal keys
+        inner: Iterable[tuple[Any, Any]]
+        if isinstance(value, dict):
+            keys += len(value)
+            inner = value.items()
+        elif isinstance(value, list):
+            inner = enumerate(value)
         else:
             trouble = _of_scalar(value)
-            if trouble:
-                return Fault(".".join(place), trouble)
+            return None if trouble is None else ([], trouble)
+        if depth >= DEPTH:
+            return [], f"is nested more than {DEPTH} levels deep"
+        for key, one in inner:
+            trouble = _of_text(key) if isinstance(key, str) else None
+            if trouble is not None:
+                return [], f"one of its keys {trouble}"
+            odd = look(one, depth + 1)
+            if odd is not None:
+                odd[0].append(str(key))
+                return odd
+        return None
+
+    odd = look(document, 0)
+    if odd is not None:
+        place, trouble = odd[0][::-1], odd[1]
+        return Fault(".".join(place if len(place) < DEPTH else place[:3]), trouble)
     # A colon follows each key: no more colons than keys, and none was dropped; then there is no need to look again.
     return _doubled(text) if text.count(b":") > keys else None
 
@@ -60,13 +76,11 @@ def _doubled(text: bytes) -> Fault | None:
 def _of_scalar(value: Any) -> str | None:
     if isinstance(value, str):
         return _of_text(value)
-    if isinstance(value, float) and not isfinite(value):
-        return f"must be a finite number, not {value}"
-    if isinstance(value, int) and not -_WHOLE <= value < _WHOLE:
-        return "must be a whole number of at most 64 bits"
-    if value is not None and not isinstance(value, bool | int | float):
-        return f"must be text, a number, true or false, not {value!r:.40}; quote what is text"
-    return None
+    if isinstance(value, float):
+        return None if isfinite(value) else f"must be a finite number, not {value}"
+    if isinstance(value, int):
+        return None if -_WHOLE <= value < _WHOLE else "must be a whole number of at most 64 bits"
+    return None if value is None else f"must be text, a number, true or false, not {value!r:.40}; quote what is text"
 
 
 def _of_text(text: str) -> str | None:
