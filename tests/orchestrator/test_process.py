@@ -289,6 +289,22 @@ def test_the_port_is_kept_over_a_run_that_never_got_ready(open_runtime: Open) ->
 
 
 @pytest.mark.slow
+def test_the_log_of_what_another_orchestrator_began_can_be_read_and_followed(open_runtime: Open) -> None:
+    other, runtime = open_runtime(), open_runtime()
+    assert other.follow("i1", 10) is None
+    runtime.start(launch(flood=2))
+    until(runtime, Phase.RUNNING)
+    assert "line 1\n" in other.logs("i1", 100)
+    with contextlib.closing(other.follow("i1", 100)) as stream:
+        assert "line 1\n" in (stream.read() or "")
+        runtime.stop("i1", force=True)
+        until(runtime, Phase.EXITED)
+        runtime.remove("i1")
+        while stream.read() is not None:
+            pass
+
+
+@pytest.mark.slow
 def test_a_log_is_kept_within_bounds_and_its_newest_lines_stay(open_runtime: Open, tmp_path: Path) -> None:
     runtime = open_runtime(log_bytes=4096)
     runtime.start(launch(flood=2000))

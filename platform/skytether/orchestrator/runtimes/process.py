@@ -273,21 +273,24 @@ class ProcessRuntime(Runtime):
             os.removedirs(run.data)
 
     def logs(self, instance: str, lines: int) -> str:
-        # Ids come from the store; the check keeps a mistake elsewhere from reading other folders.
-        if instance not in self._runs:
-            return ""
-        with contextlib.suppress(FileNotFoundError), (self._folder / instance / "log").open("rb") as log:
+        with contextlib.suppress(FileNotFoundError), self._log(instance).open("rb") as log:
             log.seek(max(0, os.fstat(log.fileno()).st_size - self._options.log_bytes))
             return b"".join(deque(log, maxlen=lines)).decode(errors="replace")
         return ""
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
-        run = self._runs.get(instance)
-        log = self._folder / instance / "log"
-        if run is None or run.ended is not None or not log.exists():
-            return None
-        return FileLog(log, lines, lambda: run.ended is not None)
+        log, run = self._log(instance), self._runs.get(instance)
+
+        def ended() -> bool:
+            return (run is not None and run.ended is not None) or not log.exists()
+
+        return None if ended() else FileLog(log, lines, ended)
+
+    def _log(self, instance: str) -> Path:
+        """Of a run that another orchestrator of this machine may have begun, which this one does not know."""
+        # Ids come from the store; the check keeps a mistake elsewhere from reading other folders.
+        return self._folder / Path(instance).name / "log"
 
     def close(self) -> None:
         _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
