@@ -8,6 +8,7 @@ processors, and a start that has nothing to do with the robot delays its command
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 import time
@@ -102,6 +103,7 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
         seen = _Commands()
         with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
             _wait(lambda: agent.source is Source.CLOUD, agent)
+            gc.freeze()  # as a robot's program does
             for i in range(n):
                 time.sleep(2 * _AROUND_S)
                 began = time.monotonic()
