@@ -19,8 +19,8 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) -n 2 --dist loadfile || { echo "once more, those that failed:"; $(UNIT) --last-failed; }
 	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
-	$(MAKE) --no-print-directory --jobs 2 --output-sync slow-engine-ros1 slow-others
-	$(SLOW) and not together"
+	@failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine-ros1 slow-others || failed=1; \
+		echo "The other slow tests, one at a time ..."; $(SLOW) and not together" || failed=1; exit $$failed
 
 slow-engine-ros1: $(READY)
 	$(SLOW) and together and (docker or ros1)"
