@@ -84,8 +84,20 @@ def test_with_no_other_site_nothing_is_started(served: Any) -> None:
     assert len(served.operator.instances()) == 1
 
 
+def test_what_has_no_site_yet_is_not_moved(served: Any, manifest: Any) -> None:
+    served.running = lambda i: served.operator.get_instance(i).state is State.RUNNING
+    served.site("only")
+    put(served, manifest, cpu=40)  # of 64
+    ask(served)
+    waiting = served.operator.create_instance(InstanceCreate(robot="walker", service="toy"))
+    with pytest.raises(ApiError, match=r"has no site yet \(.+\): move it once it runs") as caught:
+        served.operator.migrate_instance(waiting.id)
+    assert caught.value.problem.status == 409
+    assert len(served.operator.instances()) == 2
+
+
 def put(served: Any, manifest: Any, **needs: Any) -> None:
-    served.operator.put_service("toy", manifest(needs={"cpu": 0.1, **needs}, params={"properties": {"n": {}}}))
+    served.operator.put_service("toy", manifest(needs={"cpu": 0.1} | needs, params={"properties": {"n": {}}}))
 
 
 def spares(served: Any) -> list[Any]:

@@ -11,8 +11,8 @@ import yaml
 from .plain import oddity
 
 MAX_BYTES = 1 << 20
-_MAX_VALUES = MAX_BYTES
-"""Of a document with its aliases written out. Without aliases there are never so many: each takes a byte at least."""
+_MAX_VALUES = 10_000
+"""Of a document with its aliases written out, or its length: without aliases each takes a byte at least."""
 
 
 class YamlError(Exception):
@@ -81,14 +81,14 @@ def parse_yaml(text: bytes, path: Path) -> list[Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         raise YamlError(f"{path}: is no YAML{where}: {getattr(error, 'problem', None) or 'it is no text'}") from error
-    if any(map(_is_endless, documents)):
+    if any(_is_endless(document, max(_MAX_VALUES, len(text))) for document in documents):
         raise YamlError(f"{path}: an alias stands for what it is part of, or for far too much; write it out")
     return documents
 
 
-def _is_endless(document: Any) -> bool:
+def _is_endless(document: Any, left: int) -> bool:
     """Whether aliases make more of it than anybody could read: whoever walks through it would not come back."""
-    left, waiting = _MAX_VALUES, [document]
+    waiting = [document]
     while waiting:
         value = waiting.pop()
         inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()

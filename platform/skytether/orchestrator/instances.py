@@ -139,7 +139,7 @@ class Instances:
 
         Raises:
             NotFoundError: No such instance, or no such site.
-            ConflictError: It has ended or ends, is nobody's, or is at that site already.
+            ConflictError: It has ended or ends, is nobody's, has no site yet, or is at that site already.
             NoSiteError: No other site can take it now; nothing was started.
         """
         record = self.get(principal, instance)
@@ -149,6 +149,8 @@ class Instances:
             raise ConflictError(
                 f"instance '{instance}' is a standby, which nobody uses: delete it, and another is made"
             )
+        if record.site is None:
+            raise ConflictError(f"instance '{instance}' has no site yet ({record.state}): move it once it runs")
         coming = self._store.successor(instance)
         if coming is not None:
             return self.get(principal, coming)
