@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -381,3 +383,14 @@ def test_of_a_log_no_more_is_told_than_is_kept(tmp_path: Path, open_runtime: Ope
     (tmp_path / "instances/i1/log").write_bytes(b"x" * 100_000 + b"\nlast\n")
     assert runtime.logs("i1", 1) == "last\n"
     assert len(runtime.logs("i1", 5)) == 1024
+
+
+@pytest.mark.slow
+def test_the_processor_time_of_children_that_have_ended_counts() -> None:
+    before = ProcessStat.read(os.getpid())
+    burn = "import time\nwhile time.process_time() < 0.5: pass"
+    subprocess.run([sys.executable, "-c", burn], check=True)
+    after = ProcessStat.read(os.getpid())
+    assert before is not None
+    assert after is not None
+    assert after.cpu_s - before.cpu_s >= 0.4

@@ -41,6 +41,7 @@ class ProcessStat:
     session: int
     start_time: int
     cpu_s: float
+    """Its own, and that of its children that have ended and been waited for."""
     memory_bytes: int
 
     @classmethod
@@ -58,7 +59,7 @@ class ProcessStat:
             zombie=fields[0] in (b"Z", b"X"),
             session=int(fields[3]),
             start_time=int(fields[19]),
-            cpu_s=(int(fields[11]) + int(fields[12])) / _TICK,
+            cpu_s=sum(map(int, fields[11:15])) / _TICK,
             memory_bytes=int(fields[21]) * _PAGE,
         )
 
