@@ -92,6 +92,14 @@ def test_options_that_no_robot_could_use_are_refused() -> None:
         parse(ProcessOptions, {"bind_host": "0.0.0.0"})
     with pytest.raises(InvalidError, match=r"options\.bind_hots: unknown key, did you mean 'bind_host'\?"):
         parse(ProcessOptions, {"bind_hots": "x"}, prefix=("options",))
+    for wrong, text in (
+        ({"bind_host": "localhost"}, "bind_host: must be an address such as 192.0.2.7, not 'localhost'"),
+        ({"bind_host": "192.0.2.7", "advertise_host": "::"}, "advertise_host is needed"),
+        ({"advertise_host": ""}, "advertise_host"),
+        ({"folder": "relative/two"}, "folder: must be an absolute path such as .*, not 'relative/two'"),
+    ):
+        with pytest.raises(InvalidError, match=text):
+            parse(ProcessOptions, wrong)
 
 
 def test_this_process_in_proc() -> None:

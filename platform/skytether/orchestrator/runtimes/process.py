@@ -28,13 +28,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import psutil
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from typing_extensions import override
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
 from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
+from .hosts import AdvertisedHost, BindHost, check_advertised
 from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
 
 _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
@@ -48,17 +49,24 @@ _LAST_LINE = 300
 """Characters of a log's last line that are told."""
 
 
+def _absolute(path: Path) -> Path:
+    """Each service is started in a folder of its own, and would look for another place from there."""
+    if not path.is_absolute():
+        raise ValueError(f"must be an absolute path such as /var/lib/skytether/two, not '{path}'")
+    return path
+
+
 class ProcessOptions(Strict):
     """Options of a process site."""
 
-    bind_host: str = "127.0.0.1"
-    """Address that services listen on."""
-    folder: Path | None = None
+    bind_host: BindHost = "127.0.0.1"
+    """Address (a number, no name) that services listen on."""
+    folder: Annotated[Path, AfterValidator(_absolute)] | None = None
     """Of the instances, the same for several orchestrators on this machine; None: in the orchestrator's own state."""
     owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
     """Under this name instances are found again in ``folder``, beside those of other databases; None: one is made up
     when the site is added."""
-    advertise_host: str | None = None
+    advertise_host: AdvertisedHost | None = None
     """Address that robots are told; None: the one bound. Needed when that is a wildcard."""
     cpu: Annotated[float, Field(gt=0)] | None = None
     """Cores that instances may ask for in all; None: all of the machine's."""
@@ -73,8 +81,7 @@ class ProcessOptions(Strict):
 
     @model_validator(mode="after")
     def _can_be_reached(self) -> ProcessOptions:
-        if self.advertise_host is None and self.bind_host in ("0.0.0.0", "::"):  # noqa: S104 (that is the point)
-            raise ValueError("advertise_host is needed: no robot can connect to a wildcard address")
+        check_advertised(self.advertise_host or self.bind_host)
         return self
 
 

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import Annotated, Literal
 from urllib.parse import SplitResult, urlsplit
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from skytether.api.manifest import Device, Strict
 
+from ..hosts import AdvertisedHost, BindHost, check_advertised
+
 LOCAL_SOCKET = "/var/run/docker.sock"
 Port = Annotated[int, Field(ge=1, le=65_535)]
-_WILDCARDS = ("0.0.0.0", "::")  # noqa: S104
 _NO_NETWORKS = ("host", "none", "default")
 """Words of the engine that are no bridges: with the machine's network, a service could reach all of it."""
-
-
-def _ip_address(text: str) -> str:
-    """The engine takes a name for a wildcard, without a word."""
-    try:
-        return str(ipaddress.ip_address(text))
-    except ValueError:
-        raise ValueError(f"must be an address such as 192.0.2.7, not '{text}'") from None
 
 
 class TlsOptions(Strict):
@@ -53,10 +45,10 @@ class DockerOptions(Strict):
     ``tcp://HOST:PORT`` with ``tls``."""
     tls: TlsOptions | None = None
     ssh: SshOptions = SshOptions()
-    bind_host: Annotated[str, AfterValidator(_ip_address)] | None = None
+    bind_host: BindHost | None = None
     """Address (a number, no name) of the engine's machine on which instances are reached; None: loopback of a local
     engine, all addresses of a remote one."""
-    advertise_host: Annotated[str, Field(min_length=1, max_length=253)] | None = None
+    advertise_host: AdvertisedHost | None = None
     """Address that robots are told; None: ``bind_host``, or the host of a remote engine."""
     ports: tuple[Port, Port] | None = None
     """First and last UDP port that instances may have, as a firewall lets them through; None: the engine chooses."""
@@ -128,8 +120,7 @@ class DockerOptions(Strict):
 
     @model_validator(mode="after")
     def _robots_can_connect(self) -> DockerOptions:
-        if self.advertised in _WILDCARDS:
-            raise ValueError("advertise_host is needed: no robot can connect to a wildcard address")
+        check_advertised(self.advertised)
         if self.network in _NO_NETWORKS:
             raise ValueError(f"network: '{self.network}' has no published ports, by which robots reach instances")
         if self.ports is not None and self.ports[0] > self.ports[1]:
