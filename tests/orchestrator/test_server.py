@@ -6,11 +6,13 @@ import json
 import os
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +21,11 @@ import yaml
 from orchestrator_program import PATIENCE, Program, alive, until, with_toy
 
 from skytether.api.rest import Instance, InstanceCreate, State
+from skytether.orchestrator.errors import OutdatedError
 
 pytestmark = pytest.mark.slow
 
+NO_ADDRESS = "the database address cannot be used: write postgresql://USER@HOST/NAME or sqlite:///PATH"
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
 
 
@@ -281,10 +285,21 @@ def test_a_state_folder_that_is_a_file_and_secrets_for_all_and_a_broken_database
     broken = programs(name="broken")
     broken.folder.mkdir()
     (broken.folder / "state.db").write_bytes(b"no database" * 100)
-    assert broken.fails() == (1, "error: the database cannot be used: file is not a database")
+    advice = "restore a backup (`skytether orchestrator restore`), or give another --state-dir"
+    assert broken.fails() == (1, f"error: {broken.folder / 'state.db'} is no database: {advice}")
+
+
+def test_an_older_orchestrator_over_a_newer_schema_is_one_sentence(programs: Any) -> None:
+    older = programs()
+    older.folder.mkdir()
+    with closing(sqlite3.connect(older.folder / "state.db")) as database:
+        database.executescript(
+            "CREATE TABLE alembic_version (version_num VARCHAR(32)); INSERT INTO alembic_version VALUES ('9999')"
+        )
+    assert older.fails() == (1, f"error: {OutdatedError()}")
 
 
 def test_a_database_address_that_is_none_is_one_sentence(programs: Any) -> None:
     status, line = programs("--database", "nosuch://x").fails()
     assert status == 2
-    assert line.startswith("error: the database address cannot be used: ")
+    assert line == f"error: {NO_ADDRESS}"

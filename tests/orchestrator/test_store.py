@@ -11,7 +11,7 @@ from alembic.migration import MigrationContext
 
 from skytether.api.rest import SiteCreate, State
 from skytether.orchestrator.database import RobotRow, TokenRow
-from skytether.orchestrator.db import make_engine, migrate
+from skytether.orchestrator.db import AddressError, make_engine, migrate
 from skytether.orchestrator.models import metadata
 from skytether.orchestrator.moves import FOREVER
 from skytether.orchestrator.records import IllegalMoveError, Record
@@ -265,3 +265,18 @@ def test_robots_sites_and_services(store: Store) -> None:
     assert store.services() == {"s": {"v": 2}}
     store.delete_service("s")
     assert store.services() == {}
+
+
+@pytest.mark.parametrize(
+    "address", ["", "state.db", "mysql://me@host/name", "sqlite+nosuch", "postgresql://me@host:p/x"]
+)
+def test_an_address_of_no_database_says_what_to_write(address: str) -> None:
+    with pytest.raises(AddressError, match="write postgresql://USER@HOST/NAME or sqlite:///PATH"):
+        make_engine(address)
+
+
+@pytest.mark.parametrize("scheme", ["postgres", "postgresql", "postgresql+psycopg"])
+def test_the_schemes_of_postgresql(scheme: str) -> None:
+    pytest.importorskip("psycopg")
+    engine = make_engine(f"{scheme}://me@host/name")
+    assert (engine.dialect.name, engine.dialect.driver, engine.url.host) == ("postgresql", "psycopg", "host")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any, cast
 
 from pydantic_core import from_json, to_json
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
-from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
 
 from .discovery import NAME
+from .errors import OutdatedError
 
 GONE = (OperationalError, InterfaceError, NoConnectionError)
 """What is raised when the database does not answer (or, SQLite, its disk is full), or all connections wait for it."""
@@ -33,6 +34,8 @@ _POSTGRES = {
 ``postgres.py``. In a database without an encoding (``SQL_ASCII``) text would come back as bytes."""
 
 
+_DRIVERS = {"postgresql": "postgresql+psycopg", "postgres": "postgresql+psycopg", "sqlite": "sqlite"}
+"""By the schemes that people write; ``postgres`` is libpq's other name."""
 SQLITE_PATIENCE = 10
 """Seconds that a statement waits for another program that writes."""
 
@@ -46,6 +49,20 @@ _JSON: dict[str, Any] = {"json_serializer": _json, "json_deserializer": from_jso
 refuse (half a character, hundreds of levels) was refused before it was stored."""
 
 
+class AddressError(Exception):
+    """Where the database is said to be, none can be; one sentence with what to write, without passwords."""
+
+
+def _address(url: str) -> URL:
+    try:
+        address = make_url(url)
+        return address.set(drivername=_DRIVERS[address.get_backend_name()])
+    except (SQLAlchemyError, ValueError, KeyError) as error:
+        raise AddressError(
+            "the database address cannot be used: write postgresql://USER@HOST/NAME or sqlite:///PATH"
+        ) from error
+
+
 def make_engine(url: str, name: str = NAME) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
@@ -55,13 +72,20 @@ def make_engine(url: str, name: str = NAME) -> Engine:
 
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
     it under ``name``.
+
+    Raises:
+        AddressError: It is neither's address, or the driver is not installed.
     """
-    address = make_url(url)
+    address = _address(url)
     if address.get_backend_name() == "postgresql":
-        address = address.set(drivername="postgresql+psycopg")
         connect_args = {**_POSTGRES, "application_name": name}
-        made = create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
-        from .postgres import Server  # its driver is an extra
+        try:
+            made = create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
+            from .postgres import Server  # its driver is an extra
+        except ImportError as error:
+            raise AddressError(
+                f"PostgreSQL's driver cannot be loaded ({error}): pip install 'skytether[postgres]', or use SQLite"
+            ) from error
 
         event.listen(made, "do_connect", Server().connect)
         return made
@@ -101,10 +125,15 @@ def migrate(engine: Engine, to: str = "head") -> str:
 
     Returns:
         The newest schema that this code knows.
+
+    Raises:
+        OutdatedError: The database has one that it does not know.
     """
     from alembic import command  # Alembic is slow to import, and only needed here
     from alembic.config import Config
     from alembic.script import ScriptDirectory
+    from alembic.script.revision import ResolutionError
+    from alembic.util import CommandError
 
     config = Config()
     config.set_main_option("script_location", "skytether.orchestrator:migrations")
@@ -117,5 +146,10 @@ def migrate(engine: Engine, to: str = "head") -> str:
             connection.execute(text(f"SET LOCAL statement_timeout = 0; SET LOCAL lock_timeout = {_LOCK_MS}"))
             connection.execute(text(f"SELECT pg_advisory_xact_lock({MIGRATING})"))
         config.attributes["connection"] = connection
-        command.upgrade(config, to)
+        try:
+            command.upgrade(config, to)
+        except CommandError as error:
+            if isinstance(error.__cause__, ResolutionError):  # the database's revision: ours are all known
+                raise OutdatedError from error
+            raise
     return str(ScriptDirectory.from_config(config).get_current_head())

@@ -18,14 +18,15 @@ from pathlib import Path
 
 import uvicorn
 from alembic.util import CommandError
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import DatabaseError, SQLAlchemyError
 
 from skytether.bridge.echo import EchoServer
 
 from . import logs
 from .app import create_app
 from .core import Orchestrator
-from .errors import InvalidError
+from .db import AddressError
+from .errors import InvalidError, OutdatedError
 from .security import SecretFileError
 from .settings import Settings
 
@@ -72,9 +73,8 @@ def run(settings: Settings) -> None:
             core = Orchestrator(settings)
         except SecretFileError as error:
             raise StartError(str(error)) from error
-        except (SQLAlchemyError, ImportError) as error:
-            text = str(error).splitlines()[0]
-            raise StartError(f"the database address cannot be used: {text}", usage=True) from error
+        except AddressError as error:
+            raise StartError(str(error), usage=True) from error
         _serve(core, listener)
 
 
@@ -128,8 +128,14 @@ def _start(core: Orchestrator) -> None:
         raise StartError(str(error), usage=True) from error
     except SecretFileError as error:
         raise StartError(str(error)) from error
+    except OutdatedError as error:
+        raise StartError(str(error)) from error
     except (SQLAlchemyError, CommandError) as error:
         text = str(getattr(error, "orig", None) or error).splitlines()[0]
+        file = core.settings.state_dir / "state.db"
+        if core.settings.database_url is None and isinstance(error, DatabaseError) and "not a database" in text:
+            advice = "restore a backup (`skytether orchestrator restore`), or give another --state-dir"
+            raise StartError(f"{file} is no database: {advice}") from error
         raise StartError(f"the database cannot be used: {text}") from error
 
 
