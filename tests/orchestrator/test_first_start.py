@@ -1,4 +1,4 @@
-"""The passwords and the token of compose.yaml, made at its first start and kept from then on."""
+"""In the orchestrator's image: its health check; passwords and token of compose.yaml, made once and kept."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from typing import Any
 
 import pytest
 
-FILE = Path(__file__).parents[2] / "images" / "orchestrator" / "first_start.py"
+FOLDER = Path(__file__).parents[2] / "images" / "orchestrator"
 
 
-@pytest.fixture
-def first_start() -> Any:
-    spec = importlib.util.spec_from_file_location("first_start", FILE)
+def loaded(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def first_start() -> Any:
+    return loaded("first_start")
 
 
 @pytest.fixture
@@ -67,3 +71,28 @@ def test_an_orchestrator_that_is_not_there_is_one_sentence(first_start: Any, cap
     assert first_start.main(["token", "http://127.0.0.1:1"]) == 1
     assert capsys.readouterr().err.startswith("error: ")
     assert first_start.main([]) == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "asked"),
+    [
+        ("http://0.0.0.0:8600\n", "http://127.0.0.1:8600/healthz"),
+        ("https://0.0.0.0:443\n", "https://127.0.0.1:443/healthz"),
+        ("https://[::]:8600\n", "https://[::1]:8600/healthz"),
+        ("http://192.0.2.7:80\n", "http://192.0.2.7:80/healthz"),
+        ("http://[fd00::1]:80\n", "http://[fd00::1]:80/healthz"),
+    ],
+)
+def test_health_is_asked_for_where_the_orchestrator_listens(written: str, asked: str) -> None:
+    assert loaded("healthy").url(written) == asked
+
+
+def test_an_orchestrator_that_answers_is_healthy(served: Any, tmp_path: Path, capsys: Any) -> None:
+    healthy = loaded("healthy")
+    healthy.ADDRESS = tmp_path / "address"
+    assert healthy.main() == 1
+    healthy.ADDRESS.write_text(f"{served.url}\n")
+    assert healthy.main() == 0
+    healthy.ADDRESS.write_text("http://127.0.0.1:1\n")
+    assert healthy.main() == 1
+    assert capsys.readouterr().err.count("error: ") == 2
