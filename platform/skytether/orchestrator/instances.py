@@ -237,7 +237,7 @@ class Instances:
             NotFoundError: As for ``get``.
             SilentSiteError: Its site does not answer.
         """
-        site = self._sites.find(self.get(principal, instance).site)
+        site = self._sites.find_anew(self.get(principal, instance).site)
         try:
             return site.runtime.logs(instance, lines) if site else ""
         except RuntimeFailure as error:
@@ -245,7 +245,7 @@ class Instances:
 
     def follow(self, principal: Principal, instance: str, lines: int) -> LogStream | None:
         """The log of an instance's present run, as it is written; None: nothing runs. Raises as ``logs``."""
-        site = self._sites.find(self.get(principal, instance).site)
+        site = self._sites.find_anew(self.get(principal, instance).site)
         try:
             return site.runtime.follow(instance, lines) if site else None
         except RuntimeFailure as error:

@@ -278,13 +278,19 @@ class Sites:
         Raises:
             NotFoundError: There is none of that name; the text names those there are.
         """
-        site = self._sites.get(name)
+        site = self.find_anew(name)
         if site is None:
             raise NotFoundError(f"there is no site '{name}'; {known(self._sites, name)}")
         return site
 
     def find(self, name: str | None) -> Site | None:
         return self._sites.get(name) if name else None
+
+    def find_anew(self, name: str | None) -> Site | None:
+        """The same; one that is not known may have been added at another orchestrator a moment ago."""
+        if name and name not in self._sites:
+            self.refresh()
+        return self.find(name)
 
     def all(self) -> list[Site]:
         return sorted(self._sites.values(), key=lambda site: site.name)
