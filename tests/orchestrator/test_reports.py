@@ -58,3 +58,40 @@ def test_a_report_on_an_instance_that_was_forgotten_meanwhile_harms_nothing(stor
     reports.write()
     assert store.reports() == {"here": {"load": 0.2}}
     assert store.accounts()["walker", "toy"].sums() == {KEY: 12}
+
+
+def test_many_are_written_in_parts_and_what_was_written_is_not_written_again(
+    store: Store, new_record: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports = Reports(store)
+    names = [f"robot-{n}" for n in range(250)]
+    for name in names:
+        record = store.add(new_record(name, robot=name, state=State.RUNNING), "", None, "")
+        reports.take(record, 1.0, {"load": 0.1}, "robot:a", {KEY: 1})
+    parts: list[int] = []
+    hear = store.hear
+
+    def failing(heard: Any, counted: Any) -> None:
+        if len(parts) == 1:
+            parts.append(0)
+            raise OperationalError("", None, Exception("the database is away"))
+        hear(heard, counted)
+        parts.append(len(heard))
+
+    monkeypatch.setattr(store, "hear", failing)
+    with pytest.raises(OperationalError):
+        reports.write()
+    reports.write()
+    assert parts == [100, 0, 100, 50]
+    assert set(store.reports()) == set(names)
+
+
+def test_an_orchestrator_that_was_cut_off_writes_over_nothing_newer(store: Store, new_record: Any) -> None:
+    record = store.add(new_record(state=State.RUNNING), "", None, "")
+    late, early = Reports(store), Reports(store)
+    early.take(record, 1.0, {"load": 0.1}, "robot:a", {KEY: 1})
+    late.take(record, 2.0, {"load": 0.2}, "robot:a", {KEY: 2})
+    late.write()
+    early.write()
+    assert store.reports() == {record.id: {"load": 0.2}}
+    assert store.accounts()["walker", "toy"].sums() == {KEY: 2}

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 import yaml
@@ -27,6 +28,15 @@ pytestmark = pytest.mark.slow
 
 NO_ADDRESS = "the database address cannot be used: write postgresql://USER@HOST/NAME or sqlite:///PATH"
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
+
+
+_ENDLESS = 64 << 20
+"""Bytes: many times what the kernel keeps on the way."""
+
+
+def address_of(program: Program) -> tuple[str, int]:
+    url = urlsplit((program.folder / "address").read_text().strip())
+    return url.hostname or "", url.port or 0
 
 
 @pytest.fixture
@@ -56,6 +66,31 @@ def test_first_start_and_orderly_end(programs: Any) -> None:
     assert not (folder / "address").exists()
     assert (folder / "operator.token").read_text().strip() not in program.log
     assert "Traceback" not in program.log
+
+
+@pytest.mark.parametrize(
+    "endless",
+    [
+        b"GET /" + b"a" * 65_536,
+        b"GET /healthz HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 65_536,
+        b"GET /healthz HTTP/1.1\r\nHost: x\r\n" + b"a: b\r\n" * 10_000,
+        b"POST /healthz HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n" + b"a: b\r\n" * 10_000,
+    ],
+    ids=["line", "header", "headers", "trailers"],
+)
+def test_a_request_whose_head_does_not_end_is_cut_off(programs: Any, endless: bytes) -> None:
+    program = programs()
+    with program.start() as client, socket.create_connection(address_of(program)) as stranger:
+        stranger.settimeout(PATIENCE)
+        sent = 0
+        try:
+            while sent < _ENDLESS:
+                stranger.sendall(endless if not sent else endless[-60_000:])
+                sent += len(endless)
+        except OSError:
+            pass
+        assert sent < _ENDLESS, "it was let go on"
+        assert client.sites()
 
 
 def test_a_killed_service_is_seen_within_a_second_and_runs_again_at_the_same_port(programs: Any, manifest: Any) -> None:

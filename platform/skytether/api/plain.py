@@ -70,7 +70,10 @@ def _doubled(text: bytes) -> Fault | None:
         twice.extend(key for key, count in counts.items() if count > 1)
 
     json.loads(text, object_pairs_hook=look)
-    return Fault("", f"the key '{twice[0]:.40}' comes twice: leave one of them out") if twice else None
+    if not twice:
+        return None
+    key = twice[0][:40].encode(errors="backslashreplace").decode()  # it may be in what was dropped, and so anything
+    return Fault("", f"the key '{key}' comes twice: leave one of them out")
 
 
 def _of_scalar(value: Any) -> str | None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
 from typing import ParamSpec
 
-from sqlalchemy.exc import ProgrammingError
+from sqlalchemy.exc import ProgrammingError, SQLAlchemyError
 
 from skytether.api.report_metrics import Owner
 from skytether.api.rest import Report, ScrapeTargets
@@ -146,7 +147,8 @@ class Orchestrator:
         self.writer.start()
 
     def _write_reports(self) -> float:
-        self.reports.write()
+        with contextlib.suppress(*GONE):  # they are kept until it answers
+            self.reports.write()
         return PERIOD
 
     def _elect(self) -> float:
@@ -211,9 +213,10 @@ class Orchestrator:
 
     def _write_last(self) -> None:
         try:
-            self._unless_outdated(self._write_reports)()
-        except GONE as error:
-            log.warning("the robots' last reports are lost, for the database does not answer: %s", error)
+            if not self.outdated:
+                self.reports.write()
+        except SQLAlchemyError as error:
+            log.warning("the robots' last reports are lost, for the database does not take them: %s", error)
 
     def _stop_instances(self) -> None:
         # Twice the grace: once for the services, once for what comes before and after.

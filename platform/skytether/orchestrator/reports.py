@@ -7,9 +7,9 @@ counted, so one that is lost with a program that is killed is made good by the n
 from __future__ import annotations
 
 import threading
-from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from skytether.api.report_metrics import Counts, Owner
@@ -19,12 +19,16 @@ from .store import Store
 
 PERIOD = 1.0
 """Seconds that a report waits at most."""
+_TOGETHER = 100
+"""Instances whose reports are written in one transaction: others want to write too."""
 
 
 @dataclass(slots=True)
 class _Heard:
-    reports: dict[str, tuple[float, Mapping[str, Any]]] = field(default_factory=dict)
-    counted: dict[Owner, list[tuple[str, Counts]]] = field(default_factory=lambda: defaultdict(list))
+    owner: Owner
+    at: float
+    report: Mapping[str, Any]
+    counted: list[tuple[str, Counts]]
 
 
 class Reports:
@@ -32,7 +36,8 @@ class Reports:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._heard = _Heard()
+        self._heard: dict[str, _Heard] = {}
+        """By instance."""
         self._taking = threading.Lock()
         self._writing = threading.Lock()
 
@@ -47,21 +52,30 @@ class Reports:
             counts: What is counted by now: see `accounts.Account.merge`.
         """
         with self._taking:
-            self._heard.reports[record.id] = (now, report)
-            self._heard.counted[record.robot, record.service].append((life, counts))
+            before = self._heard.get(record.id)
+            counted = before.counted if before else []
+            counted.append((life, counts))
+            self._heard[record.id] = _Heard((record.robot, record.service), now, report, counted)
 
     def write(self) -> None:
         """Bring everything that was taken into the database; if that fails, it is kept for the next time."""
         with self._writing:
             with self._taking:
-                heard, self._heard = self._heard, _Heard()
-            if not heard.reports:
-                return
+                heard, self._heard = self._heard, {}
             try:
-                self._store.hear(heard.reports, heard.counted)
-            except BaseException:
+                while heard:
+                    self._hear(dict(islice(heard.items(), _TOGETHER)))
+                    for instance in list(islice(heard, _TOGETHER)):
+                        del heard[instance]
+            finally:
                 with self._taking:
-                    self._heard.reports = heard.reports | self._heard.reports
-                    for owner, counted in heard.counted.items():
-                        self._heard.counted[owner][:0] = counted
-                raise
+                    for instance, one in heard.items():
+                        newer = self._heard.setdefault(instance, one)
+                        if newer is not one:
+                            newer.counted[:0] = one.counted
+
+    def _hear(self, heard: Mapping[str, _Heard]) -> None:
+        counted: dict[Owner, list[tuple[str, Counts]]] = {}
+        for one in heard.values():
+            counted.setdefault(one.owner, []).extend(one.counted)
+        self._store.hear({instance: (one.at, one.report) for instance, one in heard.items()}, counted)

@@ -19,6 +19,7 @@ from pathlib import Path
 import uvicorn
 from alembic.util import CommandError
 from sqlalchemy.exc import DatabaseError, SQLAlchemyError
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from skytether.bridge.echo import EchoServer
 
@@ -40,6 +41,10 @@ _FILES = 16_384
 _SWITCH = 0.001
 """Seconds that one thread computes while others wait. An answer passes through several threads, each of which waits so
 long for a reconcile pass that is under way: at Python's own 5 ms that adds up."""
+
+
+_MOST_AROUND = 1 << 18
+"""Bytes of a request that are not its body: line, headers, what frames chunks."""
 
 
 class StartError(Exception):
@@ -139,6 +144,26 @@ def _start(core: Orchestrator) -> None:
         raise StartError(f"the database cannot be used: {text}") from error
 
 
+class _Protocol(HttpToolsProtocol):
+    """Uvicorn's, which has no bound on what is not body: a single client could fill the memory and hold up all."""
+
+    _around = 0
+
+    def data_received(self, data: bytes) -> None:
+        self._around += len(data)
+        super().data_received(data)
+        if self._around > _MOST_AROUND and not self.transport.is_closing():
+            self.send_400_response("The request's headers are too large.")
+
+    def on_message_begin(self) -> None:
+        self._around = 0
+        super().on_message_begin()
+
+    def on_body(self, body: bytes) -> None:
+        self._around -= len(body)
+        super().on_body(body)
+
+
 class _Server(uvicorn.Server):
     """Uvicorn that tells its address, and lets event streams end when it is to end."""
 
@@ -146,6 +171,7 @@ class _Server(uvicorn.Server):
         tls = core.settings.tls
         config = uvicorn.Config(
             create_app(core),
+            http=_Protocol,
             log_config=None,
             access_log=False,
             lifespan="off",

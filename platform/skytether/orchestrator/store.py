@@ -102,9 +102,9 @@ _KEEP_ACCOUNT = (
 )
 _HEAR = text(
     "INSERT INTO reports (instance, at, report) SELECT id, :at, :report FROM instances WHERE id = :of_instance"
-    " ON CONFLICT (instance) DO UPDATE SET at = excluded.at, report = excluded.report"
+    " ON CONFLICT (instance) DO UPDATE SET at = excluded.at, report = excluded.report WHERE reports.at <= excluded.at"
 ).bindparams(bindparam("report", type_=reports.c.report.type))
-"""Nothing for an instance that was forgotten meanwhile."""
+"""Nothing for an instance that was forgotten meanwhile, or of which another orchestrator has heard since."""
 
 
 @cache
@@ -433,7 +433,7 @@ class Store(Database):
         if record.state.final:
             self._seen.pop(record.id, None)
             return
-        if len(self._seen) >= _SEEN:
+        if record.id not in self._seen and len(self._seen) >= _SEEN:
             self._seen = {}
         self._seen[record.id] = record
 

@@ -14,6 +14,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew
 
 from ..core import Orchestrator
+from ..db import GONE
 from ..instances import utc
 from ..records import Record
 from ..runtimes.base import LogStream
@@ -96,13 +97,14 @@ async def logs(
     With ``follow`` those of its present run, then what that writes as it comes, until it ends.
     """
     lines = min(tail, core.settings.limits.log_lines)
+    record = await asyncio.to_thread(core.instances.get, caller, instance)
     stream = await asyncio.to_thread(core.instances.follow, caller, instance, lines) if follow else None
     if stream is None:
         return PlainTextResponse(await asyncio.to_thread(core.instances.logs, caller, instance, lines))
-    return StreamingResponse(_relayed(core, request, stream), media_type="text/plain")
+    return StreamingResponse(_relayed(core, request, stream, record), media_type="text/plain")
 
 
-async def _relayed(core: Orchestrator, request: Request, stream: LogStream) -> AsyncIterator[str]:
+async def _relayed(core: Orchestrator, request: Request, stream: LogStream, record: Record) -> AsyncIterator[str]:
     """Until the run ends, nobody listens any more, or the orchestrator is to end."""
     try:
         while not core.broker.closed and not await request.is_disconnected():
@@ -111,8 +113,18 @@ async def _relayed(core: Orchestrator, request: Request, stream: LogStream) -> A
                 return
             if text:
                 yield text
+            elif await asyncio.to_thread(_is_over, core, record):
+                return
     finally:
         stream.close()
+
+
+def _is_over(core: Orchestrator, record: Record) -> bool:
+    """Whether a run has ended, for whoever leads knows it first, and not every orchestrator sees every site's runs."""
+    with contextlib.suppress(*GONE):
+        now = core.store.get(record.id)
+        return now is None or now.state.final or now.attempt != record.attempt
+    return False
 
 
 @router.get("/{instance}/events", response_class=EventSourceResponse, responses=says(404))

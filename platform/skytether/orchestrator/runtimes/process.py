@@ -290,7 +290,8 @@ class ProcessRuntime(Runtime):
         log, run = self._log(instance), self._runs.get(instance)
 
         def ended() -> bool:
-            return (run is not None and run.ended is not None) or not log.exists()
+            # Of what another orchestrator began this one may know an older run only.
+            return (run is not None and run.child is not None and run.ended is not None) or not log.exists()
 
         return None if ended() else FileLog(log, lines, ended)
 
@@ -445,8 +446,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _write_private(path: Path, content: str) -> None:
-    """Mode 0600, complete or not at all."""
-    draft = path.with_name(path.name + ".new")
+    """Mode 0600, complete or not at all; several orchestrators may write it at once."""
+    draft = path.with_name(f"{path.name}.{os.getpid()}.new")
     with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         file.write(content)
     draft.replace(path)
