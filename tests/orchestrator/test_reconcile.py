@@ -17,6 +17,7 @@ from skytether.orchestrator.store import Store
 from skytether.testing.runtimes import (
     BlockedRuntime,
     CrashingRuntime,
+    FakeRuntime,
     NeverReadyRuntime,
     RefusingRuntime,
     SlowRuntime,
@@ -163,6 +164,35 @@ def test_what_cannot_be_started_waits_for_a_site_that_is_full(
     waiting = b.record("i2")
     assert (waiting.state, waiting.site) == (State.PENDING, None)
     assert waiting.reason == f"waiting for a site: lab: {NO_SPACE}; other: needs 1 cores, 0 of 1 are free"
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_what_waits_tries_a_site_that_could_not_start_it_again(
+    bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silent: bool
+) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path, cpu=1)
+    if not silent:
+        add(b, new_record("i0", pinned="other", lease_expires_at=b.clock() + 1000))
+        b.step()
+    other.runtime.silent = silent
+    b.reconciler.site_step(other)
+    tried: list[float] = []
+    real = b.runtime.start
+    monkeypatch.setattr(b.runtime, "start", lambda launch: (tried.append(b.clock()), real(launch)))
+    began = b.clock()
+    add(b, new_record("i1", lease_expires_at=began + 1000))
+    for _ in range(400):
+        b.step()
+        b.clock.forward(0.25)
+    bursts = [at - began for before, at in zip([0.0, *tried], tried, strict=False) if at - before > 20]
+    assert len(bursts) == 3, "in 100 s, each about 4 s long"
+    assert len(tried) <= 5 * 3
+    monkeypatch.setattr(b.runtime, "start", FakeRuntime.start.__get__(b.runtime))  # somebody mended it
+    for _ in range(160):
+        b.step()
+        b.clock.forward(0.25)
+    assert (b.record("i1").state, b.record("i1").site) == (State.RUNNING, "lab")
 
 
 def test_nothing_is_placed_at_a_site_that_is_blocked_until_it_is_not(

@@ -18,7 +18,7 @@ from .settings import Weights
 
 NOTHING = Capacity(0.0, 0)
 UNSTARTED = "start"
-"""Reason of a refusal by a site that was tried: it stays with the instance."""
+"""Reason of a refusal by a site that was tried: it stays with the instance while another one fits."""
 _TIER_ORDER: Mapping[Tier, int] = {"robot": 0, "edge": 1, "cloud": 2}
 """Nearer first, where nothing was measured."""
 _FULLEST = 0.95

@@ -219,8 +219,15 @@ class Reconciler:
         replaced = self._store.get(record.replaces) if record.replaces else None
         return replaced is None or site.name != replaced.site
 
+    def _waits(self, record: Record) -> bool:
+        """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
+        return 0 < record.start_at - self._clock() <= self._timing.backoff_max
+
     def _place(self, record: Record, placed: Sequence[Record]) -> Record | None:
         decision = self.weigh(record, placed)
+        untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
+        if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
+            decision = self.weigh(replace(record, refused=untried), placed)  # it may have been mended
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
             self._metrics.refused(record.service, decision.refused)
@@ -234,7 +241,7 @@ class Reconciler:
             return None
         now = self._clock()
         scores = [score.model_dump() for score in decision.scores]
-        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site, scores=scores)
+        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site, scores=scores, start_at=0.0)
         if chosen is not None:
             self._metrics.phase(chosen, "placing", now - record.created_at)
             self._wake_site(decision.site)
@@ -406,7 +413,8 @@ class Reconciler:
     def _elsewhere(self, site: Site, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
         """What else changes where a run cannot be started: the site is refused, if that leaves another one to try.
 
-        A site that can start nothing at all is not refused for good: it says so itself, until it can.
+        A site that can start nothing at all is not refused so: it says so itself, until it can. The others stay refused
+        while another one fits, or until ``start_at``: nobody tells when they were mended.
         """
         record, refused = crash.record, list(crash.record.refused)
         if not site.runtime.blocked():
@@ -425,7 +433,7 @@ class Reconciler:
             "refused": [refusal.model_dump() for refusal in decision.refused],
             "failures": 0,
             "restarts": 0,
-            "start_at": 0.0,
+            "start_at": self._clock() + self._timing.backoff_max,
         }
 
     def _expire(self, record: Record) -> None:

@@ -78,7 +78,8 @@ class Record:
     restarts: int = 0
     """At this site."""
     start_at: float = 0.0
-    """The present run is not launched before this (back-off)."""
+    """The present run is not launched before this (back-off). Without a site: those that could not start it are tried
+    again after this."""
     started_at: float | None = None
     """When the present run was launched."""
     running_at: float | None = None
