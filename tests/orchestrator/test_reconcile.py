@@ -166,6 +166,23 @@ def test_what_cannot_be_started_waits_for_a_site_that_is_full(
     assert waiting.reason == f"waiting for a site: lab: {NO_SPACE}; other: needs 1 cores, 0 of 1 are free"
 
 
+def test_a_standby_that_cannot_be_started_waits_for_no_room(
+    bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path, cpu=1)
+    monkeypatch.setattr(b.reconciler.moves, "keep_spares", lambda: None)
+    add(b, new_record("i0", pinned="other", lease_expires_at=b.clock() + 1000))
+    b.step()
+    b.reconciler.site_step(other)
+    add(b, new_record("i1", robot="", spare=True, lease_expires_at=b.clock() + 1e9))
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    assert b.record().state is State.FAILED
+    assert len(b.runtime.world) == 0
+
+
 @pytest.mark.parametrize("silent", [False, True])
 def test_what_waits_tries_a_site_that_could_not_start_it_again(
     bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silent: bool

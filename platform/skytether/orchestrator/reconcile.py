@@ -420,7 +420,7 @@ class Reconciler:
         if not site.runtime.blocked():
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
         decision = self.weigh(replace(record, refused=refused))
-        if decision.site is None and (decision.hopeless or not gives_up):
+        if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
             several = gives_up and len(decision.refused) > 1
             return {"reason": f"no site can start it: {told(decision.refused)}"} if several else {}
         self._metrics.refused(record.service, decision.refused)
