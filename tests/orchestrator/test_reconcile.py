@@ -232,6 +232,29 @@ def test_nothing_is_placed_at_a_site_that_is_blocked_until_it_is_not(
     assert {b.record(instance).state for instance in ("i1", "i2")} == {State.RUNNING}
 
 
+def test_what_runs_at_a_site_that_is_blocked_stays_as_good_as_it_was(
+    bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(BlockedRuntime)
+    b.runtime.obstacle = ""
+    monkeypatch.setattr(b.reconciler.moves, "keep_spares", lambda: None)
+    add(b, new_record("i1", robot="", spare=True, lease_expires_at=b.clock() + 1e9))
+    near = {"lab": {"rtt_ms": 5.0}, "other": {"rtt_ms": 300.0}}
+    add(b, new_record("i2", measurements=near, lease_expires_at=b.clock() + 1e9))
+    b.step(2)
+    b.runtime.obstacle = "the network is missing"
+    b.beside(tmp_path)
+    moves = b.reconciler.moves
+    assert [spare.id for spare in moves.spares_for(new_record("i3", measurements=near))] == ["i1"]
+    report = {"control_source": "fallback", "rtt_s": 0.005}
+    monkeypatch.setattr(b.store, "reports", lambda _: {"i2": report})
+    for _ in range(2):
+        moves.watch(b.store.live())
+        b.clock.forward(100)
+    moves.watch(b.store.live())
+    assert b.store.successor("i2") is None, "the other one is worse"
+
+
 def test_a_robot_that_vanishes_frees_what_it_held(bench: Any, new_record: NewRecord) -> None:
     b = bench()
     add(b, new_record())

@@ -8,9 +8,10 @@ runs, so whatever goes wrong with a successor costs the robot nothing.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 from skytether.api.manifest import Manifest
 from skytether.api.rest import Measurement, Report, State
@@ -33,8 +34,11 @@ _BY_ITSELF = ("fallback", "stop")
 _SETTLED = 30.0
 """Seconds that a spare with other parameters is kept: robots that ask for different ones must not wear it out."""
 
-Weigh = Callable[[Record, Sequence[Record]], Decision]
-"""Where a record would run, beside others."""
+
+class Weigh(Protocol):
+    """Where a record would run, beside others; ``runs``: it need not be started, which some sites cannot at present."""
+
+    def __call__(self, record: Record, placed: Sequence[Record], runs: bool = False) -> Decision: ...
 
 
 class Moves:
@@ -87,9 +91,10 @@ class Moves:
         same = [spare for spare in self._store.spares(record.service) if _alike(spare, record)]
         if not same:
             return []
-        decision = self._weigh(record, [other for other in self._store.live() if other not in same])
-        scores = {score.site: score.total_ms for score in decision.scores}
-        limit = min(scores.values(), default=0.0) + self._weights.migrate_ms
+        others = [other for other in self._store.live() if other not in same]
+        scores = {score.site: score.total_ms for score in self._weigh(record, others, runs=True).scores}
+        cold = (score.total_ms for score in self._weigh(record, others).scores)
+        limit = min(cold, default=math.inf) + self._weights.migrate_ms
         good = [s for s in same if s.site in scores and scores[s.site] <= limit and self._reachable(s)]
         return sorted(good, key=lambda spare: (scores[spare.site or ""], spare.created_at))
 
@@ -189,7 +194,8 @@ class Moves:
         rtt_ms = None if report.rtt_s is None else report.rtt_s * 1000
         here = {record.site or "": Measurement(rtt_ms=rtt_ms).model_dump(exclude_none=True)}
         as_it_is = replace(wanted, replaces=None, measurements={**record.measurements, **here})
-        present = next((s.total_ms for s in self._weigh(as_it_is, others).scores if s.site == record.site), None)
+        scores = self._weigh(as_it_is, others, runs=True).scores
+        present = next((s.total_ms for s in scores if s.site == record.site), None)
         # Only for what was measured, and only for a gain: else two bad sites would hand a robot to and fro.
         if best and best.measured and (present is None or best.total_ms + self._weights.migrate_ms < present):
             self._bad_since.pop(record.id, None)

@@ -201,14 +201,16 @@ class Reconciler:
                 to = State.STOPPED if record.state is State.STOPPING else State.FAILED
                 self._store.change(record, now, state=to, reason=f"site '{record.site}' was deleted: ask again")
 
-    def weigh(self, record: Record, placed: Sequence[Record] | None = None) -> Decision:
-        """Where it would run now, beside what is placed; looks only."""
+    def weigh(self, record: Record, placed: Sequence[Record] | None = None, runs: bool = False) -> Decision:
+        """Where it would run now, beside what is placed; looks only. ``runs``: it need not be started any more."""
         others = self._store.live() if placed is None else placed
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
         used = _used(others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
         tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
         sites = [site.candidate(record.spec, used.get(site.name, NOTHING), tried.get(site.name)) for site in allowed]
+        if runs:
+            sites = [replace(site, blocked=None) for site in sites]
         spec = record.spec
         return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
 
