@@ -137,6 +137,27 @@ def test_what_cannot_be_started_at_a_site_runs_at_another(bench: Any, new_record
     assert 'placement_refusals_total{reason="start",service="toy",site="lab"} 1.0' in b.metrics.text().decode()
 
 
+def test_what_is_moved_does_not_go_where_it_could_not_be_started(
+    bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(RefusingRuntime)
+    other = b.beside(tmp_path)
+    near = {"lab": {"rtt_ms": 5.0}, "other": {"rtt_ms": 300.0}}
+    add(b, new_record(measurements=near, lease_expires_at=b.clock() + 1e9))
+    b.step(3)
+    b.reconciler.site_step(other)
+    b.reconciler.site_step(other)
+    assert b.record().site == "other"
+    moves = b.reconciler.moves
+    monkeypatch.setattr(b.store, "reports", lambda _: {"i1": {"control_source": "fallback", "rtt_s": 0.3}})
+    for _ in range(3):
+        moves.watch(b.store.live())
+        b.clock.forward(100)
+    assert b.store.successor("i1") is None
+    assert b.reconciler.weigh(moves.successor_of(b.record())).refused[0].reason == "start"
+    assert b.reconciler.weigh(moves.successor_of(b.record(), "lab")).site == "lab", "the operator wants it"
+
+
 def test_what_no_site_can_start_fails_with_all_reasons(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:
     b = bench(RefusingRuntime)
     other = b.beside(tmp_path, RefusingRuntime)

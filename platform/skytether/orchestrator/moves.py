@@ -18,7 +18,7 @@ from skytether.api.rest import Measurement, Report, State
 
 from .catalogue import Catalogue
 from .errors import InvalidError
-from .placement import Decision
+from .placement import UNSTARTED, Decision
 from .records import Record, new_record
 from .settings import Timing, Weights
 from .sites import Sites
@@ -70,7 +70,10 @@ class Moves:
         """By instance: since when its robot has driven by itself."""
 
     def successor_of(self, record: Record, site: str | None = None) -> Record:
-        """An instance like another one, for the same robot; not stored yet."""
+        """An instance like another one, for the same robot; not stored yet.
+
+        What could not start that one is not tried again, unless it is the ``site`` that was asked for.
+        """
         now = self._clock()
         return new_record(
             robot=record.robot,
@@ -82,6 +85,7 @@ class Moves:
             updated_at=now,
             lease_s=record.lease_s,
             lease_expires_at=now + record.lease_s,
+            refused=[refusal for refusal in record.refused if refusal["reason"] == UNSTARTED and site is None],
             replaces=record.id,
             pinned=site,
         )
@@ -164,7 +168,7 @@ class Moves:
         if record.spare or self._store.successor(record.id) is not None:
             return
         wanted = self.successor_of(record)
-        for spare in self.spares_for(replace(wanted, replaces=None)):
+        for spare in self.spares_for(replace(wanted, replaces=None, refused=[])):
             robot = {"robot": record.robot, "measurements": record.measurements, "replaces": record.id}
             lease = {"lease_s": record.lease_s, "lease_expires_at": wanted.lease_expires_at}
             now = self._clock()
