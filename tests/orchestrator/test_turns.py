@@ -11,6 +11,7 @@ from reconcile_bench import Bench, add
 from skytether.api.rest import State
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.settings import Timing
+from skytether.orchestrator.sites import Site
 from skytether.testing.runtimes import FakeRuntime, NeverReadyRuntime, SlowRuntime, StubbornRuntime
 
 NewRecord = Callable[..., Record]
@@ -121,6 +122,27 @@ def test_what_comes_and_goes_is_looked_at_alone(running: Any, new_record: NewRec
     assert b.record().state is State.RUNNING
     turn(b)
     assert turn(b) > TIMING.observe_changing
+
+
+def test_a_call_in_the_moment_when_calls_are_taken_is_not_lost(running: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    b, reads = running()
+
+    class Called:
+        """Becomes true right after it was read as false."""
+
+        value = False
+
+        def __get__(self, *_: object) -> bool:
+            was, self.value = self.value, True
+            return was
+
+        def __set__(self, _: object, value: bool) -> None:
+            self.value = value
+
+    monkeypatch.setattr(Site, "called", Called(), raising=False)
+    turn(b)
+    turn(b)
+    assert reads.since() == [True]
 
 
 def test_what_does_not_end_is_ended_by_force_in_time(running: Any) -> None:

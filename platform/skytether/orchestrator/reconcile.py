@@ -104,7 +104,8 @@ class Reconciler:
         """
         now = self._steady()
         due, look = site.passed_at + _WHOLE - now, site.watched_at + self._timing.observe - now
-        called, site.called = site.called, False  # before the look: a call during it is not lost
+        if called := site.called:
+            site.called = False  # before the look, and only what was seen: no call is lost
         if due <= 0 or (look <= 0 and not _all_as_it_was(site)):
             return self.site_step(site)
         if look <= 0:
