@@ -79,7 +79,7 @@ def test_with_no_other_site_nothing_is_started(served: Any) -> None:
     served.site("only")
     made = served.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=1000))
     until(lambda: served.operator.get_instance(made.id).state is State.RUNNING)
-    with pytest.raises(ApiError, match="no site can run 'toy'"):
+    with pytest.raises(ApiError, match="no site can run 'toy': there is no other: add one"):
         served.operator.migrate_instance(made.id)
     assert len(served.operator.instances()) == 1
 

@@ -118,7 +118,7 @@ class Instances:
 
     def _no_site(self, record: Record, decision: Decision) -> NoSiteError:
         self._metrics.refused(record.service, decision.refused)
-        text = f"no site can run '{record.service}': {told(decision.refused)}"
+        text = f"no site can run '{record.service}': {told(record, decision.refused)}"
         return NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
 
     def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:

@@ -235,7 +235,7 @@ class Reconciler:
         if refused != record.refused:
             self._metrics.refused(record.service, decision.refused)
         if decision.site is None:
-            reason = f"waiting for a site: {told(decision.refused)}"
+            reason = f"waiting for a site: {told(record, decision.refused)}"
             if reason != record.reason or record.state is not State.PENDING:
                 self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
             return None
@@ -425,7 +425,7 @@ class Reconciler:
         decision = self.weigh(replace(record, refused=refused))
         if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
             several = gives_up and len(decision.refused) > 1
-            return {"reason": f"no site can start it: {told(decision.refused)}"} if several else {}
+            return {"reason": f"no site can start it: {told(record, decision.refused)}"} if several else {}
         self._metrics.refused(record.service, decision.refused)
         return {
             "state": State.PENDING,
@@ -504,6 +504,7 @@ def _used(records: Sequence[Record]) -> dict[str, Capacity]:
     return {site: Capacity(*sum_) for site, sum_ in sums.items()}
 
 
-def told(refused: Sequence[Refusal]) -> str:
+def told(record: Record, refused: Sequence[Refusal]) -> str:
     """All refusals in one sentence."""
-    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or "there is none: add one with `skytether site add`"
+    none = "no other" if record.replaces else "none"
+    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or f"there is {none}: add one with `skytether site add`"
