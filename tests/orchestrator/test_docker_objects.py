@@ -24,6 +24,7 @@ from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
+from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
 from skytether.orchestrator.runtimes.docker.objects import (
@@ -417,3 +418,22 @@ def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
         runtime._prepare_early()
         assert runtime.blocked() == ""
     assert caplog.text.count("site edge: nothing can be started: no guard") == 1, "said once"
+
+
+def test_who_sees_that_a_start_failed_sees_that_nothing_is_left_of_it() -> None:
+    class Failing(Job):
+        def _clear(self) -> None:
+            """Nothing is there."""
+
+        def _launch(self) -> None:
+            raise RuntimeFailure("no space left")
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            if name == "failure" and value:
+                assert self.unstarted
+            super().__setattr__(name, value)
+
+    nothing: Any = None
+    job = Failing(nothing, nothing, nothing, "", nothing, nothing, None)
+    job._run()
+    assert "no space left" in job.failure

@@ -105,8 +105,8 @@ class Job:
             self._follower.doubt(error)
             self.unanswered = True
         except RuntimeFailure as error:
+            self.unstarted = cleared  # first: whoever sees the failure reads this next
             self.failure = f"could not be started: {advised(str(error))}"
-            self.unstarted = cleared
         except Exception as error:
             log.exception("start of %s failed", self.launch.instance)
             self.failure = f"could not be started: {error}"
