@@ -156,7 +156,7 @@ CALLS: list[Callable[[Client], Any]] = [
 
 
 @pytest.mark.parametrize("call", CALLS)
-@pytest.mark.parametrize("url", ["http://127.0.0.1:1", "http://no-such-host.invalid", "127.0.0.1:8600", "ftp://x"])
+@pytest.mark.parametrize("url", ["http://127.0.0.1:1", "http://no-such-host.invalid"])
 def test_nobody_there_is_one_sentence_that_says_what_to_do(call: Callable[[Client], Any], url: str) -> None:
     with Client(url) as client, pytest.raises(Unreachable) as caught:
         call(client)
@@ -303,3 +303,18 @@ def test_a_lost_connection_is_tried_again_only_where_that_does_no_harm(script: S
 
 def test_no_secret_shows(client: Client) -> None:
     assert "sky-token" not in repr(client) + repr(vars(client))
+
+
+@pytest.mark.parametrize("url", ["", ",,", "localhost:8600", "cloud", "ftp://cloud:8600", "http://[::1"])
+@pytest.mark.parametrize("call", CALLS)
+def test_an_address_that_is_none_says_what_to_write(call: Callable[[Client], Any], url: str) -> None:
+    with Client(url) as client, pytest.raises(Unreachable, match="is no address of an orchestrator: write http://HOST"):
+        call(client)
+
+
+def test_the_scheme_of_the_other_kind_of_server_is_told(script: Script) -> None:
+    secure = script.url.replace("http:", "https:")
+    with Client(secure) as client, pytest.raises(Unreachable, match="does not speak TLS: write http://"):
+        client.sites()
+    with hanging_up(1) as (url, _), Client(url) as client, pytest.raises(Unreachable, match="write https:// instead"):
+        client.create_robot(RobotCreate(name="walker"))

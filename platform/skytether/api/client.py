@@ -195,7 +195,7 @@ class Client:
                 time.sleep(_END_SEEN_S)
                 if self._run(instance_id) != run:
                     return
-            except (httpx.TransportError, Unreachable, ApiError) as error:
+            except (httpx.TransportError, httpx.InvalidURL, Unreachable, ApiError) as error:
                 silent_since = silent_since or time.monotonic()
                 self._must_return(error, reached, silent_since)
                 time.sleep(_RESUME_PAUSE_S)
@@ -214,7 +214,7 @@ class Client:
         """
         away = not isinstance(error, ApiError) or error.problem.status in _AWAY
         if not (reached and away) or time.monotonic() - silent_since > _RESUME_S:
-            if isinstance(error, httpx.TransportError):
+            if isinstance(error, httpx.TransportError | httpx.InvalidURL):
                 raise self._unreachable(error) from error
             raise error
 
@@ -242,7 +242,7 @@ class Client:
                 # The stream has ended with the instance, or with the orchestrator; its last event may be missing yet.
                 ended = self.get_instance(instance_id).state.final
                 reached, silent_since = True, None
-            except (httpx.TransportError, Unreachable, ApiError) as error:
+            except (httpx.TransportError, httpx.InvalidURL, Unreachable, ApiError) as error:
                 now = time.monotonic()
                 if now >= deadline:
                     return
@@ -460,6 +460,21 @@ class Client:
             if dated:
                 advice = f"correct this machine's clock ({datetime.now(UTC):%Y-%m-%d %H:%M} UTC), or renew it"
             return Unreachable(f"the certificate of {self._shown} is not trusted ({why}): {advice}")
+        if isinstance(error, httpx.UnsupportedProtocol | httpx.InvalidURL):
+            wrong = [url for url in self._urls if not url.startswith(("http://", "https://"))] or self._urls
+            return Unreachable(
+                f"'{', '.join(wrong)}' is no address of an orchestrator: write http://HOST:PORT or https://HOST:PORT "
+                "(--url, SKYTETHER_URL, or orchestrator in robot.yaml)"
+            )
+        at = error.request.url if isinstance(error, httpx.TransportError) else httpx.URL()
+        asked = f"{at.scheme}://{at.netloc.decode('ascii')}"
+        if "WRONG_VERSION_NUMBER" in str(error):
+            return Unreachable(f"{asked} does not speak TLS: write http:// instead of https://, or correct the port")
+        if isinstance(error, httpx.RemoteProtocolError) and at.scheme == "http":
+            return Unreachable(
+                f"{asked} closes the connection without an answer: if it has a certificate, write https:// instead of "
+                "http://; if it is being restarted, try again"
+            )
         return Unreachable(
             f"no orchestrator answers at {self._shown}: "
             "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
