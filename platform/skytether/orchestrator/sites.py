@@ -278,7 +278,7 @@ class Sites:
         Raises:
             NotFoundError: There is none of that name; the text names those there are.
         """
-        site = self.find_anew(name)
+        site = self.find(name)
         if site is None:
             raise NotFoundError(f"there is no site '{name}'; {known(self._sites, name)}")
         return site
