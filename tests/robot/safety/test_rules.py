@@ -18,7 +18,8 @@ from skytether.robot.safety.footprint import Points, polygon
 from skytether.robot.safety.joystick import JoystickParams
 from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.ranges import Mount
-from skytether.robot.safety.rules import Action, Decision, Gate, Hand, RangeSensor, Rules
+from skytether.robot.safety.rules import Decision, Gate, Hand, Rules
+from skytether.robot.safety.sensing import Action, RangeSensor
 from skytether.robot.safety.zones import Zone, ZoneParams
 from skytether.robot.supervisor import Limits, Objection
 
@@ -401,7 +402,6 @@ def test_no_sequence_of_commands_drives_the_robot_into_anything(legs, things):
             relative = (world - (x, y)) @ np.array([[c, -s], [s, c]])
             assert (stop_zone.outside(relative) >= allowed - 0.005).all()
             if tick % 4 == 0:
-                gate._seen.clear()
                 gate.sense("scan", _exact(relative), now)
             gate.command(Command(Hand.AGENT, linear, angular, 1, sequence, now, 0.0, now), now)
             velocity = gate.step(now).velocity

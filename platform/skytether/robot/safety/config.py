@@ -20,7 +20,8 @@ from .joystick import JoystickParams
 from .latch import ButtonParams
 from .protocol import default_folder
 from .ranges import Mount
-from .rules import Action, RangeSensor, Rules
+from .rules import Rules
+from .sensing import Action, RangeSensor
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"

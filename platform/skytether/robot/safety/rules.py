@@ -12,23 +12,20 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf, isfinite
 
-import numpy as np
-
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import Bool, Joy, LaserScan, Message, Range
+from skytether.messages import Bool, Joy, Message
 from skytether.robot import supervisor
 from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import joystick, latch
 from . import limits as reach
-from .footprint import Footprint, Points
+from .footprint import Footprint
 from .joystick import Grip, Joystick, JoystickParams
 from .latch import ButtonParams, Latch
-from .ranges import UNKNOWN, Mount, Sight, View, view
+from .sensing import Action, RangeSensor, Sensing
 from .zones import Allowed, Zone, ZoneParams, Zones
 
-_NOTHING: Points = np.empty((0, 2))
 _ORDINARY = frozenset({Objection.LINEAR_ACCELERATION, Objection.ANGULAR_ACCELERATION})
 """Every start and every turn meets these limits; they are counted and not named."""
 _EVENTS = 32
@@ -41,31 +38,6 @@ class Hand(StrEnum):
     AGENT = "agent"
     JOYSTICK = "joystick"
     NOBODY = "nobody"
-
-
-class Action(StrEnum):
-    """What to do about a sensor that does not see."""
-
-    STOP = "stop"
-    SLOW = "slow"
-    FREE = "free"
-
-
-@dataclass(frozen=True, slots=True)
-class RangeSensor:
-    """A laser or a sonar.
-
-    Attributes:
-        mount: Where it is and how far it is to be believed.
-        max_age_s: Silence after which it is stale [s].
-        on_unknown: When it is blind, silent or makes no sense.
-        on_empty: When it reports nothing within reach in any direction.
-    """
-
-    mount: Mount = field(default_factory=Mount)
-    max_age_s: float = 0.3
-    on_unknown: Action = Action.STOP
-    on_empty: Action = Action.SLOW
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +86,6 @@ class Decision:
     troubles: Mapping[str, str]
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    view: View
-    at: float
-    stamp: tuple[int, int]
-
-
 class Gate:
     """Takes in commands and readings as they come, and says at each step what the wheels are told.
 
@@ -137,7 +102,7 @@ class Gate:
         self._supervised = Supervised()
         self._joystick = Joystick()
         self._latch = Latch(reason=stopped)
-        self._seen: dict[str, _Seen] = {}
+        self._sensing = Sensing(rules.sensors, rules.limits.clock_tolerance_s)
         self._zone = Zone.CLEAR
         self._count = 0
         self._events: dict[str, str] = {}
@@ -159,7 +124,9 @@ class Gate:
         """Take a message in from one of the robot's own sensors. Never raises for what it holds."""
         rules = self._rules
         if topic in rules.sensors:
-            self._look(topic, message, now)
+            wrong = self._sensing.look(topic, message, now)
+            if wrong is not None:
+                self._event(*wrong)
         elif rules.joystick is not None and topic == rules.joystick_topic and isinstance(message, Joy):
             self._hear_joystick(rules.joystick, message, now)
         elif rules.button is not None and topic == rules.button_topic and isinstance(message, Bool):
@@ -242,32 +209,11 @@ class Gate:
 
     def _see(self, wanted: Velocity, now: float, troubles: dict[str, str]) -> Allowed:
         """What zones and sensors leave of a velocity."""
-        points, oldest, most = [_NOTHING], 0.0, 1.0
-        for topic, sensor in self._rules.sensors.items():
-            seen = self._seen.get(topic)
-            age = inf if seen is None else now - seen.at
-            if seen is None or not -self._rules.limits.clock_tolerance_s <= age <= sensor.max_age_s:
-                sight, detail = Sight.STALE, "nothing has come yet" if seen is None else f"silent for {age:.1f} s"
-            else:
-                sight, detail = seen.view.sight, seen.view.detail
-                points.append(seen.view.points)
-                oldest = max(oldest, age)
-            action = _action(sensor, sight)
-            if action is not Action.FREE:
-                verb = "the robot stands" if action is Action.STOP else "the robot goes slowly"
-                troubles[f"sensor:{topic}:{sight}"] = f"{topic}: is {sight}: {detail}; {verb}"
-                most = min(most, 0.0 if action is Action.STOP else self._zones.slow(wanted))
-        allowed = self._zones.allow(wanted, np.concatenate(points), oldest, self._zone)
+        scene = self._sensing.see(now)
+        troubles.update(scene.troubles)
+        allowed = self._zones.allow(wanted, scene.points, scene.age, self._zone)
+        most = {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[scene.action]
         return replace(allowed, share=min(allowed.share, most))
-
-    def _look(self, topic: str, message: Message, now: float) -> None:
-        header = message.header if isinstance(message, LaserScan | Range) else None
-        stamp = (header.stamp.sec, header.stamp.nanosec) if header else (0, 0)
-        before = self._seen.get(topic)
-        if before is not None and stamp == before.stamp and any(stamp):
-            self._event(f"sensor:{topic}:repeated", f"{topic}: sends the same scan again, which counts as silence")
-            return
-        self._seen[topic] = _Seen(view(self._rules.sensors[topic].mount, message), now, stamp)
 
     def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> None:
         self._joystick, wrong = joystick.hear(params, self._joystick, message, now)
@@ -289,12 +235,6 @@ class Gate:
     def _event(self, kind: str, sentence: str) -> None:
         if len(self._events) < _EVENTS:
             self._events[kind] = sentence
-
-
-def _action(sensor: RangeSensor, sight: Sight) -> Action:
-    if sight in UNKNOWN:
-        return sensor.on_unknown
-    return sensor.on_empty if sight is Sight.EMPTY else Action.FREE
 
 
 _SAYS: Mapping[Objection, str] = {
