@@ -29,8 +29,8 @@ def test_little_need_be_written(load):
     assert rules.limits.period_s == 0.02
     assert rules.limits.linear_max == 0.25
     assert rules.sensors["scan"].on_unknown is Action.STOP
-    assert rules.joystick is None
-    assert rules.button is None
+    assert rules.sources.joystick is None
+    assert rules.sources.button is None
 
 
 def test_everything_can_be_written_and_goes_to_the_gate_unchanged(load):
@@ -56,8 +56,8 @@ def test_everything_can_be_written_and_goes_to_the_gate_unchanged(load):
     mount = rules.sensors["scan"].mount
     assert mount.yaw == pytest.approx(math.pi / 2)
     assert mount.ignore[0] == pytest.approx((-0.75 * math.pi, -math.pi / 2))
-    assert rules.joystick.deadman == 5
-    assert (rules.button.pressed_is, rules.button.max_age_s) == (False, math.inf)
+    assert rules.sources.joystick.deadman == 5
+    assert (rules.sources.button.pressed_is, rules.sources.button.max_age_s) == (False, math.inf)
     assert config.kinds()["scan"] is LaserScan
     assert config.kinds()["sonar/left"] is Range
     assert config.kinds()["joy"] is Joy

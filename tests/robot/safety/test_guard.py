@@ -9,7 +9,7 @@ from skytether.robot.safety import protocol
 from skytether.robot.safety.guard import Watch
 from skytether.robot.safety.process import Systemd
 from skytether.robot.safety.protocol import Beat
-from skytether.robot.safety.rules import Hand
+from skytether.robot.safety.sources import Hand
 from skytether.robot.supervisor import Limits
 
 LIMITS = Limits()  # 0 to 0.25 m/s, 0.5 rad/s; brakes 2 m/s^2 and 4 rad/s^2; 10 ms

@@ -18,8 +18,9 @@ from skytether.robot.safety.footprint import Points, polygon
 from skytether.robot.safety.joystick import JoystickParams
 from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.ranges import Mount
-from skytether.robot.safety.rules import Decision, Gate, Hand, Rules
+from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sensing import Action, RangeSensor
+from skytether.robot.safety.sources import Hand, SourceRules
 from skytether.robot.safety.zones import Zone, ZoneParams
 from skytether.robot.supervisor import Limits, Objection
 
@@ -30,8 +31,10 @@ RULES = Rules(
     limits=LIMITS,
     zones=ZoneParams(),
     sensors={"scan": RangeSensor(Mount(max_gap=math.radians(10)))},
-    joystick=JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4),
-    button=ButtonParams(),
+    sources=SourceRules(
+        joystick=JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4),
+        button=ButtonParams(),
+    ),
 )
 PERIOD = LIMITS.period_s
 RAYS = 360
@@ -384,7 +387,7 @@ things = st.lists(st.tuples(st.floats(0.42, 2.0), st.floats(-math.pi, math.pi)),
 @given(legs, things)
 def test_no_sequence_of_commands_drives_the_robot_into_anything(legs, things):
     """A robot that does what it is told among things that stand still; whatever the agent wants, none is touched."""
-    rules = replace(RULES, joystick=None, button=None)
+    rules = replace(RULES, sources=SourceRules())
     gate = Gate(rules)
     world = np.array([(r * math.cos(a), r * math.sin(a)) for r, a in things])
     world = world[FOOTPRINT.outside(world) > 0.01]

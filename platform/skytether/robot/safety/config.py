@@ -22,6 +22,7 @@ from .protocol import default_folder
 from .ranges import Mount
 from .rules import Rules
 from .sensing import Action, RangeSensor
+from .sources import SourceRules
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"
@@ -234,10 +235,12 @@ class SafetyConfig(_Numbers):
             limits=limits,
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
-            joystick=None if joystick is None else JoystickParams(**joystick.model_dump(exclude={"topic"})),
-            joystick_topic=joystick.topic if joystick else "",
-            button=None if button is None else ButtonParams(button.pressed_is, button.max_age_s or inf),
-            button_topic=button.topic if button else "",
+            sources=SourceRules(
+                joystick=None if joystick is None else JoystickParams(**joystick.model_dump(exclude={"topic"})),
+                joystick_topic=joystick.topic if joystick else "",
+                button=None if button is None else ButtonParams(button.pressed_is, button.max_age_s or inf),
+                button_topic=button.topic if button else "",
+            ),
         )
 
     def place(self) -> Path:

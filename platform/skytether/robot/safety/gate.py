@@ -28,7 +28,8 @@ from .config import SafetyConfig
 from .hardware import Sensors, Wheels, bind, receive
 from .process import log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, Beat, pack_beat, unpack_command
-from .rules import Decision, Gate, Hand
+from .rules import Decision, Gate
+from .sources import Hand
 from .ways import open_sensors, open_wheels
 
 _log = logging.getLogger("skytether.gate")

@@ -9,35 +9,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from math import inf, isfinite
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import Bool, Joy, Message
+from skytether.messages import Message
 from skytether.robot import supervisor
 from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
-from . import joystick, latch
 from . import limits as reach
 from .footprint import Footprint
-from .joystick import Grip, Joystick, JoystickParams
-from .latch import ButtonParams, Latch
 from .sensing import Action, RangeSensor, Sensing
+from .sources import Hand, SourceRules, Sources
 from .zones import Allowed, Zone, ZoneParams, Zones
 
 _ORDINARY = frozenset({Objection.LINEAR_ACCELERATION, Objection.ANGULAR_ACCELERATION})
 """Every start and every turn meets these limits; they are counted and not named."""
 _EVENTS = 32
 """Troubles of single messages that are kept until the next step names them."""
-
-
-class Hand(StrEnum):
-    """Who drives."""
-
-    AGENT = "agent"
-    JOYSTICK = "joystick"
-    NOBODY = "nobody"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,20 +38,14 @@ class Rules:
         limits: The supervisor's; `max_gap_s` is the age at which a command of the agent ends.
         zones: Sizes of the zones.
         sensors: By topic.
-        joystick: None: there is none.
-        joystick_topic: Its topic.
-        button: The emergency stop button; None: there is none.
-        button_topic: Its topic.
+        sources: Who may drive, and who may stop the robot.
     """
 
     footprint: Footprint
     limits: Limits = field(default_factory=Limits)
     zones: ZoneParams = field(default_factory=ZoneParams)
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
-    joystick: JoystickParams | None = None
-    joystick_topic: str = "joy"
-    button: ButtonParams | None = None
-    button_topic: str = "estop"
+    sources: SourceRules = field(default_factory=SourceRules)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,17 +83,15 @@ class Gate:
         self._rules = rules
         self._zones = Zones(rules.zones, rules.footprint, rules.limits)
         self._supervised = Supervised()
-        self._joystick = Joystick()
-        self._latch = Latch(reason=stopped)
+        self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.limits.clock_tolerance_s)
         self._zone = Zone.CLEAR
-        self._count = 0
         self._events: dict[str, str] = {}
 
     @property
     def stopped(self) -> str:
         """Why the robot stands until somebody resets it; empty: it does not."""
-        return self._latch.reason
+        return self._sources.stopped
 
     def command(self, command: Command, now: float) -> Objection | None:
         """Take a velocity in that the agent wants; its ``source`` must be `Hand.AGENT`."""
@@ -122,21 +103,18 @@ class Gate:
 
     def sense(self, topic: str, message: Message, now: float) -> None:
         """Take a message in from one of the robot's own sensors. Never raises for what it holds."""
-        rules = self._rules
-        if topic in rules.sensors:
+        if topic in self._rules.sensors:
             wrong = self._sensing.look(topic, message, now)
             if wrong is not None:
                 self._event(*wrong)
-        elif rules.joystick is not None and topic == rules.joystick_topic and isinstance(message, Joy):
-            self._hear_joystick(rules.joystick, message, now)
-        elif rules.button is not None and topic == rules.button_topic and isinstance(message, Bool):
-            self._latch = latch.hear(rules.button, self._latch, bool(message.data), now)
+        elif self._sources.expects(topic, message):
+            self._hear(topic, message, now)
         else:
             self._event(f"topic:{topic[:64]}", f"{topic[:64]}: a {message.TYPE} is not expected there and not used")
 
     def engage(self, reason: str) -> None:
         """Emergency stop, until `reset`."""
-        self._latch = latch.engage(self._latch, reason)
+        self._sources.engage(reason)
 
     def reset(self, now: float) -> str:
         """End the emergency stop and forget all commands; only new ones move the robot.
@@ -144,9 +122,8 @@ class Gate:
         Returns:
             Why it was refused; empty: it was not.
         """
-        self._latch, refused = latch.reset(self._rules.button, self._latch, now)
+        refused = self._sources.reset(now)
         if not refused:
-            self._joystick = Joystick()
             self._supervised = replace(
                 self._supervised, held={k: replace(v, received_at=-inf) for k, v in self._supervised.held.items()}
             )
@@ -167,7 +144,7 @@ class Gate:
 
     def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
         before, dt = self._supervised.velocity, supervisor.elapsed(self._rules.limits, self._supervised, now)
-        hand = self._hand(now, troubles)
+        hand = self._sources.look(now, troubles)
         wanted = self._supervise(hand, now, troubles)
         allowed = self._see(wanted, now, troubles)
         velocity = Velocity(wanted.linear * allowed.share, wanted.angular * allowed.share)
@@ -179,26 +156,8 @@ class Gate:
         self._zone = allowed.zone
         return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
-    def _hand(self, now: float, troubles: dict[str, str]) -> Hand:
-        rules = self._rules
-        if rules.joystick is not None:
-            self._joystick = joystick.look(rules.joystick, self._joystick, now)
-        if self._latch.reason:
-            troubles["stopped"] = f"emergency stop: {self._latch.reason}; `skytether robot reset` ends it"
-            return Hand.NOBODY
-        if rules.button is not None and latch.silent(rules.button, self._latch, now):
-            troubles["button"] = f"{rules.button_topic}: the emergency stop button is not heard; the robot stands"
-            return Hand.NOBODY
-        if self._joystick.grip is Grip.LOST:
-            troubles["joystick"] = (
-                f"{rules.joystick_topic}: fell silent with the button held; the robot stands until it is heard with the"
-                " button up, or until `skytether robot reset`"
-            )
-            return Hand.NOBODY
-        return Hand.JOYSTICK if self._joystick.grip is Grip.HELD else Hand.AGENT
-
     def _supervise(self, hand: Hand, now: float, troubles: dict[str, str]) -> Velocity:
-        limits = self._limits(hand)
+        limits = self._sources.limits(hand)
         self._supervised, objections = supervisor.step(limits, self._supervised, hand, limits.max_gap_s, now)
         for objection in objections:
             if objection in _ORDINARY:
@@ -215,22 +174,13 @@ class Gate:
         most = {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[scene.action]
         return replace(allowed, share=min(allowed.share, most))
 
-    def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> None:
-        self._joystick, wrong = joystick.hear(params, self._joystick, message, now)
+    def _hear(self, topic: str, message: Message, now: float) -> None:
+        command, wrong = self._sources.hear(topic, message, now)
         if wrong:
-            self._event("joystick:message", f"{self._rules.joystick_topic}: {wrong}")
-        if self._joystick.grip is Grip.HELD:
-            self._count += 1
-            linear, angular = self._joystick.wanted
-            command = Command(Hand.JOYSTICK, linear, angular, 0, self._count, now, 0.0, now)
-            limits = self._limits(Hand.JOYSTICK)
+            self._event(f"{topic}:message", f"{topic}: {wrong}")
+        if command is not None:
+            limits = self._sources.limits(Hand.JOYSTICK)
             self._supervised, _ = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
-
-    def _limits(self, hand: Hand) -> Limits:
-        params = self._rules.joystick
-        if hand is Hand.JOYSTICK and params is not None:
-            return replace(self._rules.limits, max_gap_s=params.max_age_s)
-        return self._rules.limits
 
     def _event(self, kind: str, sentence: str) -> None:
         if len(self._events) < _EVENTS:
