@@ -28,11 +28,11 @@ from skytether.messages import Message, Twist, type_hash, warm
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
 
-from . import fallback
+from . import fallback, stall
 from .arbiter import Needs
 from .asker import Asker, Orchestrator
 from .command import Source
-from .driver import Base, Driver, Observer
+from .driver import Base, Clocks, Driver, Observer
 from .graph_base import Graph
 from .link import Quality
 from .notices import Notices
@@ -136,6 +136,8 @@ class Agent:
         client: The orchestrator; made from the configuration if not given.
         bridge: Makes the robot's end of the bridge.
         clock: Monotonic seconds; the bridge's must be the same.
+        clocks: The same clock, and one that goes on while the computer sleeps; without it `stall.clocks`, or with a
+            ``clock`` that is made up, that one alone.
         random: For the jitter of the back-off.
 
     Raises:
@@ -152,17 +154,19 @@ class Agent:
         client: Orchestrator | None = None,
         bridge: MakeBridge | None = None,
         clock: Callable[[], float] = time.monotonic,
+        clocks: Clocks | None = None,
         random: Random | None = None,
     ) -> None:
         self._config = config
         self._base = base
         self._graph = graph
         self._clock = clock
+        self._clocks = clocks or (stall.clocks if clock is time.monotonic else lambda: (self._clock(), None))
         self._make_bridge = bridge or (
             lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
         )
         local = fallback.load(config.fallback, config.fallback_options)
-        self._driver = Driver(base, local, config.limits, config.needs, clock(), observer)
+        self._driver = Driver(base, local, config.limits, config.needs, clock(), observer, self._clocks)
         self._own_client = (
             None
             if client
@@ -255,9 +259,9 @@ class Agent:
         except OSError as error:  # somebody else has the port; that is no reason not to drive
             _log.error("no status on port %d of loopback: %s", config.status_port, error.strerror)
 
-    def tick(self, now: float) -> None:
+    def tick(self, now: float, boot: float | None = None) -> None:
         """One turn of the control loop; called by its thread, or by a test with made-up time."""
-        self._driver.tick(now)
+        self._driver.tick(now, boot)
 
     @property
     def source(self) -> Source:
@@ -301,7 +305,7 @@ class Agent:
         deadline = self._clock()
         try:
             while not self._stop.is_set():
-                self.tick(self._clock())
+                self.tick(*self._clocks())
                 deadline += period
                 late = self._clock() - deadline
                 if late < 0:

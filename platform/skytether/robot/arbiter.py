@@ -36,6 +36,8 @@ class Reason(StrEnum):
     """More messages of a topic are too old before they are through than the service bears."""
     CLOCK = "clock"
     """The peer's clock is not known well enough to judge the age of commands."""
+    STALL = "stall"
+    """The control loop stood still: what it knew is forgotten."""
     RECOVERED = "recovered"
     """The link has been good for long enough."""
 
@@ -118,6 +120,13 @@ class Choice:
 def start(needs: Needs, now: float) -> Choice:
     """Before the first command of the cloud the robot is on its own."""
     return Choice(needs.local, Reason.START, now)
+
+
+def stalled(needs: Needs, choice: Choice, now: float) -> Choice:
+    """The control loop stood still: the robot is on its own, and the link has to be good anew."""
+    if choice.source is Source.CLOUD:
+        return Choice(needs.local, Reason.STALL, now)
+    return replace(choice, good_since=None)
 
 
 def choose(needs: Needs, choice: Choice, link: Link, now: float) -> Choice:

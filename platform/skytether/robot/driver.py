@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import nan
+from math import inf, isnan, nan
 from typing import Protocol
 
 from skytether.control.admittance import STANDSTILL, Velocity
@@ -25,6 +25,7 @@ from .link import Quality
 from .notices import Notices
 from .service_manager import Patience, Terms
 from .session import LiveSession
+from .stall import StallWatch
 from .supervisor import Limits, Objection, Supervised
 
 _log = logging.getLogger(__name__)
@@ -39,6 +40,8 @@ _NAMED = {
     Objection.ANGULAR_LIMIT: "turning faster than limits.angular_max allows; they are cut down",
 }
 """Named in the log, once while it lasts. A gap is told by the hand-over; limits of acceleration are no trouble."""
+_SETTLE_S = 0.2
+"""After a stall, how long readings are not used [s]: those from before it wait in sockets, and are read first."""
 _TRANSITIONS_KEPT = 1000
 """The newest; all are counted."""
 
@@ -47,7 +50,7 @@ class Base(Protocol):
     """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick.
 
     A call that never returns, or a killed process, ends the control loop: motors must stop by themselves when nothing
-    has been written for some 100 ms, as motor drives with a watchdog do.
+    has been written for some 100 ms (`Limits.watchdog_s`), as motor drives with a watchdog do.
     """
 
     topics: Mapping[str, type[Message]]
@@ -64,6 +67,10 @@ class Base(Protocol):
 
 Observer = Callable[[Command, Objection | None], None]
 """Told each command from the cloud that arrives, and what was wrong with it. Must return at once."""
+
+
+Clocks = Callable[[], tuple[float, float | None]]
+"""Now by the clock that stands still in a suspend, and by the one that goes on (None: there is none)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +98,7 @@ class DriverStatus:
         first_command_at: Arrival of the first command from the cloud that was admitted.
         last_command_at: Of the newest.
         readings: Messages read from the base, by topic.
+        stalls: Times that the loop stood still for longer than `Limits.watchdog_s`, or the computer slept.
     """
 
     source: Source
@@ -104,6 +112,7 @@ class DriverStatus:
     first_command_at: float | None
     last_command_at: float | None
     readings: Mapping[str, int]
+    stalls: int
 
 
 class Driver:
@@ -116,6 +125,8 @@ class Driver:
         needs: The arbiter's; what a session says about the service replaces round trip and loss.
         now: Monotonic seconds.
         observer: See `Observer`.
+        clocks: Both clocks as `skytether.robot.stall.clocks` reads them, looked at right before each velocity is
+            written: who is stopped in the middle of a tick tells nothing old. None: time is made up.
     """
 
     def __init__(
@@ -126,6 +137,7 @@ class Driver:
         needs: Needs,
         now: float,
         observer: Observer | None = None,
+        clocks: Clocks | None = None,
     ) -> None:
         self.session: LiveSession | None = None
         self.left: deque[LiveSession] = deque()
@@ -155,6 +167,11 @@ class Driver:
         self._errors: Counter[str] = Counter()
         self._read: Counter[str] = Counter()
         self._first_command_at: float | None = None
+        self._clocks = clocks
+        self._stall = StallWatch(limits.watchdog_s)
+        self._stalls = 0
+        self._written_at = now
+        self._believed_from = -inf
 
     @property
     def source(self) -> Source:
@@ -166,13 +183,19 @@ class Driver:
         self._patience = Patience(terms.period_s, self._command_timeout_s, self._limits.period_s)
         self._needs = replace(self._needs, max_rtt_s=terms.max_rtt_s, max_loss=terms.max_loss, max_late=terms.max_late)
 
-    def tick(self, now: float) -> None:
+    def tick(self, now: float, boot: float | None = None) -> None:
         """One turn of the loop: exactly one velocity is written. Never raises.
 
-        Whatever goes wrong on the way brakes the wheels: what cannot be computed must not be driven.
+        Whatever goes wrong on the way brakes the wheels: what cannot be computed must not be driven. A loop that stood
+        still goes on from standstill.
+
+        Args:
+            now: Monotonic seconds.
+            boot: Seconds of the clock that goes on in a suspend; None: there is none.
         """
         self._seconds[self._choice.source] += max(0.0, now - self._now)
         try:
+            self._look_for_stall(now, boot)
             self._take_readings(now)
             self._take_commands(now)
             self._choose(now)
@@ -213,12 +236,39 @@ class Driver:
             first_command_at=self._first_command_at,
             last_command_at=held.received_at if held else None,
             readings=dict(self._read),
+            stalls=self._stalls,
         )
+
+    def _look_for_stall(self, now: float, boot: float | None) -> None:
+        """Whatever was known before a gap is old, and the wheels stand."""
+        stood = self._stall.look(now, boot)
+        if not stood:
+            if now - self._written_at > self._limits.watchdog_s:  # nothing could be written: they stand as well
+                self._supervised = replace(self._supervised, velocity=STANDSTILL)
+            return
+        self._stalls += 1
+        self._supervised = supervisor.begin_anew(self._supervised, now)
+        self._readings.clear()
+        self._believed_from = now + _SETTLE_S
+        self._now = now - self._limits.period_s  # the wheels' step, and the fallback's, is an ordinary one
+        sentence = f"the control loop stood still for {stood:.2f} s; the robot goes on from standstill"
+        self._notices.say("stall", f"control: {sentence}", now)
+        before, self._choice = self._choice, arbiter.stalled(self._needs, self._choice, now)
+        if self._choice.source is not before.source:
+            self._handed_over(before.source, sentence, now)
+
+    def _handed_over(self, before: Source, why: str, now: float) -> None:
+        self._counts[self._choice.reason] += 1
+        self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
+        _log.warning("control: %s -> %s (%s): %s", before, self._choice.source, self._choice.reason, why)
+        self._why = why
 
     def _take_readings(self, now: float) -> None:
         for topic, message in self._base.read(now):
-            self._readings[topic] = Reading(message, now)
             self._read[topic] += 1
+            if now < self._believed_from:
+                continue
+            self._readings[topic] = Reading(message, now)
             for session in (self.session, self._coming):
                 if session is not None:
                     try:
@@ -271,7 +321,7 @@ class Driver:
         held = self._supervised.held.get(Source.CLOUD)
         link = Link(
             connected=self.session is not None and self.session.connected,
-            command_at=held.received_at if held else None,
+            command_at=None if held is None or isnan(held.received_at) else held.received_at,
             rtt=self.quality.rtt,
             loss=self.quality.loss,
             late=self.quality.late,
@@ -283,11 +333,8 @@ class Driver:
         before = self._choice
         self._choice = arbiter.choose(self._needs, before, link, now)
         if self._choice.source is not before.source:
-            self._counts[self._choice.reason] += 1
-            self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
             why = service_manager.explain(self._choice.reason, self._needs, link, self.quality, now)
-            _log.warning("control: %s -> %s (%s): %s", before.source, self._choice.source, self._choice.reason, why)
-            self._why = why
+            self._handed_over(before.source, why, now)
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
@@ -337,8 +384,11 @@ class Driver:
             return STANDSTILL
 
     def _write(self, velocity: Velocity) -> None:
+        if self._clocks is not None and self._stall.late(*self._clocks()):
+            velocity = STANDSTILL  # what was computed before the gap; the next tick finds it
         try:
             self._base.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
+            self._written_at = self._now
         except Exception as error:  # tried again at the next tick
             self._caught("write", error)
 

@@ -79,6 +79,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
         "objections": dict(driver.objections),
         "errors": dict(driver.errors),
         "overruns": status.overruns,
+        "stalls": driver.stalls,
     }
 
 
@@ -160,6 +161,9 @@ def _families(robot: str, service: str, status: AgentStatus, report: rest.Report
     yield counter("control_seconds", "Time under each source", ("robot", "service", "source"), seconds.items())
     yield gauge("session_connected", "1 while the bridge has a session", ("robot", "service"), connected)
     yield counter("control_errors", "Exceptions caught in the control loop", ("robot", "part"), errors.items())
+    stalls = Sums()
+    stalls.add((robot, service), status.driver.stalls)
+    yield counter("control_stalls", "Times that the control loop stood still", ("robot", "service"), stalls.items())
     labels = ("robot", "service", "option")
     yield gauge("task_cost", "What the task manager reckons for each site and for local; +Inf: ruled out", labels, cost)
 

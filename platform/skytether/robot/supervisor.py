@@ -62,7 +62,9 @@ class Limits:
         max_local_age_s: Oldest readings that a command of the robot's own fallback may be made from [s].
         clock_tolerance_s: How far in the future a time may lie: readers of one clock in several threads [s].
         period_s: Of the control loop; used to brake with when the clock fails [s].
-        max_step_s: Longest time that one step counts for, so that a stalled loop does not jump when it goes on [s].
+        max_step_s: Longest time that one step counts for, so that a late one does not jump [s].
+        watchdog_s: The wheels stop by themselves when they hear nothing for this long: a control loop that stood for
+            longer begins again from standstill, with new commands and readings only [s].
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -79,6 +81,7 @@ class Limits:
     clock_tolerance_s: float = 0.01
     period_s: float = 0.01
     max_step_s: float = 0.05
+    watchdog_s: float = 0.1
 
     def __post_init__(self) -> None:
         """Refuse limits that would not limit.
@@ -101,11 +104,13 @@ class Supervised:
         velocity: What the wheels were last told.
         now: When they were told; None before the first step.
         held: The command last admitted from each source.
+        since: Commands made before that time are not followed.
     """
 
     velocity: Velocity = STANDSTILL
     now: float | None = None
     held: dict[StrEnum, Command] = field(default_factory=dict)
+    since: float = -inf
 
 
 def admit(
@@ -156,6 +161,15 @@ def step(
     return replace(state, velocity=velocity), objections
 
 
+def begin_anew(state: Supervised, now: float) -> Supervised:
+    """The loop stood still, and so do the wheels: nothing that is held is followed, nor what was sent before now.
+
+    The sequence is kept: a command that came before does not come again.
+    """
+    held = {source: replace(command, received_at=nan) for source, command in state.held.items()}
+    return Supervised(held=held, since=now)
+
+
 def max_age(limits: Limits, source: StrEnum, max_rtt_s: float | None) -> float:
     """Oldest information that a source may act on [s].
 
@@ -197,7 +211,10 @@ def _objection_at_arrival(
     held = state.held.get(command.source)
     if held is not None and (command.epoch, command.sequence) <= (held.epoch, held.sequence):
         return Objection.SEQUENCE
-    return _objection_while_held(limits, command, max_age_s, now)
+    objection = _objection_while_held(limits, command, max_age_s, now)
+    if objection is None and not command.sent_at - command.sent_at_error >= state.since:
+        return Objection.STALE
+    return objection
 
 
 def _objection_while_held(limits: Limits, command: Command | None, max_age_s: float, now: float) -> Objection | None:
