@@ -13,7 +13,9 @@ The state is the velocity itself and is limited, not only the output, so nothing
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+
+from skytether.guard.velocity import STANDSTILL as STANDSTILL
+from skytether.guard.velocity import Velocity as Velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +47,6 @@ class AdmittanceParams:
         for name in self.__slots__:
             if not getattr(self, name) > 0:
                 raise ValueError(f"admittance: {name} must be above 0, not {getattr(self, name)}")
-
-
-class Velocity(NamedTuple):
-    """Velocity of the walker's base: forward [m/s], and about the vertical axis [rad/s], positive to the left."""
-
-    linear: float
-    angular: float
-
-
-STANDSTILL = Velocity(0.0, 0.0)
 
 
 def linear_step(params: AdmittanceParams, linear: float, force: float, dt: float) -> float:

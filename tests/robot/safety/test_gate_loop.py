@@ -14,7 +14,7 @@ from skytether.robot.safety.client import GateError, GateLink, ask
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.gate import GateLoop, Keeper
 from skytether.robot.safety.hardware import SocketSensors, SocketWheels
-from skytether.robot.safety.protocol import unpack_beat
+from skytether.robot.safety.protocol import GateState, pack_state, unpack_beat, unpack_state
 
 SCAN = LaserScan(
     angle_min=-math.pi / 2,
@@ -189,3 +189,30 @@ def test_wheels_may_come_later(tmp_path):
 def test_whoever_asks_where_no_gate_is_hears_what_to_do(tmp_path):
     with pytest.raises(GateError, match=r"no gate listens at .*skytether robot gate"):
         ask(tmp_path, {"do": "status"})
+
+
+def test_the_gate_says_to_the_agent_what_the_wheels_were_told(bench):
+    assert bench.link.state() is None
+    for _ in range(30):
+        bench.link.send(Velocity(0.2, 0.1))
+        bench.turn()
+    state = bench.link.state()
+    assert (state.at, state.stopped, state.hand) == (bench.now, "", "agent")
+    assert state.told == pytest.approx((0.2, 0.1))
+    bench.loop.answer(json.dumps({"do": "stop", "reason": "ö" * 150}).encode())
+    bench.link.send(Velocity(0.2, 0.1))
+    bench.turn()
+    state = bench.link.state()
+    assert (state.stopped, state.hand) == ("ö" * 100, "nobody")
+
+
+def test_a_stranger_cannot_tell_the_agent_its_state(bench):
+    bench.link.send(Velocity(0.2, 0.1))
+    bench.turn()
+    before = bench.link.state()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+        stranger.bind("")
+        lie = pack_state(GateState(99.0, Velocity(0.5, 0.0), 99.0, "", "agent"))
+        assert stranger.sendto(lie, bench.link._socket.getsockname()) == len(lie)
+    assert bench.link.state() == before
+    assert unpack_state(lie[:-1]) is None

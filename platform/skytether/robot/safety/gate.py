@@ -16,18 +16,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.clock import now as boottime
 from skytether.messages import Twist, warm
 from skytether.robot.notices import Notices
 
 from .config import SafetyConfig
-from .hardware import Sensors, Wheels, bind, receive
+from .hardware import Sensors, Wheels, bind, receive_from
 from .process import log_without_waiting
-from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, Beat, pack_beat, unpack_command
+from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, Beat, GateState, pack_beat, pack_state, unpack_command
 from .rules import Decision, Gate
 from .sources import Hand
 from .ways import open_sensors, open_wheels
@@ -107,7 +109,7 @@ class GateLoop:
         guard: The socket to the guard; whole packets, never waits.
         sensors: Where readings come from.
         wheels: For the day that the guard is gone.
-        clock: Monotonic seconds.
+        clock: `skytether.guard.clock.now`; replaced by tests only.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class GateLoop:
         guard: socket.socket,
         sensors: Sensors,
         wheels: Wheels,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = boottime,
     ) -> None:
         self.guard_gone = False
         self._config = config
@@ -160,16 +162,18 @@ class GateLoop:
 
     def turn(self, now: float) -> None:
         """One turn of the loop."""
+        agent: object = None
         with self._lock:
-            arrived = receive(self._commands, 256, _COMMANDS_EACH_TURN)
+            arrived = receive_from(self._commands, 256, _COMMANDS_EACH_TURN)
             if len(arrived) > _MANY_COMMANDS:
                 sentence = f"more than {_MANY_COMMANDS} commands came within one turn; the newest counts"
                 self._notices.say("rate", sentence, now)
-            for data in arrived:
+            for data, sender in arrived:
                 command = unpack_command(data, Hand.AGENT, now)
                 if command is None:
                     self._notices.say("bytes", "something that is no command comes to the gate's command socket", now)
                 else:
+                    agent = sender
                     self._gate.command(command, now)
             for topic, message in self._sensors.read():
                 self._gate.sense(topic, message, now)
@@ -182,6 +186,13 @@ class GateLoop:
             self._kept = self._gate.stopped
             self._keeper.keep(self._kept)
         self._tell_guard(decision.velocity, now)
+        if agent:
+            self._tell_agent(agent, decision, now)
+
+    def _tell_agent(self, agent: Any, decision: Decision, now: float) -> None:
+        state = GateState(now, decision.velocity, now, self._gate.stopped, decision.hand)
+        with suppress(OSError):  # it is gone, or does not read; it asks again
+            self._commands.sendto(pack_state(state), agent)
 
     def _tell_guard(self, velocity: Velocity, now: float) -> None:
         try:
@@ -281,7 +292,7 @@ def main() -> None:
     guard.setblocking(False)
     warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
     notices = Notices(_log)
-    sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, time.monotonic()))
+    sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()))
     loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"))
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short

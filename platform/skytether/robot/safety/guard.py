@@ -19,6 +19,7 @@ from math import isfinite
 from typing import IO
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.clock import now as boottime
 from skytether.robot.notices import Notices
 from skytether.robot.supervisor import Limits
 
@@ -164,13 +165,13 @@ class Guard:
     Args:
         config: The section of robot.yaml.
         wheels: The only way to them.
-        clock: Monotonic seconds.
+        clock: `skytether.guard.clock.now`; replaced by tests only.
 
     Raises:
         GuardError: Another guard has this folder, or the folder cannot be made.
     """
 
-    def __init__(self, config: SafetyConfig, wheels: Wheels, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, config: SafetyConfig, wheels: Wheels, clock: Callable[[], float] = boottime) -> None:
         self._config = config
         self._wheels = wheels
         self._clock = clock

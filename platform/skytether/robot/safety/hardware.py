@@ -134,6 +134,19 @@ def bind(address: Address, mode: int) -> socket.socket:
     return made
 
 
+def receive_from(source: socket.socket, largest: int, most: int) -> list[tuple[bytes, object]]:
+    """What waits in a socket that never waits, and who sent it, at most so many."""
+    found: list[tuple[bytes, object]] = []
+    while len(found) < most:
+        try:
+            found.append(source.recvfrom(largest))
+        except BlockingIOError:
+            break
+        except OSError:  # what was sent before found nobody
+            continue
+    return found
+
+
 def receive(source: socket.socket, largest: int, most: int) -> list[bytes]:
     """What waits in a socket that never waits, at most so many."""
     found: list[bytes] = []

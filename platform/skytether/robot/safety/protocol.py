@@ -1,4 +1,4 @@
-"""Bytes between the agent, the gate and the guard on one machine, whose monotonic clock is the same for all."""
+"""Bytes between the agent, the gate and the guard on one machine, whose clock is the same for all."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from skytether.control.admittance import Velocity
+from skytether.guard.velocity import Velocity
 from skytether.robot.command import Command
 
 _COMMAND = struct.Struct("<4sQQddd")
 _MAGIC = b"SkG1"
 _BEAT = struct.Struct("<4sddd")
+_STATE = struct.Struct("<4sdddd16s")
+_STATE_MAGIC = b"SkS1"
+_REASON_BYTES = 200
+"""Of a reason; the rest is cut off."""
 COMMAND_SOCKET = "command.sock"
 """In the gate's folder: datagrams of `pack_command`."""
 CONTROL_SOCKET = "control.sock"
@@ -30,13 +34,47 @@ class Beat:
     velocity: Velocity
 
 
+@dataclass(frozen=True, slots=True)
+class GateState:
+    """What the gate tells the agent after each of its commands.
+
+    Attributes:
+        at: When it was said [s], by `skytether.guard.clock`.
+        told: What the wheels were told last; standstill after a stall, a failed write, or with nobody there.
+        told_at: When they were [s].
+        stopped: Why the robot stands until a person resets it; empty: it does not.
+        hand: Who drives: ``agent``, ``joystick``, ``nobody``.
+    """
+
+    at: float
+    told: Velocity
+    told_at: float
+    stopped: str
+    hand: str
+
+
+def pack_state(state: GateState) -> bytes:
+    """For the agent."""
+    head = _STATE.pack(_STATE_MAGIC, state.at, *state.told, state.told_at, state.hand.encode())
+    return head + state.stopped.encode()[:_REASON_BYTES]
+
+
+def unpack_state(data: bytes) -> GateState | None:
+    """From the gate; None: the bytes are none."""
+    if not _STATE.size <= len(data) <= _STATE.size + _REASON_BYTES or data[:4] != _STATE_MAGIC:
+        return None
+    _, at, linear, angular, told_at, hand = _STATE.unpack_from(data)
+    reason = data[_STATE.size :].decode(errors="replace")
+    return GateState(at, Velocity(linear, angular), told_at, reason, hand.rstrip(b"\0").decode(errors="replace"))
+
+
 def pack_command(epoch: int, sequence: int, sent_at: float, velocity: Velocity) -> bytes:
     """A velocity that the agent wants.
 
     Args:
         epoch: Higher for every start of the agent.
         sequence: Counts its commands.
-        sent_at: Monotonic seconds.
+        sent_at: By `skytether.guard.clock` [s].
         velocity: Wanted.
     """
     return _COMMAND.pack(_MAGIC, epoch, sequence, sent_at, *velocity)
