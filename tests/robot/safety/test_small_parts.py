@@ -5,7 +5,7 @@ import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Joy
-from skytether.robot.safety import joystick, latch, limits
+from skytether.robot.safety import joystick, kinematics, latch
 from skytether.robot.safety.joystick import Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams, Latch
 from skytether.robot.supervisor import Limits
@@ -20,16 +20,16 @@ def joy(axes, buttons) -> Joy:
 
 def test_the_slowest_axis_says_how_fast_a_curve_can_be_left():
     # 0.2 m/s at 2 m/s^2: 10 per second; 0.5 rad/s at 4 rad/s^2: 8 per second.
-    assert limits.slowdown(LIMITS, Velocity(0.2, 0.0)) == pytest.approx(10.0)
-    assert limits.slowdown(LIMITS, Velocity(-0.2, 0.5)) == pytest.approx(8.0)
-    assert limits.slowdown(LIMITS, STANDSTILL) == inf
+    assert kinematics.slowdown(LIMITS, Velocity(0.2, 0.0)) == pytest.approx(10.0)
+    assert kinematics.slowdown(LIMITS, Velocity(-0.2, 0.5)) == pytest.approx(8.0)
+    assert kinematics.slowdown(LIMITS, STANDSTILL) == inf
 
 
 def test_braking_keeps_the_curvature():
     # 8 per second over 10 ms: 92 % is left of both.
-    assert limits.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.01) == pytest.approx((0.184, 0.46))
-    assert limits.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.2) == STANDSTILL
-    assert limits.brake_on_curve(LIMITS, STANDSTILL, 0.2) == STANDSTILL
+    assert kinematics.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.01) == pytest.approx((0.184, 0.46))
+    assert kinematics.brake_on_curve(LIMITS, Velocity(0.2, 0.5), 0.2) == STANDSTILL
+    assert kinematics.brake_on_curve(LIMITS, STANDSTILL, 0.2) == STANDSTILL
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_braking_keeps_the_curvature():
     ],
 )
 def test_what_the_wheels_can_reach_in_one_tick(before, after, reached):
-    assert limits.within_reach(LIMITS, Velocity(*before), Velocity(*after), 0.01) is reached
+    assert kinematics.within_reach(LIMITS, Velocity(*before), Velocity(*after), 0.01) is reached
 
 
 def test_a_held_button_drives_and_letting_go_gives_back():

@@ -6,14 +6,17 @@ import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.robot.safety.footprint import polygon
+from skytether.robot.safety.stopping import Stages
 from skytether.robot.safety.zones import Zone, ZoneParams, Zones
 from skytether.robot.supervisor import Limits
 
 # A square of 1 m; room of 0.1 m; braking 2 m/s^2 and 4 rad/s^2.
 SQUARE = polygon([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
-PARAMS = ZoneParams(stop_m=0.1, slow_m=0.5, slow_speed=0.1, hysteresis_m=0.05, reaction_s=0.1)
+PARAMS = ZoneParams(stop_m=0.1, slow_m=0.5, slow_speed=0.1, hysteresis_m=0.05)
 FAST = Limits(linear_max=2.0, linear_min=-2.0, angular_max=2.0)
-ZONES = Zones(PARAMS, SQUARE, FAST)
+# All stages together: 0.1 s.
+STAGES = Stages(sensing_s=0.0, period_s=0.01, guard_s=0.05, writer_s=0.0, wheels_s=0.03)
+ZONES = Zones(PARAMS, SQUARE, FAST, STAGES)
 
 
 def ahead(way: float) -> np.ndarray:

@@ -23,6 +23,7 @@ from .ranges import Mount
 from .rules import Rules
 from .sensing import Action, RangeSensor
 from .sources import SourceRules
+from .stopping import Stages
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"
@@ -228,13 +229,15 @@ class SafetyConfig(_Numbers):
 
     def rules(self) -> Rules:
         """The rules that follow."""
-        limits = replace(self.limits or Limits(), period_s=1 / self.rate_hz)
+        stages = self.stages()
+        limits = replace(self.limits or Limits(), period_s=stages.period_s, max_step_s=stages.longest_step_s)
         joystick, button = self.joystick, self.estop
         return Rules(
             footprint=self.footprint.footprint(),
             limits=limits,
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
+            stages=stages,
             sources=SourceRules(
                 joystick=None if joystick is None else JoystickParams(**joystick.model_dump(exclude={"topic"})),
                 joystick_topic=joystick.topic if joystick else "",
@@ -242,6 +245,12 @@ class SafetyConfig(_Numbers):
                 button_topic=button.topic if button else "",
             ),
         )
+
+    def stages(self) -> Stages:
+        """The latencies from the light to the brakes."""
+        period = 1 / self.rate_hz
+        writer = 0.0 if self.ros1 is None and self.ros2 is None else period
+        return Stages(self.zones.sensing_s, period, self.guard_s, writer, self.zones.reaction_s)
 
     def place(self) -> Path:
         """The gate's folder."""

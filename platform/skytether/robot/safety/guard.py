@@ -23,7 +23,7 @@ from skytether.guard.clock import now as boottime
 from skytether.robot.notices import Notices
 from skytether.robot.supervisor import Limits
 
-from . import limits as reach
+from . import kinematics as reach
 from .config import SafetyConfig
 from .hardware import Wheels
 from .process import Systemd

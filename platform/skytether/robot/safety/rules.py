@@ -17,10 +17,11 @@ from skytether.robot import supervisor
 from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
-from . import limits as reach
+from . import kinematics as reach
 from .footprint import Footprint
 from .sensing import Action, RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
+from .stopping import Stages
 from .zones import Allowed, Zone, ZoneParams, Zones
 
 _ORDINARY = frozenset({Objection.LINEAR_ACCELERATION, Objection.ANGULAR_ACCELERATION})
@@ -39,6 +40,7 @@ class Rules:
         zones: Sizes of the zones.
         sensors: By topic.
         sources: Who may drive, and who may stop the robot.
+        stages: Latencies from the light to the brakes.
     """
 
     footprint: Footprint
@@ -46,6 +48,7 @@ class Rules:
     zones: ZoneParams = field(default_factory=ZoneParams)
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
     sources: SourceRules = field(default_factory=SourceRules)
+    stages: Stages = field(default_factory=Stages)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +84,7 @@ class Gate:
         self.counts: Counter[str] = Counter()
         """What was objected to, by kind."""
         self._rules = rules
-        self._zones = Zones(rules.zones, rules.footprint, rules.limits)
+        self._zones = Zones(rules.zones, rules.footprint, rules.limits, rules.stages)
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.limits.clock_tolerance_s)

@@ -1,10 +1,10 @@
 """Slow and stop zones in the direction of motion: what share of a velocity the robot may have. Pure.
 
 The stop zone is the footprint with room around. A velocity is allowed as far as the robot, going on along the same
-curve, would come to a standstill before anything that is seen gets into that zone: with c the time until contact at
-this velocity, r the reaction time and d the slow-down that braking allows, the share s solves
-``s r + s^2 / (2 d) = c``.
-Within the slow zone, that many metres of way before the stop zone, the speed has a limit as well.
+curve, would come to a standstill before anything that is seen gets into that zone (`stopping` has the inequality):
+with c the time until contact at this velocity, r the reaction time of all stages and d the slow-down that braking
+allows, the share s solves ``s r + s^2 / (2 d) = c``. Within the slow zone, that many metres of way before the stop
+zone, the speed has a limit as well.
 
 The way is that of the outermost corner, so that the same metres hold for turning on the spot.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from math import inf, isinf, sqrt
+from math import inf, isinf
 from typing import ClassVar
 
 import numpy as np
@@ -23,8 +23,9 @@ from skytether.control.admittance import Velocity
 from skytether.control.numbers import check_positive
 from skytether.robot.supervisor import Limits
 
-from . import limits as reach
+from . import kinematics as reach
 from .footprint import Footprint, Points
+from .stopping import Stages, fastest
 
 _TOUCH_M = 0.005
 """Way before the stop zone at which the robot stands, instead of creeping up to it for ever."""
@@ -47,7 +48,8 @@ class ZoneParams:
         slow_m: Length of the slow zone before the stop zone, along the way [m].
         slow_speed: Of the outermost corner within the slow zone [m/s].
         hysteresis_m: More way than this must be free, or be free beyond the slow zone, before a zone is left [m].
-        reaction_s: From the light of the laser to the first effect of the brake, without the age of the scan [s].
+        sensing_s: From the light of a sensor to its message at the gate; a rotating laser's turn belongs to it [s].
+        reaction_s: From a velocity that is written to its first effect at the wheels [s].
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -56,6 +58,7 @@ class ZoneParams:
     slow_m: float = 0.5
     slow_speed: float = 0.1
     hysteresis_m: float = 0.05
+    sensing_s: float = 0.05
     reaction_s: float = 0.1
 
     def __post_init__(self) -> None:
@@ -89,11 +92,13 @@ class Zones:
         params: Sizes.
         footprint: Outline of the robot with all that it carries.
         limits: What the wheels may do; the braking among them is relied upon.
+        stages: Latencies from the light to the brakes.
     """
 
-    def __init__(self, params: ZoneParams, footprint: Footprint, limits: Limits) -> None:
+    def __init__(self, params: ZoneParams, footprint: Footprint, limits: Limits, stages: Stages) -> None:
         self.stop = footprint.inflated(params.stop_m)
         self._params = params
+        self._stages = stages
         self._limits = limits
         self._radius = footprint.radius
 
@@ -119,7 +124,7 @@ class Zones:
         if speed == 0:
             return Allowed(1.0, before, inf)
         p = self._params
-        reaction = p.reaction_s + age
+        reaction = self._stages.reaction_s(age)
         slowdown = reach.slowdown(self._limits, velocity)
         horizon = max(p.slow_m + p.hysteresis_m, speed * (reaction + 0.5 / slowdown))
         near = points[np.hypot(points[:, 0], points[:, 1]) <= self.stop.radius + horizon]
@@ -128,7 +133,7 @@ class Zones:
         zone = self._zone(way, before)
         if zone is Zone.STOP:
             return Allowed(0.0, zone, way)
-        share = 1.0 if isinf(contact) else min(1.0, slowdown * (sqrt(reaction**2 + 2 * contact / slowdown) - reaction))
+        share = 1.0 if isinf(contact) else min(1.0, fastest(contact, slowdown, reaction))
         if zone is Zone.SLOW:
             share = min(share, self.slow(velocity))
         return Allowed(share, zone, way)

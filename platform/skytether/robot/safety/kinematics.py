@@ -1,19 +1,44 @@
 """From one velocity to the next, never faster than the robot may: slowing down on the way it is on. Pure.
 
-What a command may ask of the wheels is `skytether.robot.supervisor`'s; here is what a zone may ask of them.
+What a command may ask of the wheels is `skytether.robot.supervisor`'s; here is what a zone may ask of them. Only the
+standard library is used, so that the guard can use it too.
 """
 
 from __future__ import annotations
 
 from math import inf
+from typing import Protocol
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.robot.supervisor import Limits
 
 _ROUNDING = 1e-9
 
 
-def slowdown(limits: Limits, velocity: Velocity) -> float:
+class Rates(Protocol):
+    """How fast velocities may change; `skytether.robot.supervisor.Limits` has them [m/s^2, rad/s^2]."""
+
+    @property
+    def linear_acceleration(self) -> float:
+        """Of ordinary changes."""
+        ...
+
+    @property
+    def angular_acceleration(self) -> float:
+        """Of ordinary changes."""
+        ...
+
+    @property
+    def linear_braking(self) -> float:
+        """Towards a standstill."""
+        ...
+
+    @property
+    def angular_braking(self) -> float:
+        """Towards a standstill."""
+        ...
+
+
+def slowdown(limits: Rates, velocity: Velocity) -> float:
     """How fast a velocity can be scaled down while the robot stays on its curve [1/s]; inf at a standstill."""
     linear, angular = abs(velocity.linear), abs(velocity.angular)
     return min(
@@ -22,7 +47,7 @@ def slowdown(limits: Limits, velocity: Velocity) -> float:
     )
 
 
-def brake_on_curve(limits: Limits, velocity: Velocity, dt: float) -> Velocity:
+def brake_on_curve(limits: Rates, velocity: Velocity, dt: float) -> Velocity:
     """The next velocity of the fastest stop that keeps the curvature."""
     if velocity == STANDSTILL:
         return STANDSTILL
@@ -30,7 +55,7 @@ def brake_on_curve(limits: Limits, velocity: Velocity, dt: float) -> Velocity:
     return Velocity(velocity.linear * left, velocity.angular * left)
 
 
-def within_reach(limits: Limits, before: Velocity, after: Velocity, dt: float) -> bool:
+def within_reach(limits: Rates, before: Velocity, after: Velocity, dt: float) -> bool:
     """Whether the wheels may be told ``after``, ``dt`` seconds after ``before``."""
     return _reach(before.linear, after.linear, limits.linear_acceleration, limits.linear_braking, dt) and _reach(
         before.angular, after.angular, limits.angular_acceleration, limits.angular_braking, dt
