@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
+from .lab_safety import safety
 from .output import console, fail, print_json, silenced
 
 app = typer.Typer(help="Experiments and benchmarks on this machine.", no_args_is_help=True)
 bench = typer.Typer(help="Measure the real program, and print what was measured.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+bench.command("safety")(safety)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 

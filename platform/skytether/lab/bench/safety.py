@@ -1,0 +1,195 @@
+"""The promises of docs/safety.md, attacked on real processes: what the wheels received, held against them.
+
+Guard, gate and agent are the real programs; sensors and wheels are played here, on the gate's own sockets. Each attack
+begins with a robot that drives, and ends with one that drives again.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from skytether.lab.safety import deaths, stops
+from skytether.lab.safety.attacks import Attack, Attacks
+from skytether.lab.safety.checker import Finding
+from skytether.lab.safety.robot import PlayedRobot, StagingError
+from skytether.lab.safety.stage import Stage
+
+from .pair import BenchError
+
+_SHOWN = 5
+"""Violations of an attack that are told in words; the others are counted."""
+_BUSY_PER_CORE = 2
+_SPIN = "while True: pass"
+_START_S = 3.0
+
+Tell = Callable[[str], object]
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyRow:
+    """One line of the table.
+
+    Attributes:
+        attack: Its name.
+        n: How often it was staged.
+        violations: Promises that were not kept.
+        velocity_max_m_s: Fastest that the wheels were told.
+        acceleration_max_m_s2: Largest change of velocity by its time, a period of the loop added: that much a time may
+            be off. Braking included.
+        standstill_max_s: Longest time from the attack to standstill; None: the attack demands none.
+        promised_s: What that may be, from the configuration.
+        what: The violations in words, the first few of them.
+    """
+
+    attack: str
+    n: int
+    violations: int
+    velocity_max_m_s: float
+    acceleration_max_m_s2: float
+    standstill_max_s: float | None
+    promised_s: float | None
+    what: tuple[str, ...]
+
+    def document(self) -> dict[str, object]:
+        """For ``--json``."""
+        return asdict(self)
+
+
+def attacks() -> list[Attack]:
+    """All that there are, in the order in which they are staged."""
+    known = Attacks()
+    deaths.enter(known)
+    stops.enter(known)
+    return known.all
+
+
+def select(names: Sequence[str]) -> list[Attack]:
+    """Those of that name, or whose name begins with it and a hyphen; without a name all of them.
+
+    Raises:
+        ValueError: There is none.
+    """
+    known = attacks()
+    chosen = []
+    for name in names:
+        found = [attack for attack in known if attack.name == name or attack.name.startswith(f"{name}-")]
+        if not found:
+            raise ValueError(f"there is no attack '{name}'; there are: {', '.join(attack.name for attack in known)}")
+        chosen += [attack for attack in found if attack not in chosen]
+    return chosen or known
+
+
+def estimate(chosen: Sequence[Attack], n: int) -> float:
+    """About how long it takes [s]."""
+    return _START_S + n * sum(attack.seconds + (_START_S if attack.spoils else 0) for attack in chosen)
+
+
+def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lambda _: None) -> Iterator[SafetyRow]:
+    """Stage attacks, one after the other.
+
+    Args:
+        chosen: See `select`.
+        n: How often each.
+        busy: Other programs take all cores meanwhile.
+        tell: Told what goes on.
+
+    Raises:
+        BenchError: The robot cannot be made to drive at all.
+    """
+    with ExitStack() as undo:
+        if busy:
+            undo.enter_context(busy_cores())
+        robots = undo.enter_context(_Robots())
+        for attack in chosen:
+            found = []
+            for i in range(n):
+                tell(f"{attack.name}, {i + 1} of {n}")
+                found.append(_stage(attack, robots))
+            yield _row(attack, found)
+
+
+@contextmanager
+def busy_cores() -> Iterator[None]:
+    """Programs that take every core, twice over."""
+    spinning = [
+        subprocess.Popen([sys.executable, "-c", _SPIN], stdin=subprocess.DEVNULL)
+        for _ in range(_BUSY_PER_CORE * (os.cpu_count() or 1))
+    ]
+    try:
+        yield
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+
+
+class _Robots:
+    """The robot that is attacked; another one when it is of no use any more."""
+
+    def __init__(self) -> None:
+        self._undo = ExitStack()
+        self._robot: PlayedRobot | None = None
+
+    def __enter__(self) -> _Robots:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def get(self) -> PlayedRobot:
+        """One that drives, or will."""
+        if self._robot is None:
+            folder = Path(self._undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-")))
+            self._robot = self._undo.enter_context(PlayedRobot(folder))
+        return self._robot
+
+    def end(self) -> None:
+        """End it; the next one is new."""
+        self._robot = None
+        self._undo.close()
+
+
+def _stage(attack: Attack, robots: _Robots) -> tuple[Finding, float | None]:
+    """Stage an attack once: a robot that drives, the attack, and a robot that drives again."""
+    try:
+        robot = robots.get()
+        robot.go()
+    except StagingError as error:
+        robots.end()
+        raise BenchError(f"the robot does not drive before {attack.name}: {error}") from error
+    stage = Stage(robot)
+    promised = attack.promised(stage.promised) if attack.promised else None
+    try:
+        attack.run(stage)
+        if not attack.spoils:
+            robot.go()
+    except StagingError as error:
+        stage.wrong("stuck", str(error).partition("\n")[0])
+    finding = stage.finding()
+    if attack.spoils or any(violation.kind == "stuck" for violation in finding.violations):
+        robots.end()
+    return finding, promised
+
+
+def _row(attack: Attack, found: Sequence[tuple[Finding, float | None]]) -> SafetyRow:
+    findings = [finding for finding, _ in found]
+    violations = [violation for finding in findings for violation in finding.violations]
+    standstills = [f.standstill_max_s for f in findings if f.standstill_max_s is not None]
+    promised = found[0][1]
+    return SafetyRow(
+        attack=attack.name,
+        n=len(found),
+        violations=len(violations),
+        velocity_max_m_s=round(max(finding.velocity_max for finding in findings), 3),
+        acceleration_max_m_s2=round(max(finding.acceleration_max for finding in findings), 3),
+        standstill_max_s=round(max(standstills), 3) if standstills and promised is not None else None,
+        promised_s=round(promised, 3) if promised is not None else None,
+        what=tuple(f"{violation.kind}: {violation.text}" for violation in violations[:_SHOWN]),
+    )

@@ -1,0 +1,169 @@
+"""Attacks on processes: killed, frozen and continued, told to end, alone and two at a time."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import permutations
+
+from .attacks import Attacks
+from .stage import Promised, Stage
+
+ROLES = ("agent", "gate", "guard")
+_FREEZES_S = (0.2, 1.0, 2.0)
+_NEXT_S = 0.05
+"""From the first death to the second: less than it takes to notice the first."""
+_WATCH_S = 1.0
+"""For so long the robot has to stay where it stands."""
+_GATE_STARTS_S = 0.5
+"""No new gate drives on sooner than this."""
+
+
+def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
+    """Add them, for the processes that there are."""
+    for role in roles:
+        attacks.add(f"{role}-killed", f"the {role} is killed", _killed(role), _alone(role), seconds=3)
+        for seconds in _FREEZES_S:
+            long = seconds > 0.5
+            attacks.add(
+                f"{role}-frozen-{seconds:g}",
+                f"the {role} is frozen for {seconds:g} s, and goes on",
+                _frozen(role, seconds),
+                _alone(role) if long else None,
+                seconds=seconds + 1.5,
+            )
+    for first, second in permutations(roles, 2):
+        attacks.add(
+            f"{first}-{second}-killed",
+            f"the {first} is killed, {1e3 * _NEXT_S:.0f} ms later the {second}",
+            _both_killed(first, second),
+            _two(first, second),
+            seconds=3.5,
+        )
+    for first, second in permutations(("gate", "guard")):
+        attacks.add(
+            f"{first}-{second}-frozen",
+            f"the {first} is frozen for 1 s, {1e3 * _NEXT_S:.0f} ms later the {second}; both go on in this order",
+            _both_frozen(first, second),
+            _two(first, second),
+            seconds=3,
+        )
+        attacks.add(
+            f"{first}-frozen-{second}-killed",
+            f"the {first} is frozen for 1 s, {1e3 * _NEXT_S:.0f} ms later the {second} is killed",
+            _frozen_and_killed(first, second),
+            _two(first, second),
+            seconds=4,
+        )
+    for name, number in (("terminated", signal.SIGTERM), ("hung-up", signal.SIGHUP)):
+        attacks.add(
+            f"guard-{name}",
+            f"the guard is told to end ({number.name})",
+            _ended(number, everybody=False),
+            lambda promised: promised.stop,
+            seconds=4,
+        )
+        attacks.add(
+            f"all-{name}",
+            f"guard, gate and agent are told to end at once ({number.name})",
+            _ended(number, everybody=True),
+            lambda promised: promised.partner,
+            seconds=4,
+        )
+
+
+def _alone(role: str) -> Callable[[Promised], float]:
+    return lambda promised: promised.agent if role == "agent" else promised.partner
+
+
+def _two(first: str, second: str) -> Callable[[Promised], float]:
+    if "agent" in (first, second):
+        return lambda promised: _NEXT_S + promised.partner
+    return lambda promised: _NEXT_S + promised.silence
+
+
+def _killed(role: str) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        until = _WATCH_S if role != "gate" else _GATE_STARTS_S
+        with stage.stands(_alone(role)(stage.promised), f"the {role} was killed"):
+            stage.robot.signal(role, signal.SIGKILL)
+            stage.sleep(until)
+        if role == "guard":
+            stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends without its guard")
+
+    return run
+
+
+def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        if seconds > 0.5:
+            with stage.stands(_alone(role)(stage.promised), f"the {role} was frozen"):
+                pid = stage.robot.signal(role, signal.SIGSTOP)
+                stage.sleep(seconds)
+        else:
+            pid = stage.robot.signal(role, signal.SIGSTOP)
+            stage.sleep(seconds)
+        os.kill(pid, signal.SIGCONT)
+        stage.drives_on(f"the robot drives on after the {role} was frozen for {seconds:g} s")
+
+    return run
+
+
+def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        victim = stage.robot.pid(second)
+        with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were killed"):
+            stage.robot.signal(first, signal.SIGKILL)
+            stage.sleep(_NEXT_S)
+            with suppress(ProcessLookupError):  # it has ended by itself because of the first
+                os.kill(victim, signal.SIGKILL)
+            stage.sleep(_WATCH_S)
+
+    return run
+
+
+def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were frozen"):
+            one = stage.robot.signal(first, signal.SIGSTOP)
+            stage.sleep(_NEXT_S)
+            other = stage.robot.signal(second, signal.SIGSTOP)
+            stage.sleep(1.0 - _NEXT_S)
+        os.kill(one, signal.SIGCONT)
+        stage.sleep(_NEXT_S)
+        os.kill(other, signal.SIGCONT)
+        stage.drives_on(f"the robot drives on after {first} and {second} were frozen")
+
+    return run
+
+
+def _frozen_and_killed(first: str, second: str) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        with stage.stands(_two(first, second)(stage.promised), f"the {first} was frozen and the {second} killed"):
+            victim = stage.robot.pid(second)
+            frozen = stage.robot.signal(first, signal.SIGSTOP)
+            stage.sleep(_NEXT_S)
+            os.kill(victim, signal.SIGKILL)
+            stage.sleep(1.0 - _NEXT_S)
+            with suppress(ProcessLookupError):
+                os.kill(frozen, signal.SIGCONT)
+            stage.sleep(0.5)
+
+    return run
+
+
+def _ended(number: signal.Signals, everybody: bool) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        promised = stage.promised.partner if everybody else stage.promised.stop
+        roles = ROLES if everybody else ("guard",)
+        victims = [stage.robot.pid(role) for role in roles]
+        with stage.stands(promised, f"{', '.join(roles)}: told to end"):
+            for victim in victims:
+                os.kill(victim, number)
+            stage.sleep(_WATCH_S)
+        stage.expect(lambda: not stage.robot.alive("guard"), "the guard ends when it is told to")
+        stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends with its guard")
+
+    return run

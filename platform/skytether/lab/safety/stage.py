@@ -1,0 +1,131 @@
+"""Where an attack is staged: a robot that drives, and what is demanded of its wheels meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.supervisor import Limits
+
+from .checker import Demand, Finding, Violation, Wheels, check
+from .record import now
+from .robot import PlayedRobot, StagingError
+
+_TURNS = 2
+"""Of the gate's loop: until it has seen what happened, and until the guard has told the wheels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Promised:
+    """How long it may take until the robot stands, as the configuration has it [s].
+
+    Attributes:
+        agent: After the agent's last command.
+        partner: After the last word of gate or guard.
+        sensor: After a laser's last reading.
+        button: After the last word of the button.
+        joystick: After the joystick's last word.
+        stop: After a stop, by a person or a button.
+        silence: After the last word of whoever could speak to the wheels; they then stop by themselves.
+        jitter: What each of these has in addition, for how well times are known.
+    """
+
+    agent: float
+    partner: float
+    sensor: float
+    button: float
+    joystick: float
+    stop: float
+    silence: float
+    jitter: float
+
+    @classmethod
+    def of(cls, config: SafetyConfig) -> Promised:
+        """Those of a configuration: what it waits for, two turns, and braking from full speed."""
+        limits = config.limits or Limits()
+        period = 1 / config.rate_hz
+        brakes = max(limits.linear_max / limits.linear_braking, limits.angular_max / limits.angular_braking)
+        rest = _TURNS * period + brakes + period
+        return cls(
+            agent=limits.max_gap_s + rest,
+            partner=config.guard_s + rest,
+            sensor=max((sensor.max_age_s for sensor in config.sensors.values()), default=0.0) + rest,
+            button=((config.estop and config.estop.max_age_s) or 0.0) + rest,
+            joystick=(config.joystick.max_age_s if config.joystick else 0.0) + rest,
+            stop=rest,
+            silence=config.guard_s + _TURNS * period,
+            jitter=period,
+        )
+
+
+def wheels_of(config: SafetyConfig) -> Wheels:
+    """What holds always for the wheels of a configuration."""
+    return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=1 / config.rate_hz)
+
+
+class Stage:
+    """One repetition of an attack.
+
+    Args:
+        robot: To be attacked.
+    """
+
+    def __init__(self, robot: PlayedRobot) -> None:
+        self.robot = robot
+        self.promised = Promised.of(robot.config)
+        self._began = now()
+        self._demands: list[Demand] = []
+        self._seen: list[Violation] = []
+
+    @contextmanager
+    def stands(self, within_s: float, why: str) -> Iterator[None]:
+        """The robot has to come to a standstill, counted from the beginning of the block, and stay so until its end."""
+        with self.slows(0.0, within_s, why):
+            yield
+
+    @contextmanager
+    def slows(self, speed: float, within_s: float, why: str) -> Iterator[None]:
+        """The robot has to be as slow as that [m/s], in time, until the end of the block."""
+        since = now()
+        yield
+        self._demands.append(Demand(since, within_s, now(), why, speed))
+
+    def wrong(self, kind: str, text: str) -> None:
+        """Something else that was promised is not so."""
+        self._seen.append(Violation(now(), kind, text))
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        time.sleep(seconds)
+
+    def drives_on(self, why: str) -> None:
+        """The robot has to drive again by itself, at some time."""
+        self.expect(self.robot.drives, why)
+
+    def expect(self, condition: Callable[[], bool], why: str) -> None:
+        """Something has to come about, at some time."""
+        try:
+            self.robot.wait(condition, why)
+        except StagingError as error:
+            self.wrong("stuck", str(error).partition("\n")[0])
+
+    def timed(self, act: Callable[[], object], why: str, within_s: float) -> None:
+        """Something must not take longer than that [s]."""
+        since = now()
+        act()
+        took = now() - since
+        if took > within_s:
+            self.wrong("late", f"{why} after {took:.3f} s; {within_s:.3f} s is the most")
+
+    def finding(self) -> Finding:
+        """What the wheels received since the beginning, held against all that was demanded."""
+        found = check(self.robot.record.since(self._began), self._demands, wheels_of(self.robot.config))
+        return Finding(
+            violations=(*found.violations, *self._seen),
+            velocity_max=found.velocity_max,
+            acceleration_max=found.acceleration_max,
+            standstill_max_s=found.standstill_max_s,
+        )
