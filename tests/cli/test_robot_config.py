@@ -2,6 +2,7 @@ import pytest
 
 from skytether.cli.config_file import ConfigError
 from skytether.cli.robot_config import DEFAULT_MASTER, load_config, load_token
+from skytether.ros.permissions import Allowed
 
 LEAST = """
 robot: walker
@@ -109,3 +110,28 @@ def test_a_token_is_read_from_a_file_that_nobody_else_may_read(read, tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="no token"):
         load_token(settings, tmp_path)
+
+
+GATED = """
+ros1: {namespace: /base, readings: {force: geometry_msgs/msg/WrenchStamped}}
+safety: {footprint: {radius: 0.3}, sensors: {scan: {}}, joystick: {topic: /joy}, estop: {}}
+"""
+
+
+def test_what_the_service_may_do_in_the_graph_is_listed_by_absolute_names_or_in_the_robot_s_namespace(read):
+    settings = read(GATED + "cloud: {publish: [map, /tf], call: [/static_map]}")
+    assert settings.allowed == Allowed(["/base/map", "/tf"], ["/static_map"], [])
+
+
+@pytest.mark.parametrize(
+    "name", ["scan", "/base/scan", "/joy", "/base/estop", "cmd_vel", "~cmd_vel", "force", "/Joy", "/clock"]
+)
+@pytest.mark.parametrize("access", ["publish", "call", "offer"])
+def test_what_is_safety_s_cannot_be_listed(read, name, access):
+    with pytest.raises(ConfigError, match=rf"cloud\.{access}\.1.* is never the cloud's"):
+        read(GATED + f"cloud: {{{access}: [map, '{name}']}}")
+
+
+def test_a_name_that_is_none_cannot_be_listed(read):
+    with pytest.raises(ConfigError, match=r"cloud\.publish\.0.*no name of a graph"):
+        read(GATED + "cloud: {publish: [/a//b]}")

@@ -16,6 +16,7 @@ from skytether.robot.ros1 import Ros1RobotConfig
 from skytether.robot.safety.client import GateError, ask
 from skytether.robot.safety.config import SafetyConfig
 from skytether.ros.names import Names, resolve
+from skytether.ros.permissions import Permissions, refused
 from skytether.ros.ros1.master import MasterError
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.services import CallRefusedError
@@ -53,7 +54,9 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
     findings.append(_master(node))
     if manifest is not None and findings[-1].good:
         specs = manifest.spec.topics
-        findings += _topics(settings, graph.names(specs), node, specs)
+        names = graph.names(specs)
+        findings += _topics(settings, names, node, specs)
+        findings += forbidden(graph.permissions(), specs, names, settings.command_topic)
         if settings.safety is None:
             findings.append(_wheels(graph.cmd_vel or "", graph, node))
     if settings.safety is not None:
@@ -160,6 +163,14 @@ def _wheels(cmd_vel: str, graph: Ros1RobotConfig, node: Node) -> Finding:
         return Finding("wheels", name, "geometry_msgs/Twist", f"is a {kind}", good=False)
     says = "is known to the master" if kind != "*" else "nobody listens to it yet; is cmd_vel right?"
     return Finding("wheels", name, "geometry_msgs/Twist", says)
+
+
+def forbidden(permissions: Permissions, specs: Sequence[TopicSpec], names: Names, command_topic: str) -> list[Finding]:
+    """What the service wants in the graph and is not allowed: with any of it there is no session."""
+    return [
+        Finding(row, name, "", sentence, good=False)
+        for row, name, sentence in refused(permissions, specs, names, command_topic)
+    ]
 
 
 def unknown(name: str) -> Finding:

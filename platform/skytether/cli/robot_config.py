@@ -13,11 +13,14 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from skytether.api.manifest import Name, Strict
 from skytether.api.plain import oddity
 from skytether.messages import type_of
+from skytether.robot.graph_base import protected_names as graph_names
 from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.robot.status import DEFAULT_PORT
 from skytether.robot.supervisor import Limits
 from skytether.robot.task_manager import Mode, Policy
-from skytether.ros.names import Generation, check_name
+from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
+from skytether.ros.permissions import Access, Allowed, Permissions
 
 from .bridge_config import LocalNetwork
 from .config_file import ConfigError, Endpoint, read_config
@@ -135,6 +138,22 @@ class Ros2Config(GraphConfig, Ros2Graph):
         return self
 
 
+class CloudConfig(Strict):
+    """What the service may do in the robot's graph, beyond names below its own namespace.
+
+    Names are absolute, or in the robot's namespace; each includes all below it. What safety reads, what the robot's own
+    controller reads, ``/clock`` and what the wheels listen to is never the cloud's, and cannot be listed.
+    """
+
+    publish: tuple[str, ...] = ()
+    """Topics, and actions of ROS 1 whose goals the service sends: ``[/tf, /move_base]``."""
+    call: tuple[str, ...] = ()
+    """Services of the robot's nodes that it may call, and actions of ROS 2 whose goals it sends. Services that change a
+    node (``set_parameters`` and the like) must be listed in full."""
+    offer: tuple[str, ...] = ()
+    """Services that the robot's nodes may call at it."""
+
+
 class TaskConfig(Strict):
     """Local or offloaded, and to which site: weights and hysteresis of ``skytether.robot.task_manager.Policy``."""
 
@@ -197,6 +216,8 @@ class RobotConfig(Strict):
     ros1: Ros1Config | None = None
     ros2: Ros2Config | None = None
     """The robot's graph: one of the two."""
+    cloud: CloudConfig = CloudConfig()
+    """What the service may publish, call and offer in it."""
 
     @field_validator("fallback", mode="before")
     @classmethod
@@ -226,6 +247,48 @@ class RobotConfig(Strict):
                 f"ros1: {found}; it, or ros2, says which graph the robot is (an empty one is written: ros1: {{}})"
             )
         return self
+
+    @model_validator(mode="after")
+    def _the_cloud_has_no_way_past_safety(self) -> RobotConfig:
+        ros: Generation = 1 if self.ros1 is not None else 2
+        permissions = Permissions(self.home, namespace_of(self.service), Allowed(), self.protected)
+        for access in Access:
+            for i, given in enumerate(getattr(self.cloud, access)):
+                key = f"cloud.{access}.{i}"
+                try:
+                    name = check_name(resolve(check_name(given, ros), self.home), ros)
+                except ValueError as error:
+                    raise ValueError(f"{key}: {error}") from None
+                why = permissions.protected(name)
+                if why:
+                    raise ValueError(f"{key}: {name} is never the cloud's: {why}; take it out of the list")
+        return self
+
+    @property
+    def home(self) -> str:
+        """The namespace of the robot's topics."""
+        graph = self.ros1 or self.ros2
+        given = graph.namespace if graph is not None else None
+        return namespace_of(self.robot) if given is None else resolve(given, "/")
+
+    @property
+    def allowed(self) -> Allowed:
+        """What is listed for the service, by absolute names."""
+        lists = ([resolve(name, self.home) for name in getattr(self.cloud, access)] for access in Access)
+        return Allowed(*lists)
+
+    @property
+    def protected(self) -> dict[str, str]:
+        """What is never the service's: why, by absolute name."""
+        graph = self.ros1 or self.ros2
+        if graph is None:
+            return {}
+        names = Names((), self.home, "/", graph.remap, ros=1 if self.ros1 is not None else 2)
+        found = graph_names(names, self.home, [graph.cmd_vel], graph.readings)
+        if self.safety is None:
+            return found
+        prefix = self.ros2.bridge_namespace if self.ros2 is not None and self.ros2.dialect == "ros2dds" else "/"
+        return found | safety_names(self.safety, self.home, prefix)
 
 
 def load_config(path: Path) -> RobotConfig:

@@ -15,7 +15,7 @@ from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.node import Ros2Node
 from skytether.ros.ros2.qos import row_settings
 
-from .robot_check import Finding, look_at_gate, look_at_orchestrator, show, unknown
+from .robot_check import Finding, forbidden, look_at_gate, look_at_orchestrator, show, unknown
 from .robot_config import RobotConfig, Ros2Config
 from .ros2_config import join_graph
 
@@ -36,6 +36,8 @@ def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
         idle_s=ros2.idle_s,
         readings=ros2.readings,
         topics=ros2.topics,
+        allowed=settings.allowed,
+        protected=settings.protected,
     )
 
 
@@ -87,6 +89,7 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
             findings += [unknown(name) for name in names.unused((*config.readings, config.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
             findings += [_row(settings, part, names, node) for part in rows]
+            findings += forbidden(config.permissions(), specs, names, settings.command_topic)
             if settings.safety is None:
                 findings.append(_wheels(config, node))
     if settings.safety is not None:

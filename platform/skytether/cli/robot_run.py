@@ -220,4 +220,6 @@ def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
         topics=ros1.topics,
         params=ros1.params,
         use_sim_time=ros1.use_sim_time,
+        allowed=settings.allowed,
+        protected=settings.protected,
     )

@@ -15,6 +15,7 @@ from typing import Protocol
 from skytether.api.manifest import TopicSpec
 from skytether.bridge.port import Port
 from skytether.messages import DecodeError, Encoding, Message, Twist, decode, encode
+from skytether.ros.names import Names, resolve
 from skytether.wire.topic import Topic
 
 _log = logging.getLogger(__name__)
@@ -108,3 +109,26 @@ class GraphBase:
 
 
 _STANDSTILL = Twist()
+
+
+def protected_names(names: Names, home: str, wheels: Iterable[str], readings: Iterable[str]) -> dict[str, str]:
+    """What no service may publish in a robot's graph, gate or not: why, by absolute name.
+
+    Args:
+        names: The robot's own.
+        home: Their namespace.
+        wheels: What the wheels listen to.
+        readings: What the robot's own controller reads.
+    """
+    found = {name: "the robot's own controller reads it" for given in readings for name in _both(given, names, home)}
+    found |= {
+        name: "the wheels listen to it; a service drives by its command topic alone, past the supervisor"
+        for given in wheels
+        for name in _both(given, names, home)
+    }
+    return found
+
+
+def _both(name: str, names: Names, home: str) -> tuple[str, str]:
+    """With its remapping and without."""
+    return names.own(name), resolve(name, home)

@@ -9,15 +9,16 @@ from dataclasses import dataclass, field
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
 from skytether.messages import Encoding, Message, Twist, hash_of, type_of
-from skytether.ros import notes
+from skytether.ros import notes, permissions
 from skytether.ros.names import Names, bridge_type, namespace_of, resolve
+from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
 from skytether.ros.ros1.master import MasterError, RefusedError
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.port import CLOCK, SIM_TIME, Ros1Port
 from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import Role, Topic
 
-from .graph_base import IDLE_S, GraphBase
+from .graph_base import IDLE_S, GraphBase, protected_names
 from .table import Offer, robot_table
 
 _log = logging.getLogger(__name__)
@@ -38,6 +39,8 @@ class Ros1RobotConfig:
         topics: Sent to a service that takes any.
         params: Handed to the service's graph.
         use_sim_time: Whether /clock tells the time; None: as the master says.
+        allowed: What the service may publish, call and offer beyond its own namespace.
+        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
     """
 
     robot: str
@@ -50,6 +53,8 @@ class Ros1RobotConfig:
     topics: Collection[str] = ()
     params: Collection[str] = ()
     use_sim_time: bool | None = None
+    allowed: Allowed = NOTHING_MORE
+    protected: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def home(self) -> str:
@@ -63,6 +68,12 @@ class Ros1RobotConfig:
             GraphNameError: One is not allowed.
         """
         return Names(specs, self.home, namespace_of(self.service), self.remap)
+
+    def permissions(self) -> Permissions:
+        """What the service may do in the robot's graph."""
+        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
+        kept = protected_names(self.names(()), self.home, wheels, self.readings)
+        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
 
 
 class Ros1Robot:
@@ -99,6 +110,8 @@ class Ros1Robot:
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         names = self._config.names(specs)
+        may = self._config.permissions()
+        permissions.check(may, specs, names, command_topic)
         for unused in names.unused(self._config.readings):
             _log.warning("remap.%s has no effect: the service has no such topic", unused)
         sim_time = self.sim_time()
@@ -115,6 +128,7 @@ class Ros1Robot:
             names,
             topics,
             skip=(command_topic,),
+            permissions=may,
             params=self._config.params,
             sim_time=sim_time,
         )

@@ -11,7 +11,9 @@ from functools import partial
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
 from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, hash_of, type_of
+from skytether.ros import permissions
 from skytether.ros.names import Names, namespace_of, resolve
+from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.endpoints import Handle
 from skytether.ros.ros2.node import Ros2Node
@@ -19,7 +21,7 @@ from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
 from skytether.wire.topic import Role, Topic
 
-from .graph_base import IDLE_S, GraphBase
+from .graph_base import IDLE_S, GraphBase, protected_names
 from .table import Offer, robot_table
 
 _log = logging.getLogger(__name__)
@@ -43,6 +45,8 @@ class Ros2RobotConfig:
         idle_s: See `skytether.robot.graph_base.IDLE_S`.
         readings: Types of what the robot's own control reads, by name.
         topics: Sent to a service that takes any.
+        allowed: What the service may publish, call and offer beyond its own namespace.
+        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
     """
 
     robot: str
@@ -55,6 +59,8 @@ class Ros2RobotConfig:
     idle_s: float | None = IDLE_S
     readings: Mapping[str, str] = field(default_factory=dict)
     topics: Collection[str] = ()
+    allowed: Allowed = NOTHING_MORE
+    protected: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def home(self) -> str:
@@ -68,6 +74,11 @@ class Ros2RobotConfig:
             GraphNameError: One is not allowed.
         """
         return Names(specs, self.home, namespace_of(self.service), self.remap, ros=2)
+
+    def permissions(self) -> Permissions:
+        """What the service may do in the robot's graph."""
+        kept = protected_names(self.names(()), self.home, [self.cmd_vel], self.readings)
+        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
 
 
 class Ros2Robot:
@@ -102,12 +113,14 @@ class Ros2Robot:
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         names = self._config.names(specs)
+        may = self._config.permissions()
+        permissions.check(may, specs, names, command_topic)
         for unused in names.unused((*self._config.readings, self._config.cmd_vel)):
             _log.warning("remap.%s has no effect: the service has no such topic", unused)
         topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
         if self._port is not None:
             self._port.close()
-        self._port = Ros2Port(self._node, topics, Role.ROBOT, name_of=names.of, skip=(command_topic,))
+        self._port = Ros2Port(self._node, topics, Role.ROBOT, name_of=names.of, skip=(command_topic,), permissions=may)
         return topics, self._port
 
     def close(self) -> None:

@@ -113,7 +113,8 @@ class Names:
             home = robot if (spec.direction == "in") is not asks else service
             name = check_name(resolve(self._remap.get(spec.name, spec.name), home), ros)
             self._names[spec.name] = name
-            self._names.update({row.name: name + row.name.removeprefix(spec.name) for row in spec.rows()})
+            for part in (*spec.parts(), *spec.rows()):
+                self._names[part.name] = name + part.name.removeprefix(spec.name)
 
     def of(self, topic: str) -> str:
         """The graph's name of a topic, a call or an action of the bridge. What only a row ``*`` takes keeps its name.

@@ -161,6 +161,7 @@ def test_topic_tools_image_proc_and_robot_state_publisher_run_as_a_service(graph
         "service": "ros-tools",
         "params": {"rate": 2},
         "ros1": {"master": graph.uri, "params": ["/robot_description"]},
+        "cloud": {"publish": ["/tf", "/tf_static"]},
     }
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(config))

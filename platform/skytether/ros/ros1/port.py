@@ -19,6 +19,7 @@ from skytether.messages import definition_of, hash_of
 from skytether.ros import notes as graph_notes
 from skytether.ros.names import GraphNameError, Names, ros1_type
 from skytether.ros.notes import NOTES, Notes, TypeNote
+from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as TF_STATIC
 from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
@@ -74,6 +75,7 @@ class Ros1Port:
         names: Names in the graph.
         topics: This end's table, with `skytether.ros.notes.topics`.
         skip: Topics that somebody else takes care of.
+        permissions: What the other end may publish, call and offer here; None: everything.
         params: Names or namespaces of parameters that the other end gets.
         sim_time: Tell the other end that its time is a simulation's.
         on_notes: Called in the bridge's thread with what the other end tells; must return at once.
@@ -88,6 +90,7 @@ class Ros1Port:
         topics: Iterable[Topic],
         *,
         skip: Collection[str] = (),
+        permissions: Permissions | None = None,
         params: Collection[str] = (),
         sim_time: bool = False,
         on_notes: Callable[[Notes], None] = lambda _: None,
@@ -96,6 +99,7 @@ class Ros1Port:
         self._node = node
         self._role = role
         self._names = names
+        self._permissions = permissions
         self._params = params
         self._sim_time = sim_time
         self._on_notes = on_notes
@@ -136,7 +140,8 @@ class Ros1Port:
     def deliver(self, message: MessageReceived) -> None:
         publication = self._publications.get(message.topic)
         if publication is not None:
-            publication.publish(message.payload)
+            if self._may(Access.PUBLISH, publication.topic):
+                publication.publish(message.payload)
         elif message.topic == NOTES[self._other]:
             told = graph_notes.unpack(message.payload)
             if told is None:
@@ -220,6 +225,8 @@ class Ros1Port:
                 return
             try:
                 name = self._names.of(topic.name)
+                if not self._may(Access.PUBLISH, name):
+                    return
                 queue = max(QUEUE, topic.depth)
                 # What must arrive (a goal) may come just before the node that it is for has connected.
                 hold = topic.lifespan if topic.reliable and not topic.latched else 0.0
@@ -264,8 +271,11 @@ class Ros1Port:
                 return
             timeout = self._timeout(call)
             try:
+                name = self._names.of(call)
+                if not self._may(Access.OFFER, name):
+                    return
                 self._servers[call] = self._node.serve(
-                    self._names.of(call), kind, lambda request: self._peer.call(call, request, timeout)
+                    name, kind, lambda request: self._peer.call(call, request, timeout)
                 )
             except (GraphNameError, ValueError) as error:
                 self._say(f"service {call} cannot be offered here: {error}")
@@ -280,7 +290,10 @@ class Ros1Port:
         """In a thread of the bridge's calls: have a node of this graph answer the other end."""
         kind = self._found.get(call)
         try:
-            return self._node.call_service(self._names.of(call), request, self._timeout(call), kind.md5 if kind else "")
+            name = self._names.of(call)
+            if not self._may(Access.CALL, name):
+                raise CallError(f"{name} is not called for the other end")
+            return self._node.call_service(name, request, self._timeout(call), kind.md5 if kind else "")
         except (CallRefusedError, MasterError) as error:
             raise CallError(str(error)) from error
 
@@ -350,7 +363,8 @@ class Ros1Port:
             if caller is self._role:
                 continue
             try:
-                found = self._node.find_service(self._names.of(call))
+                name = self._names.of(call)
+                found = self._node.find_service(name) if self._may(Access.CALL, name) else None
             except CallRefusedError as error:
                 self._say(str(error))
                 found = None
@@ -358,6 +372,13 @@ class Ros1Port:
                 self._found.pop(call, None)
             else:
                 self._found[call] = found[1]
+
+    def _may(self, access: Access, name: str) -> bool:
+        """Whether the other end may do that here; a refusal is named."""
+        refusal = self._permissions.refusal(access, name) if self._permissions is not None else ""
+        if refusal:
+            self._say(refusal)
+        return not refusal
 
     def _say(self, sentence: str) -> None:
         """Each once."""

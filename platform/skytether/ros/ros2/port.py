@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
 from skytether.messages import Encoding, hash_of
+from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
@@ -65,6 +66,7 @@ class Ros2Port:
         name_of: Name in the graph of a topic of the table (of a call its request); by default its own, in the root
             namespace.
         skip: Topics of the table that the port has nothing to do with.
+        permissions: What the peer may publish, call and offer here; None: everything.
         on_event: Called in the bridge's thread with connected, disconnected, moved and refused; must return at once.
 
     Raises:
@@ -81,11 +83,13 @@ class Ros2Port:
         *,
         name_of: Callable[[str], str] = full_name,
         skip: Container[str] = (),
+        permissions: Permissions | None = None,
         on_event: Callable[[Event], object] | None = None,
     ) -> None:
         self._node = node
         self._role = role
         self._name_of = name_of
+        self._permissions = permissions
         self._on_event = on_event
         self._publisher: Publisher | None = None
         rows = {t.name: t for t in topics if t.name not in skip}
@@ -112,6 +116,11 @@ class Ros2Port:
         if not isinstance(publisher, Caller):
             raise TypeError("a table with calls needs a bridge that makes and answers calls")
         for name, caller in self._calls.items():
+            access = Access.OFFER if caller is self._role else Access.CALL
+            if not self._may(access, name + REQUEST, self._services[name].name):
+                if access is Access.CALL:
+                    publisher.answer(name, partial(_refuse, self._ways[name + REQUEST].refusal))
+                continue
             if caller is self._role:
                 serve = partial(self._ask_peer, publisher, name)
                 handle: Handle = self._node.serve(self._services[name], serve)
@@ -124,7 +133,9 @@ class Ros2Port:
     def deliver(self, message: MessageReceived) -> None:
         """Port: publish what came from the peer."""
         way = self._ways.get(message.topic)
-        if way is not None and isinstance(way.handle, Publication):
+        if way is None or not isinstance(way.handle, Publication):
+            return
+        if self._may(Access.PUBLISH, message.topic, way.handle.endpoint.name):
             way.handle.put(message.payload)
 
     def notify(self, event: Event) -> None:
@@ -164,7 +175,8 @@ class Ros2Port:
         endpoint = self._endpoints[row.name]
         way = self._ways[row.name]
         if endpoint.kind is Kind.PUBLISHER:
-            way.handle = self._node.publish(endpoint, waits=row.reliable)
+            if self._may(Access.PUBLISH, row.name, endpoint.name):
+                way.handle = self._node.publish(endpoint, waits=row.reliable)
         else:
             send = partial(self._send, row.name)
             if endpoint.name == STATIC_TF:
@@ -211,8 +223,18 @@ class Ros2Port:
 
     def _ask_graph(self, client: Client, name: str, request: bytes) -> bytes:
         """In a worker's thread of the bridge: a call from the peer is answered by our graph."""
+        if not self._may(Access.CALL, name + REQUEST, client.endpoint.name):
+            raise CallError(self._ways[name + REQUEST].refusal)
         timeout = self._call_rows[name][0].lifespan
         return _told(lambda: client.call(request, timeout))
+
+    def _may(self, access: Access, row: str, name: str) -> bool:
+        """Whether the peer may do that here; a refusal is named once, and kept with the row."""
+        refusal = self._permissions.refusal(access, name) if self._permissions is not None else ""
+        if refusal:
+            self._ways[row].refusal = refusal
+            self._node.report(f"permission {access} {name}", refusal)
+        return not refusal
 
     # --- names -------------------------------------------------------------------------------------------------------
 
@@ -232,6 +254,11 @@ class Ros2Port:
     @staticmethod
     def _hash(row: Topic) -> str:
         return row.type_hash if row.type_hash.startswith(_RIHS) else hash_of(row.type, "cdr")
+
+
+def _refuse(why: str, _: bytes) -> bytes:
+    """Answer of a call that is not made."""
+    raise CallError(why)
 
 
 def _told(ask: Callable[[], bytes]) -> bytes:
