@@ -97,6 +97,9 @@ class Drive:
         self.gate = Gate(self.rules)
         self.watch = Watch(self.rules.limits, self.config.guard_s)
         self.now = 100.0
+        for sequence, earlier in ((-1, 0.5), (0, 0.1)):  # the agent begins from a standstill
+            then = self.now - earlier
+            self.gate.command(Command(Hand.AGENT, 0.0, 0.0, 1, sequence, then, 0.0, then), then)
         self._aim = STANDSTILL
         self._events: list[tuple[float, int, str, Any]] = []
         self._count = self._commands = 0

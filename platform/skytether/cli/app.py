@@ -51,6 +51,7 @@ resources.robot_app.command("gate")(gate.gate)
 resources.robot_app.command("gate-status")(gate.gate_status)
 resources.robot_app.command("stop")(gate.stop)
 resources.robot_app.command("reset")(gate.reset)
+resources.robot_app.command("start")(gate.start)
 app.add_typer(lab.app, name="lab")
 
 

@@ -1,4 +1,4 @@
-"""``skytether robot gate, stop, reset, gate-status``: the last gate before the wheels, and what people say to it."""
+"""``skytether robot gate, stop, reset, start, gate-status``: the last gate before the wheels; what people say to it."""
 
 from __future__ import annotations
 
@@ -59,9 +59,19 @@ def stop(
 
 
 def reset(folder: Folder = None) -> None:
-    """End the emergency stop, after a look at the robot."""
+    """End the emergency stop, after a look at the robot. Nothing moves by that alone."""
     _ask(folder, {"do": "reset"})
-    console.print("the emergency stop is over; the robot follows new commands", markup=False)
+    sentence = (
+        "the emergency stop is over; whoever drives begins from a standstill, or goes on after: skytether robot start"
+    )
+    console.print(sentence, markup=False, soft_wrap=True)
+
+
+def start(folder: Folder = None) -> None:
+    """After a reset: let whoever wants to drive now go on."""
+    started = _ask(folder, {"do": "start"})["started"]
+    sentence = f"may drive: {', '.join(started)}" if started else "nobody wants to drive now; begin from a standstill"
+    console.print(sentence, markup=False, soft_wrap=True)
 
 
 def gate_status(folder: Folder = None, json: Json = False) -> None:
@@ -74,6 +84,8 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
     print(f"ahead     {answer['zone']}: {way}")
     print(f"stopped   {answer['stopped'] or 'no'}")
+    for source, why in answer["waiting"].items():
+        print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["troubles"]:
         print(f"trouble   {sentence}")
 

@@ -32,7 +32,7 @@ class Command:
         received_at: When it reached this robot.
     """
 
-    source: StrEnum
+    source: str
     linear: float
     angular: float
     epoch: int

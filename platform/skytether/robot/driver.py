@@ -9,8 +9,7 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from math import inf, isfinite, nan
+from math import inf, isnan, nan
 from typing import Protocol
 
 from skytether.control.admittance import STANDSTILL, Velocity
@@ -321,7 +320,7 @@ class Driver:
         held = self._supervised.held.get(Source.CLOUD)
         link = Link(
             connected=self.session is not None and self.session.connected,
-            command_at=held.received_at if held is not None and isfinite(held.received_at) else None,
+            command_at=None if held is None or isnan(held.received_at) else held.received_at,
             rtt=self.quality.rtt,
             loss=self.quality.loss,
             late=self.quality.late,
@@ -365,14 +364,14 @@ class Driver:
             self._object((objection,), command.source, now)
         return objection
 
-    def _object(self, objections: Iterable[Objection], source: StrEnum, now: float) -> None:
+    def _object(self, objections: Iterable[Objection], source: str, now: float) -> None:
         """Count always; name each kind once."""
         for objection in objections:
             self._objections[objection] += 1
             if objection in _NAMED:
                 self._notices.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
 
-    def _max_age(self, source: StrEnum) -> float:
+    def _max_age(self, source: str) -> float:
         return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)
 
     def _brake(self, now: float) -> Velocity:

@@ -109,7 +109,7 @@ class Supervised:
 
     velocity: Velocity = STANDSTILL
     now: float | None = None
-    held: dict[StrEnum, Command] = field(default_factory=dict)
+    held: dict[str, Command] = field(default_factory=dict)
     since: float = -inf
 
 
@@ -135,7 +135,7 @@ def admit(
 
 
 def step(
-    limits: Limits, state: Supervised, charge: StrEnum, max_age_s: float, now: float
+    limits: Limits, state: Supervised, charge: str, max_age_s: float, now: float
 ) -> tuple[Supervised, tuple[Objection, ...]]:
     """Decide what the wheels are told now: the ``velocity`` of the new state.
 
@@ -166,18 +166,18 @@ def begin_anew(state: Supervised, now: float) -> Supervised:
 
     The sequence is kept: a command that came before does not come again.
     """
-    held = {source: replace(command, received_at=-inf) for source, command in state.held.items()}
+    held = {source: replace(command, received_at=nan) for source, command in state.held.items()}
     return Supervised(held=held, since=now)
 
 
-def max_age(limits: Limits, source: StrEnum, max_rtt_s: float | None) -> float:
+def max_age(limits: Limits, source: str, max_rtt_s: float | None) -> float:
     """Oldest information that a source may act on [s].
 
     From the cloud: what a service needs of the round trip, and the time that a command may be repeated. The clock
     offset's error is at most half a round trip, so the bound of a command's age at its arrival is at most one round
     trip: a link that the service's manifest allows is never called stale.
     """
-    if source is Source.CLOUD:
+    if source == Source.CLOUD:
         return (DEFAULT_MAX_RTT_S if max_rtt_s is None else max_rtt_s) + limits.max_gap_s
     return limits.max_local_age_s
 

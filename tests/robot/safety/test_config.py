@@ -133,6 +133,47 @@ def test_a_section_that_is_missing_or_misspelt_is_named(tmp_path):
         load_safety(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"sources": {"nav": {"topic": "joy", "priority": 20}}, "joystick": {}}, "'joy' cannot be two things"),
+        ({"sources": {"nav": {"topic": "nav_vel", "priority": 10}}}, "agent and nav have the same priority 10"),
+        ({"sources": {"agent": {"topic": "nav_vel", "priority": 20}}}, "that name is taken"),
+        ({"sources": {"nav": {"topic": "nav_vel"}}}, "priority"),
+        ({"sources": {"nav": {"topic": "a", "priority": 20, "type": "std_msgs/msg/Bool"}}}, "type"),
+        ({"sources": {"nav": {"topic": "a", "priority": 20, "timeout_s": 3600}}}, "timeout_s"),
+        ({"locks": {"pause": {"topic": "p", "priority": 256}}}, "priority"),
+        ({"joystick": {"linear_axis": 1, "angular_axis": 1}}, "must be two axes"),
+        ({"joystick": {"max_still_s": 100}}, "max_still_s"),
+        ({"estop": {"on_silence": "ignore"}}, "on_silence"),
+    ],
+)
+def test_an_order_of_sources_that_is_none_is_refused_by_its_key(load, change, says):
+    with pytest.raises(ConfigError, match=says):
+        load({"footprint": {"radius": 0.3}, "sensors": {}, **change})
+
+
+def test_sources_and_locks_become_rules(load):
+    settings = load(
+        {
+            "footprint": {"radius": 0.3},
+            "sensors": {},
+            "joystick": {"max_still_s": None, "priority": 90},
+            "estop": {"on_silence": "latch"},
+            "sources": {"keys": {"topic": "k", "type": "geometry_msgs/msg/TwistStamped", "priority": 50}},
+            "locks": {"pause": {"topic": "p", "priority": 60, "max_age_s": None}},
+        }
+    )
+    sources = settings.rules().sources
+    assert (sources.joystick.max_still_s, sources.joystick_priority, sources.agent_priority) == (math.inf, 90, 10)
+    assert sources.further["k"].stamped
+    assert (sources.locks["p"].priority, sources.locks["p"].max_age_s) == (60, math.inf)
+    assert sources.on_silence == "latch"
+    kinds = {topic: kind.TYPE for topic, kind in settings.kinds().items()}
+    assert kinds["k"] == "geometry_msgs/msg/TwistStamped"
+    assert kinds["p"] == "std_msgs/msg/Bool"
+
+
 def test_the_example_of_the_documentation_is_a_configuration(load):
     text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
     example = yaml.safe_load(text.split("```yaml")[1].split("```")[0])

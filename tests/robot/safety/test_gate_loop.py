@@ -3,6 +3,7 @@
 import json
 import math
 import socket
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ class Hardware:
 class Bench:
     def __init__(self, folder: Path) -> None:
         self.now = 50.0
+        self.folder = folder
         self.hardware = Hardware()
         self.guard, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (self.guard, theirs):
@@ -54,6 +56,9 @@ class Bench:
         )
         self.loop = GateLoop(config, theirs, self.hardware, self.hardware, clock=lambda: self.now)
         self.link = GateLink(folder, clock=lambda: self.now)
+        for _ in range(25):  # the agent begins from a standstill
+            self.link.send(STANDSTILL)
+            self.turn()
 
     def turn(self, *, answered: bool = True) -> Velocity:
         """One turn of the loop; what it told the guard."""
@@ -138,7 +143,23 @@ def test_stop_reset_and_status(bench):
     bench.turn()
     status = bench.loop.answer(b'{"do": "status"}')
     assert (status["hand"], status["linear_m_s"]) == ("nobody", 0.0)
+    assert "comes first" in bench.loop.answer(b'{"do": "start"}')["refused"]
     assert bench.loop.answer(b'{"do": "reset"}')["stopped"] == ""
+    assert bench.loop.answer(b'{"do": "status"}')["waiting"] == {"agent": "the reset"}
+
+
+def test_after_a_reset_nothing_moves_until_a_person_says_start(bench):
+    bench.loop.answer(b'{"do": "stop"}')
+    bench.loop.answer(b'{"do": "reset"}')
+    for _ in range(50):
+        bench.link.send(Velocity(0.2, 0.0))
+        assert bench.turn() == STANDSTILL
+    assert "skytether robot start" in bench.loop.answer(b'{"do": "status"}')["troubles"][0]
+    assert bench.loop.answer(b'{"do": "start"}')["started"] == ["agent"]
+    for _ in range(30):
+        bench.link.send(Velocity(0.2, 0.0))
+        velocity = bench.turn()
+    assert velocity == pytest.approx((0.2, 0.0))
 
 
 def test_an_emergency_stop_outlives_the_gate(tmp_path):
@@ -192,7 +213,8 @@ def test_whoever_asks_where_no_gate_is_hears_what_to_do(tmp_path):
 
 
 def test_the_gate_says_to_the_agent_what_the_wheels_were_told(bench):
-    assert bench.link.state() is None
+    with closing(GateLink(bench.folder)) as unheard:
+        assert unheard.state() is None
     for _ in range(30):
         bench.link.send(Velocity(0.2, 0.1))
         bench.turn()

@@ -56,6 +56,7 @@ class Robot:
                 [sys.executable, "-m", "skytether.cli", "robot", "gate", str(config)], stdout=output, stderr=output
             )
         self.agent = self.start_agent()
+        self.start()
 
     def start_agent(self) -> subprocess.Popen[bytes]:
         with self._log.open("ab") as output:
@@ -65,6 +66,17 @@ class Robot:
 
     def status(self) -> dict:
         return ask(self.folder, {"do": "status"}, timeout=PATIENCE_S)
+
+    def start(self) -> None:
+        """A person lets the agent go on: after each start of a gate, each reset and each lost joystick."""
+
+        def started() -> bool:
+            try:
+                return "agent" in ask(self.folder, {"do": "start"}, PATIENCE_S)["started"]
+            except GateError:  # it is being started
+                return False
+
+        wait(started, "the agent may drive", self)
 
     def drives(self) -> None:
         wait(lambda: self._newest()[0] > 0.15, "the robot drives", self)
@@ -187,10 +199,14 @@ def test_the_gate_killed_or_frozen(robot):
     os.kill(first, signal.SIGKILL)
     robot.stands(0.0)
     second = gate_pid(robot, other_than=first)
+    robot.start()
     robot.drives()
     os.kill(second, signal.SIGSTOP)
     robot.stands(0.0)
     third = gate_pid(robot, other_than=second)  # a frozen one is ended and started anew
+    robot.stands()  # nothing moves by itself
+    assert "agent" in robot.status()["waiting"]
+    robot.start()
     robot.drives()
     ask(robot.folder, {"do": "stop", "reason": "a test"}, PATIENCE_S)
     robot.stands()
@@ -200,6 +216,8 @@ def test_the_gate_killed_or_frozen(robot):
     robot.stands()
     assert "a test" in robot.status()["stopped"]
     ask(robot.folder, {"do": "reset"}, PATIENCE_S)
+    robot.stands()  # nothing moves by itself
+    robot.start()
     robot.drives()
 
 
@@ -237,6 +255,7 @@ def test_the_disk_is_full(tmp_path, netns):
             gate_pid(robot, other_than=first)
             robot.stands()
             ask(folder, {"do": "reset"}, PATIENCE_S)
+            robot.start()
             robot.drives()
             robot.agent.kill()
             robot.stands()
@@ -247,15 +266,25 @@ def test_the_disk_is_full(tmp_path, netns):
 
 
 def test_people_and_things_in_the_way(robot):
+    up = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32))
+    robot.pad = up
     robot.drives()
     robot.wall = 0.38
     robot.stands()
     assert robot.status()["zone"] == "stop"
     robot.wall = 5.0
     robot.drives()
-    robot.pad = Joy(axes=np.array([0.0, 0.5], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
-    wait(lambda: robot._newest() == pytest.approx((0.0, 0.2)), "the joystick turns the robot", robot)
-    robot.pad = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32))
+    robot.drives()
+    robot.pad = Joy(axes=np.array([0.0, 1.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+    wait(lambda: robot._newest() == pytest.approx((0.0, 0.4)), "the joystick turns the robot", robot)
+    robot.pad = up
+    robot.drives()  # the button was let go: the agent goes on
+    robot.pad = Joy(axes=np.array([0.0, 1.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+    robot.stands()  # its driver repeats itself as if the radio were gone
+    assert "says the same for" in " ".join(robot.status()["troubles"])
+    robot.pad = up
+    robot.stands()
+    robot.start()
     robot.drives()
     cli = [sys.executable, "-m", "skytether.cli", "robot"]
     there = ["--folder", str(robot.folder)]
@@ -266,6 +295,9 @@ def test_people_and_things_in_the_way(robot):
     status = subprocess.run([*cli, "gate-status", "--json", *there], check=True, capture_output=True, text=True)
     assert json.loads(status.stdout)["hand"] == "nobody"
     subprocess.run([*cli, "reset", *there], check=True, capture_output=True)
+    robot.stands()
+    told = subprocess.run([*cli, "start", *there], check=True, capture_output=True, text=True)
+    assert "may drive: agent" in told.stderr + told.stdout
     robot.drives()
     for name in ("control.sock", "command.sock", "sensors.sock"):
         assert (robot.folder / name).stat().st_mode & 0o007 == 0  # closed to other users

@@ -32,7 +32,7 @@ RULES = Rules(
     zones=ZoneParams(),
     sensors={"scan": RangeSensor(Mount(max_gap=math.radians(10)))},
     sources=SourceRules(
-        joystick=JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4),
+        joystick=JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4, deadzone=0.0),
         button=ButtonParams(),
     ),
 )
@@ -67,9 +67,22 @@ class Bench:
         self.now = 100.0
         self.points: Points = np.empty((0, 2))
         self.scans = self.buttons = self.commands = True
-        self.sequence = 0
+        self.sequence = self.unrest = 0
         self.wanted = (0.3, 0.0)
         self.last: Decision | None = None
+        self.neutral()
+
+    def neutral(self) -> None:
+        """Agent and joystick begin from a standstill."""
+        for now in (self.now - 0.5, self.now - 0.2):
+            self.sequence += 1
+            self.gate.command(Command(Hand.AGENT, 0.0, 0.0, 1, self.sequence, now, 0.0, now), now)
+            self.gate.sense("joy", joy(0.0, 0.0, held=False), now)
+
+    def pad(self, *axes: float) -> None:
+        """A hand on the stick, which is never quite still."""
+        self.unrest += 1
+        self.gate.sense("joy", joy(*axes, 0.001 * (self.unrest % 2)), self.now)
 
     def run(self, seconds: float = PERIOD) -> Decision:
         for _ in range(round(seconds / PERIOD)):
@@ -117,7 +130,7 @@ def test_a_velocity_that_is_no_number_is_refused_and_named(bad):
     bench.run(0.5)
     assert bench.send(bad, 0.0) is Objection.NOT_FINITE
     assert bench.send(0.1, bad) is Objection.NOT_FINITE
-    assert "NaN or infinite" in bench.run().troubles["command:not_finite"]
+    assert "NaN or infinite" in bench.run().troubles["command:agent:not_finite"]
     assert bench.run().velocity == pytest.approx((0.3, 0.0))  # the last good one still holds
 
 
@@ -218,7 +231,7 @@ def test_the_joystick_goes_before_the_agent_and_gives_back():
     bench = Bench()
     bench.run(1.0)
     for _ in range(100):
-        bench.gate.sense("joy", joy(-0.5, 1.0), bench.now)
+        bench.pad(-0.5, 1.0)
         bench.run()
     assert bench.last.hand is Hand.JOYSTICK
     assert bench.last.velocity == pytest.approx((-0.1, 0.4))
@@ -231,7 +244,7 @@ def test_the_joystick_is_held_back_by_the_zones_as_well():
     bench = Bench()
     bench.points = np.array([[0.38, 0.0]])
     for _ in range(100):
-        bench.gate.sense("joy", joy(1.0, 0.0), bench.now)
+        bench.pad(1.0, 0.0)
         bench.run()
     assert (bench.last.hand, bench.last.velocity) == (Hand.JOYSTICK, STANDSTILL)
 
@@ -239,30 +252,42 @@ def test_the_joystick_is_held_back_by_the_zones_as_well():
 def test_a_joystick_lost_with_the_button_held_stops_the_robot_for_good():
     bench = Bench()
     for _ in range(50):
-        bench.gate.sense("joy", joy(1.0, 0.0), bench.now)
+        bench.pad(1.0, 0.0)
         bench.run()
     assert bench.run(2.0).velocity == STANDSTILL
     assert bench.last.hand is Hand.NOBODY
     assert "fell silent" in bench.last.troubles["joystick"]
+    for _ in range(50):
+        bench.pad(1.0, 0.0)
+        assert bench.run().velocity == STANDSTILL  # it is heard again, and its button was never let go
     bench.gate.sense("joy", joy(0.0, 0.0, held=False), bench.now)
+    assert bench.run(1.0).velocity == STANDSTILL  # nor does the agent go on by itself
+    assert "the joystick was lost" in bench.last.troubles["agent:neutral"]
+    bench.wanted = (0.0, 0.0)
+    bench.run(0.3)
+    bench.wanted = (0.3, 0.0)
     assert bench.run(1.0).velocity == pytest.approx((0.3, 0.0))
 
 
-def test_an_emergency_stop_is_latched_and_reset_starts_from_new_commands_only():
+def test_an_emergency_stop_is_latched_and_a_reset_alone_moves_nothing():
     bench = Bench()
     bench.run(1.0)
     bench.gate.sense("estop", Bool(data=True), bench.now)
     assert bench.run(0.2).velocity == STANDSTILL  # the button is up again, the stop stays
     assert "button was pressed" in bench.last.troubles["stopped"]
     for _ in range(50):
-        bench.gate.sense("joy", joy(1.0, 0.0), bench.now)
+        bench.pad(1.0, 0.0)
         assert bench.run().velocity == STANDSTILL  # nor does the joystick go past it
     bench.gate.sense("joy", joy(0.0, 0.0, held=False), bench.now)
     bench.commands = False
     bench.run()
+    assert "comes first" in bench.gate.start(bench.now)[1]
     assert bench.gate.reset(bench.now) == ""
     assert bench.run(0.05).velocity == STANDSTILL
     bench.commands = True
+    assert bench.run(0.5).velocity == STANDSTILL
+    assert "skytether robot start" in bench.last.troubles["agent:neutral"]
+    assert bench.gate.start(bench.now) == (["agent"], "")
     assert bench.run(0.5).velocity == pytest.approx((0.3, 0.0))
 
 

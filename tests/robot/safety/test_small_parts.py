@@ -11,7 +11,8 @@ from skytether.robot.safety.latch import ButtonParams, Latch
 from skytether.robot.supervisor import Limits
 
 LIMITS = Limits()  # accelerates 1 m/s^2 and 2 rad/s^2, brakes 2 m/s^2 and 4 rad/s^2
-PAD = JoystickParams(deadman=1, linear_axis=1, angular_axis=0, linear=0.2, angular=0.4, max_age_s=0.3)
+PAD = JoystickParams(deadman=1, linear_axis=1, angular_axis=0, linear=0.2, angular=0.4, deadzone=0.0, max_age_s=0.3)
+RELEASED = Joystick(seen_released=True)
 
 
 def joy(axes, buttons) -> Joy:
@@ -52,7 +53,7 @@ def test_what_the_wheels_can_reach_in_one_tick(before, after, reached):
 
 
 def test_a_held_button_drives_and_letting_go_gives_back():
-    state, wrong = joystick.hear(PAD, Joystick(), joy([0.5, 1.0], [0, 1]), 1.0)
+    state, wrong = joystick.hear(PAD, RELEASED, joy([0.5, 1.0], [0, 1]), 1.0)
     assert (state.grip, wrong) == (Grip.HELD, "")
     assert state.wanted == pytest.approx((0.2, 0.2))  # full forward, half left
     assert joystick.look(PAD, state, 1.29).grip is Grip.HELD
@@ -62,7 +63,7 @@ def test_a_held_button_drives_and_letting_go_gives_back():
 
 @pytest.mark.parametrize("now", [1.31, 0.69, nan, inf, -inf])
 def test_a_held_joystick_that_falls_silent_is_lost_until_it_is_heard_with_the_button_up(now):
-    held, _ = joystick.hear(PAD, Joystick(), joy([0, 1], [0, 1]), 1.0)
+    held, _ = joystick.hear(PAD, RELEASED, joy([0, 1], [0, 1]), 1.0)
     lost = joystick.look(PAD, held, now)
     assert (lost.grip, lost.wanted) == (Grip.LOST, STANDSTILL)
     assert joystick.look(PAD, lost, 1.0) == lost  # time alone does not give it back
@@ -84,13 +85,13 @@ def test_a_joystick_that_was_not_held_may_be_silent():
     ],
 )
 def test_a_joystick_of_another_make_drives_nothing(message, grip, says):
-    state, wrong = joystick.hear(PAD, Joystick(), message, 1.0)
+    state, wrong = joystick.hear(PAD, RELEASED, message, 1.0)
     assert (state.grip, state.wanted) == (grip, STANDSTILL)
     assert says in wrong
 
 
 def test_axes_beyond_their_end_are_at_their_end():
-    state, _ = joystick.hear(PAD, Joystick(), joy([-7, 3], [0, 1]), 1.0)
+    state, _ = joystick.hear(PAD, RELEASED, joy([-7, 3], [0, 1]), 1.0)
     assert state.wanted == pytest.approx((0.2, -0.4))
 
 

@@ -1,6 +1,7 @@
 """The gate as nodes of a real ROS 1 graph, with a real agent, bridge and service beside it that are killed."""
 
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -60,14 +61,18 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     graph.kill_master()
     pad = walker.node.advertise("/joy", "sensor_msgs/Joy", type_hash(Joy, "ros1"))
     graph.start_master()
-    held = Joy(axes=np.array([1.0, 0.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+    held = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.array([1], dtype=np.int32))
+    up = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32))
 
     def joystick_drives() -> bool:
-        pad.publish(encode(held, "ros1"))
+        """Seen up for long enough, a press counts."""
+        for message in (*[up] * 8, held):
+            pad.publish(encode(message, "ros1"))
+            time.sleep(0.05)
         return ask(folder, {"do": "status"}, 30)["hand"] == "joystick"
 
     wait_for(joystick_drives, "the joystick")
-    pad.publish(encode(Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.zeros(1, dtype=np.int32)), "ros1"))
+    pad.publish(encode(up, "ros1"))
     drives(walker)
     # The emergency stop button, pressed by a node of the robot.
     graph.end(button)
@@ -85,6 +90,7 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
             return False
 
     wait_for(released, "the reset")
+    ask(folder, {"do": "start"}, 30)
     drives(walker)
     # The guard itself is killed: the gate has a publisher of its own.
     guard.kill()

@@ -74,14 +74,23 @@ def test_the_wheels_of_a_ros_2_robot_are_behind_the_gate(stage, folder):
         except GateError:
             return 0
 
+    def start():
+        """A person lets the agent go on with what it wants."""
+        try:
+            return ask(folder, {"do": "start"}, 30)["started"]
+        except GateError:
+            return []
+
     agent = threading.Thread(target=play)
     agent.start()
     try:
+        stage.until(start, "the gate does not let the agent drive")
         stage.until(lambda: speed() is not None and speed() > 0.15, "the agent does not drive")
         assert decode(TwistStamped, wheels.payloads[-1]).header.frame_id == "base_link"
         first = stage.until(gate, "the gate does not answer")
         os.kill(first, signal.SIGKILL)
         stage.until(lambda: speed() == 0.0, "the guard does not stop the wheels")
+        stage.until(start, "the next gate does not let the agent drive")
         stage.until(lambda: speed() > 0.15, "the next gate does not drive")
         ask(folder, {"do": "stop"}, 30)
         stage.until(lambda: speed() == 0.0, "no emergency stop")

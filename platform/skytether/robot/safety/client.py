@@ -69,7 +69,7 @@ class GateLink:
 
 
 def ask(folder: Path, request: dict[str, Any], timeout: float = 3.0) -> dict[str, Any]:
-    """Put a request to the gate: ``{"do": "status"}``, ``"reset"``, or ``"stop"`` with a ``"reason"``.
+    """Put a request to the gate: ``{"do": "status"}``, ``"reset"``, ``"start"``, or ``"stop"`` with a ``"reason"``.
 
     Raises:
         GateError: It does not answer, or answers no.

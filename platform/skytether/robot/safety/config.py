@@ -4,42 +4,33 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from math import inf, radians
+from math import radians
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from skytether.api.manifest import Strict
-from skytether.messages import Bool, Joy, LaserScan, Message, Range
+from skytether.messages import LaserScan, Message, Range
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name
 
+from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
-from .joystick import JoystickParams
-from .latch import ButtonParams
 from .protocol import default_folder
 from .ranges import Mount
 from .rules import Rules
 from .sensing import Action, RangeSensor
-from .sources import SourceRules
+from .source_config import SourcesConfig
 from .stopping import Stages
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"
 
-_Metres = Annotated[float, Field(ge=-100, le=100)]
-_Topic = Annotated[str, Field(min_length=1, max_length=255)]
 
-
-class _Numbers(Strict):
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
-
-
-class OutlineConfig(_Numbers):
+class OutlineConfig(Numbers):
     """The robot with all that it carries, seen from above: a polygon or a circle about the origin."""
 
-    polygon: Annotated[tuple[tuple[_Metres, _Metres], ...], Field(min_length=3, max_length=100)] | None = None
+    polygon: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=3, max_length=100)] | None = None
     """Corners (x forward, y left) in the base frame [m], in any order; of a dented outline the hull is taken."""
     radius: Annotated[float, Field(gt=0, le=100)] | None = None
     """[m]"""
@@ -56,14 +47,14 @@ class OutlineConfig(_Numbers):
         return polygon(self.polygon) if self.polygon is not None else circle(self.radius or 0.0)
 
 
-class SensorConfig(_Numbers):
+class SensorConfig(Numbers):
     """A laser or a sonar, as it is mounted."""
 
     kind: Literal["laser", "sonar"] = "laser"
     """sensor_msgs/msg/LaserScan or sensor_msgs/msg/Range."""
-    x: _Metres = 0.0
+    x: Metres = 0.0
     """Forward of the base's origin [m]."""
-    y: _Metres = 0.0
+    y: Metres = 0.0
     """Left of it [m]."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Where its middle looks; positive to the left."""
@@ -101,33 +92,7 @@ class SensorConfig(_Numbers):
         return RangeSensor(mount, self.max_age_s, Action(self.on_unknown), Action(self.on_empty))
 
 
-class JoystickConfig(_Numbers):
-    """A joystick or gamepad (sensor_msgs/msg/Joy), repeated at 10 Hz or more while the button is held."""
-
-    topic: _Topic = "joy"
-    deadman: Annotated[int, Field(ge=0, le=63)] = 4
-    """Index of the button to be held."""
-    linear_axis: Annotated[int, Field(ge=0, le=63)] = 1
-    angular_axis: Annotated[int, Field(ge=0, le=63)] = 0
-    linear: float = 0.2
-    """At the end of the axis [m/s]; negative turns the axis round."""
-    angular: float = 0.4
-    """At the end of the axis [rad/s]."""
-    max_age_s: Annotated[float, Field(gt=0, le=2)] = 0.3
-    """Silence after which a held joystick is lost."""
-
-
-class ButtonConfig(_Numbers):
-    """An emergency stop button (std_msgs/msg/Bool)."""
-
-    topic: _Topic = "estop"
-    pressed_is: bool = True
-    """Its value when pressed; false for a circuit that opens."""
-    max_age_s: Annotated[float, Field(gt=0, le=60)] | None = 0.5
-    """Silence after which the robot stops; null: it speaks only when it changes."""
-
-
-class SocketsConfig(_Numbers):
+class SocketsConfig(Numbers):
     """Drivers that speak to the gate through datagram sockets; ``unix:PATH`` or ``udp:HOST:PORT``."""
 
     sensors: str | None = None
@@ -143,16 +108,16 @@ class SocketsConfig(_Numbers):
         return text
 
 
-class Ros1Way(_Numbers):
+class Ros1Way(Numbers):
     """A robot that is a ROS 1 graph: names are absolute, or in ``namespace``."""
 
     master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
     host: str | None = None
     """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
     namespace: str = "/"
-    node: _Topic = "skytether"
+    node: Topic = "skytether"
     """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
-    cmd_vel: _Topic = "cmd_vel"
+    cmd_vel: Topic = "cmd_vel"
     """What the wheels listen to; nobody else may publish it."""
 
     @field_validator("namespace", "node", "cmd_vel")
@@ -161,7 +126,7 @@ class Ros1Way(_Numbers):
         return check_name(name)
 
 
-class Ros2Way(_Numbers):
+class Ros2Way(Numbers):
     """A robot that is a ROS 2 graph; the keys are those of the section ``ros2``."""
 
     router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
@@ -173,7 +138,7 @@ class Ros2Way(_Numbers):
     namespace: str = "/"
     node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
     """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
-    cmd_vel: _Topic = "cmd_vel"
+    cmd_vel: Topic = "cmd_vel"
     """What the wheels listen to; nobody else may publish it."""
     cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
     frame: str = "base_link"
@@ -185,17 +150,15 @@ class Ros2Way(_Numbers):
         return check_name(name, 2)
 
 
-class SafetyConfig(_Numbers):
+class SafetyConfig(SourcesConfig):
     """The whole section."""
 
     footprint: OutlineConfig
     limits: Limits | None = None
     """Of the wheels, whoever drives; null: the file's own ``limits``."""
     zones: ZoneParams = ZoneParams()
-    sensors: Annotated[dict[_Topic, SensorConfig], Field(max_length=32)]
+    sensors: Annotated[dict[Topic, SensorConfig], Field(max_length=32)]
     """By topic. Without any the robot is blind and drives all the same: write ``{}`` to have that."""
-    joystick: JoystickConfig | None = None
-    estop: ButtonConfig | None = None
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
@@ -216,7 +179,7 @@ class SafetyConfig(_Numbers):
             raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
         for name in self.kinds() if self.ros1 or self.ros2 else ():
             check_name(name, 1 if self.ros1 else 2)
-        topics = [*self.sensors, *(part.topic for part in (self.joystick, self.estop) if part)]
+        topics = [*self.sensors, *(topic for topic, _ in self.source_kinds())]
         for topic in topics:
             if topics.count(topic) > 1:
                 raise ValueError(f"the topic '{topic}' cannot be two things")
@@ -231,19 +194,13 @@ class SafetyConfig(_Numbers):
         """The rules that follow."""
         stages = self.stages()
         limits = replace(self.limits or Limits(), period_s=stages.period_s, max_step_s=stages.longest_step_s)
-        joystick, button = self.joystick, self.estop
         return Rules(
             footprint=self.footprint.footprint(),
             limits=limits,
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
             stages=stages,
-            sources=SourceRules(
-                joystick=None if joystick is None else JoystickParams(**joystick.model_dump(exclude={"topic"})),
-                joystick_topic=joystick.topic if joystick else "",
-                button=None if button is None else ButtonParams(button.pressed_is, button.max_age_s or inf),
-                button_topic=button.topic if button else "",
-            ),
+            sources=self.source_rules(),
         )
 
     def stages(self) -> Stages:
@@ -261,11 +218,7 @@ class SafetyConfig(_Numbers):
         kinds: dict[str, type[Message]] = {
             name: LaserScan if sensor.kind == "laser" else Range for name, sensor in self.sensors.items()
         }
-        if self.joystick is not None:
-            kinds[self.joystick.topic] = Joy
-        if self.estop is not None:
-            kinds[self.estop.topic] = Bool
-        return kinds
+        return kinds | dict(self.source_kinds())
 
 
 def address(text: str) -> str | tuple[str, int]:

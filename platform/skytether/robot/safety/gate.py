@@ -257,8 +257,11 @@ class GateLoop:
                 refused = self._gate.reset(self._clock())
                 if refused:
                     return {"refused": refused}
+            elif what == "start":
+                started, refused = self._gate.start(self._clock())
+                return {"refused": refused} if refused else self._status() | {"started": started}
             elif what != "status":
-                return {"refused": f"there is no request {str(what)[:40]!r}; there are status, stop and reset"}
+                return {"refused": f"there is no request {str(what)[:40]!r}; there are status, stop, reset and start"}
             return self._status()
         finally:
             self._lock.release()
@@ -268,6 +271,7 @@ class GateLoop:
         return {
             "stopped": self._gate.stopped,
             "hand": last.hand if last else None,
+            "waiting": dict(self._gate.waiting),
             "zone": last.zone if last else None,
             "way_m": round(last.way, 3) if last and isfinite(last.way) else None,
             "share": round(last.share, 3) if last else None,

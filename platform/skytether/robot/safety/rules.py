@@ -57,7 +57,7 @@ class Decision:
 
     Attributes:
         velocity: For the wheels.
-        hand: Who drives.
+        hand: Who drives: a `Hand`, or the name of a further source.
         zone: What lies ahead.
         way: Of the outermost corner until the stop zone [m]; inf: nothing near.
         share: Of the wanted velocity that zones and sensors left.
@@ -65,7 +65,7 @@ class Decision:
     """
 
     velocity: Velocity
-    hand: Hand
+    hand: str
     zone: Zone
     way: float
     share: float
@@ -98,11 +98,7 @@ class Gate:
 
     def command(self, command: Command, now: float) -> Objection | None:
         """Take a velocity in that the agent wants; its ``source`` must be `Hand.AGENT`."""
-        limits = self._rules.limits
-        self._supervised, objection = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
-        if objection is not None:
-            self._event(f"command:{objection}", f"a command of the agent is refused: {_SAYS[objection]}")
-        return objection
+        return self._admit(command, now)
 
     def sense(self, topic: str, message: Message, now: float) -> None:
         """Take a message in from one of the robot's own sensors. Never raises for what it holds."""
@@ -120,7 +116,7 @@ class Gate:
         self._sources.engage(reason)
 
     def reset(self, now: float) -> str:
-        """End the emergency stop and forget all commands; only new ones move the robot.
+        """End the emergency stop and forget all commands; see `Sources.reset`.
 
         Returns:
             Why it was refused; empty: it was not.
@@ -131,6 +127,15 @@ class Gate:
                 self._supervised, held={k: replace(v, received_at=-inf) for k, v in self._supervised.held.items()}
             )
         return refused
+
+    def start(self, now: float) -> tuple[list[str], str]:
+        """A person says that those who want to drive now may; see `Sources.start`."""
+        return self._sources.start(now)
+
+    @property
+    def waiting(self) -> Mapping[str, str]:
+        """Sources that must be neutral before they may drive, and after what."""
+        return self._sources.waiting
 
     def step(self, now: float) -> Decision:
         """Decide what the wheels are told until the next step. Never raises; whatever fails stands still."""
@@ -159,13 +164,13 @@ class Gate:
         self._zone = allowed.zone
         return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
-    def _supervise(self, hand: Hand, now: float, troubles: dict[str, str]) -> Velocity:
+    def _supervise(self, hand: str, now: float, troubles: dict[str, str]) -> Velocity:
         limits = self._sources.limits(hand)
         self._supervised, objections = supervisor.step(limits, self._supervised, hand, limits.max_gap_s, now)
         for objection in objections:
             if objection in _ORDINARY:
                 self.counts[f"{hand}:{objection}"] += 1
-            elif hand is not Hand.NOBODY:
+            elif hand != Hand.NOBODY:
                 troubles[f"{hand}:{objection}"] = f"{hand}: {_SAYS[objection]}"
         return self._supervised.velocity
 
@@ -182,8 +187,17 @@ class Gate:
         if wrong:
             self._event(f"{topic}:message", f"{topic}: {wrong}")
         if command is not None:
-            limits = self._sources.limits(Hand.JOYSTICK)
-            self._supervised, _ = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
+            self._admit(command, now)
+
+    def _admit(self, command: Command, now: float) -> Objection | None:
+        limits = self._sources.limits(command.source)
+        self._supervised, objection = supervisor.admit(limits, self._supervised, command, limits.max_gap_s, now)
+        if objection is None:
+            self._sources.admitted(command, now)
+        else:
+            who = f"a command of {command.source} is refused: {_SAYS[objection]}"
+            self._event(f"command:{command.source}:{objection}", who)
+        return objection
 
     def _event(self, kind: str, sentence: str) -> None:
         if len(self._events) < _EVENTS:
