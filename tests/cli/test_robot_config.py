@@ -2,6 +2,7 @@ import pytest
 
 from skytether.cli.config_file import ConfigError
 from skytether.cli.robot_config import DEFAULT_MASTER, load_config, load_token
+from skytether.robot.arbiter import Needs
 from skytether.ros.permissions import Allowed
 
 LEAST = """
@@ -135,3 +136,16 @@ def test_what_is_safety_s_cannot_be_listed(read, name, access):
 def test_a_name_that_is_none_cannot_be_listed(read):
     with pytest.raises(ConfigError, match=r"cloud\.publish\.0.*no name of a graph"):
         read(GATED + "cloud: {publish: [/a//b]}")
+
+
+def test_the_link_has_needs_of_the_robot_s_own(read):
+    assert read().needs.needs() == Needs(max_rtt_s=1.0, max_loss=0.5, max_late=0.5)
+    assert read("ros1: {}\nneeds: {max_rtt_ms: 300}").needs.needs().max_rtt_s == 0.3
+
+
+@pytest.mark.parametrize(
+    "bad", ["max_rtt_ms: 3600000", "max_rtt_ms: null", "max_loss: 1.0", "max_late: .inf", "max_rtt_ms: 0"]
+)
+def test_needs_that_would_be_none_are_refused(read, bad):
+    with pytest.raises(ConfigError, match=f"needs.{bad.split(':')[0]}"):
+        read(f"ros1: {{}}\nneeds: {{{bad}}}")

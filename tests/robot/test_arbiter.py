@@ -102,8 +102,8 @@ def test_a_bad_moment_on_the_way_back_starts_it_anew(bad):
     assert run(choice, GOOD, 0.03, now)[0].source is Source.CLOUD
 
 
-def test_what_the_service_does_not_need_does_not_count():
-    needs = Needs()
+def test_what_nobody_needs_does_not_count():
+    needs = Needs(max_rtt_s=None, max_loss=None)
     choice = start(needs, 0.0)
     for i in range(200):
         now = i * TICK

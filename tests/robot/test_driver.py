@@ -5,6 +5,8 @@ from math import nan
 
 import pytest
 
+from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import TopicSpec
 from skytether.control.admittance import Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
 from skytether.robot.arbiter import Needs, Reason
@@ -12,7 +14,7 @@ from skytether.robot.command import Source
 from skytether.robot.driver import Driver
 from skytether.robot.fallback import Admittance, Stop
 from skytether.robot.link import Quality
-from skytether.robot.service_manager import Terms
+from skytether.robot.service_manager import Terms, terms
 from skytether.robot.session import LiveSession
 from skytether.robot.supervisor import Limits
 from skytether.wire.events import Connected, Disconnected, MessageReceived
@@ -268,13 +270,13 @@ def test_the_services_needs_decide(driven):
     driven.driver.quality = Quality(loss=0.3, lossy_topic="force")
     status = driven.run(0.6, linear=0.2)
     assert status.transitions[-1].reason is Reason.LOSS
-    assert status.why == "30% of force lost, the service bears 20%"
+    assert status.why == "30% of force lost, 20% at most"
     driven.driver.quality = Quality()
     assert driven.run(1.2, linear=0.2).source is Source.CLOUD
     driven.driver.quality = Quality(late=0.6, late_topic="scan")
     status = driven.run(0.6, linear=0.2)
     assert status.transitions[-1].reason is Reason.LATE
-    assert status.why == "60% of scan too late, the service bears 50%"
+    assert status.why == "60% of scan too late, 50% at most"
 
 
 def test_a_command_older_than_the_service_needs_is_not_followed(driven):
@@ -283,6 +285,33 @@ def test_a_command_older_than_the_service_needs_is_not_followed(driven):
     assert status.objections["stale"] == 30
     assert status.transitions[-1].reason is Reason.NO_COMMAND
     assert driven.run(1.5, linear=0.2, delay=0.2).source is Source.CLOUD
+
+
+HOUR_MS = 3_600_000.0
+
+
+@pytest.mark.parametrize("asked", [1e9, 1e308])
+def test_no_answer_of_the_orchestrator_lets_an_old_command_drive(driven, asked):
+    """Every number of a session that reaches the control loop, as wide as it can be."""
+    row = TopicSpec(name="cmd_vel", type=Twist.TYPE, direction="out", period_ms=HOUR_MS - 1, lifespan_ms=HOUR_MS)
+    held_to = terms(ServiceNeeds(max_rtt_ms=asked, max_loss=1.0), [row], "cmd_vel")
+    driven.driver.hold_to(held_to)
+    # The robot's own: 1 s of round trip, and the time that a command may be repeated.
+    status = driven.run(0.5, linear=0.2, delay=3600.0)
+    assert status.objections["stale"] == 50
+    assert status.transitions[-1].reason is Reason.NO_COMMAND
+    assert status.source is Source.FALLBACK
+    driven.driver.quality = Quality(rtt=1.01)
+    assert driven.run(2.0, linear=0.2, delay=0.2).source is not Source.CLOUD
+
+
+def test_commands_stop_driving_after_the_robot_s_own_gap_whatever_period_a_manifest_has(driven):
+    row = TopicSpec(name="cmd_vel", type=Twist.TYPE, direction="out", period_ms=HOUR_MS - 1)
+    driven.driver.hold_to(terms(ServiceNeeds(), [row], "cmd_vel"))
+    driven.run(1.5, linear=0.2)
+    status = driven.run(0.4)
+    assert status.transitions[-1].reason is Reason.NO_COMMAND
+    assert status.source is Source.FALLBACK
 
 
 def test_commands_whose_age_is_not_known_well_enough_hand_over(driven):

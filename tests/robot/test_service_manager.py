@@ -2,12 +2,14 @@ from dataclasses import replace
 from math import inf, nan
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.robot.arbiter import Link, Needs, Reason
 from skytether.robot.link import LinkMonitor, Quality
-from skytether.robot.service_manager import Patience, ServiceManager, Terms, explain, terms
+from skytether.robot.service_manager import Patience, ServiceManager, Terms, explain, terms, tighten
 from skytether.wire.stats import SessionStats, TopicStats
 
 CMD_VEL = TopicSpec(name="cmd_vel", type="geometry_msgs/msg/Twist", direction="out", period_ms=50)
@@ -92,3 +94,21 @@ def test_every_hand_over_is_explained_whatever_is_unknown(reason):
             sentence = explain(reason, needs, link, Quality(), 5.2)
             assert sentence
             assert "\n" not in sentence
+
+
+NUMBER = st.one_of(st.none(), st.floats(0, 1e308), st.sampled_from([inf, nan, 0.0, 5e-324]))
+
+
+@given(rtt=NUMBER, loss=NUMBER, late=st.floats(0, 1e308), period=NUMBER)
+def test_no_answer_widens_what_the_robot_needs(rtt, loss, late, period):
+    own = Needs(max_rtt_s=0.4, max_loss=0.3, max_late=0.2)
+    needs = tighten(own, Terms(rtt, loss, late, period))
+    assert needs.max_rtt_s <= 0.4
+    assert needs.max_loss <= 0.3
+    assert needs.max_late <= 0.2
+    same = ("max_clock_error_s", "command_timeout_s", "bad_s", "good_s", "local")
+    assert all(getattr(needs, name) == getattr(own, name) for name in same)
+
+
+def test_a_stricter_service_is_held_to_its_own_needs():
+    assert tighten(Needs(), Terms(0.1, 0.05, 0.05)) == Needs(max_rtt_s=0.1, max_loss=0.05, max_late=0.05)

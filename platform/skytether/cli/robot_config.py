@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from skytether.api.manifest import Name, Strict
 from skytether.api.plain import oddity
 from skytether.messages import type_of
+from skytether.robot.arbiter import Needs
 from skytether.robot.graph_base import protected_names as graph_names
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.protected import protected_names as safety_names
@@ -138,6 +139,21 @@ class Ros2Config(GraphConfig, Ros2Graph):
         return self
 
 
+class LinkNeeds(Strict):
+    """What the link must be like while the service drives; a service's manifest only tightens it."""
+
+    max_rtt_ms: Annotated[float, Field(gt=0, le=5000)] = 1000.0
+    """Round trip. What drives the robot was made from information that is at most so old, and ``limits.max_gap_s``."""
+    max_loss: Annotated[float, Field(ge=0, le=0.95)] = 0.5
+    """Share of a topic's messages that may be lost."""
+    max_late: Annotated[float, Field(ge=0, le=0.95)] = 0.5
+    """Share of a topic's messages that may come too late to be used."""
+
+    def needs(self) -> Needs:
+        """For the source choice."""
+        return Needs(max_rtt_s=self.max_rtt_ms / 1000, max_loss=self.max_loss, max_late=self.max_late)
+
+
 class CloudConfig(Strict):
     """What the service may do in the robot's graph, beyond names below its own namespace.
 
@@ -201,6 +217,8 @@ class RobotConfig(Strict):
     fallback: FallbackConfig = FallbackConfig()
     limits: dict[str, float] = {}
     """What the wheels may do: fields of ``skytether.robot.supervisor.Limits``."""
+    needs: LinkNeeds = LinkNeeds()
+    """What the link must be like at least."""
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Of the robot's control loop."""
     bind: Endpoint = Endpoint(host="0.0.0.0")  # noqa: S104 - a robot has one network or several

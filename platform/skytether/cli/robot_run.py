@@ -194,6 +194,7 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         fallback=settings.fallback.name,
         fallback_options=settings.fallback.options,
         limits=Limits(**settings.limits),
+        needs=settings.needs.needs(),
         command_topic=settings.command_topic,
         rate_hz=settings.rate_hz,
         bind=(settings.bind.host, settings.bind.port),

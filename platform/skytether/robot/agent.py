@@ -70,8 +70,8 @@ class AgentConfig:
         fallback: Entry point of the group ``skytether.fallbacks``.
         fallback_options: The fallback's.
         limits: The supervisor's; from here only.
-        needs: The arbiter's patience. Its ``max_rtt_s`` and ``max_loss`` hold until a session brings what the service's
-            manifest needs: ``needs.max_rtt_ms`` and ``needs.max_loss`` there; missing there means any.
+        needs: The arbiter's patience, and what the link must be like at least. What a session says the service needs
+            (``needs.max_rtt_ms`` and ``needs.max_loss`` of its manifest) only tightens that.
         command_topic: The service's topic (geometry_msgs/msg/Twist) that drives the robot.
         rate_hz: Of the control loop.
         lease_s: The instance ends when the robot was not heard of for this long.

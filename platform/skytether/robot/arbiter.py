@@ -17,6 +17,7 @@ from math import inf, isfinite, nan
 from skytether.control.numbers import check_positive
 
 from .command import Source
+from .supervisor import DEFAULT_MAX_RTT_S
 
 
 class Reason(StrEnum):
@@ -44,11 +45,13 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What the service needs of the link, and how patient the arbiter is.
+    """What the link must be like, and how patient the arbiter is. The defaults are the robot's own.
+
+    What a service needs only tightens them (`skytether.robot.service_manager.tighten`).
 
     Attributes:
-        max_rtt_s: From the manifest [s]; None: any.
-        max_loss: From the manifest, share of messages; None: any but all.
+        max_rtt_s: Round trip [s]; None: any. The oldest information that may drive is by `Limits.max_gap_s` older.
+        max_loss: Share of messages; None: any but all.
         max_late: Share of a topic's messages that may miss their lifespan.
         max_clock_error_s: Largest bound of the clock offset's error [s].
         command_timeout_s: Without a valid command for this long the robot is on its own [s].
@@ -57,8 +60,8 @@ class Needs:
         local: Who drives when the cloud does not.
     """
 
-    max_rtt_s: float | None = None
-    max_loss: float | None = None
+    max_rtt_s: float | None = DEFAULT_MAX_RTT_S
+    max_loss: float | None = 0.5
     max_late: float = 0.5
     max_clock_error_s: float = 0.5
     command_timeout_s: float = 0.15

@@ -121,7 +121,7 @@ class Driver:
         base: The hardware.
         fallback: Who drives when the cloud does not.
         limits: The supervisor's.
-        needs: The arbiter's; what a session says about the service replaces round trip and loss.
+        needs: The arbiter's, and the robot's own; what a session says about the service only tightens them.
         now: Monotonic seconds.
         observer: See `Observer`.
         clocks: Both clocks as `skytether.robot.stall.clocks` reads them, looked at right before each velocity is
@@ -149,7 +149,7 @@ class Driver:
         self._watching = fallback if isinstance(fallback, Watching) else None
         self._limits = limits
         self._observer = observer
-        self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
+        self._own_needs = self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
         self._command_timeout_s = needs.command_timeout_s
         self._patience = Patience(None, needs.command_timeout_s, limits.period_s)
         self._notices = Notices(_log)
@@ -178,9 +178,9 @@ class Driver:
         return self._choice.source
 
     def hold_to(self, terms: Terms) -> None:
-        """Take over what the service's manifest says of the link and of its commands."""
+        """Take over what the service's manifest says of the link and of its commands, where it is stricter."""
         self._patience = Patience(terms.period_s, self._command_timeout_s, self._limits.period_s)
-        self._needs = replace(self._needs, max_rtt_s=terms.max_rtt_s, max_loss=terms.max_loss, max_late=terms.max_late)
+        self._needs = service_manager.tighten(self._own_needs, terms)
 
     def tick(self, now: float, boot: float | None = None) -> None:
         """One turn of the loop: exactly one velocity is written. Never raises.

@@ -10,8 +10,8 @@ Pure: time is an argument.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, replace
+from math import inf, isfinite
 
 from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
@@ -62,6 +62,23 @@ def terms(needs: ServiceNeeds, topics: Sequence[TopicSpec], command_topic: str) 
         max_late=MOST_LATE if needs.max_loss is None else needs.max_loss,
         period_s=None if period is None else period / 1000,
     )
+
+
+def tighten(own: Needs, terms: Terms) -> Needs:
+    """What the link must be like: the robot's own needs, and the service's where they are stricter.
+
+    The terms come from the orchestrator, and whatever it answers widens nothing. A number that is none is no need.
+    """
+    return replace(
+        own,
+        max_rtt_s=_least(own.max_rtt_s, terms.max_rtt_s),
+        max_loss=_least(own.max_loss, terms.max_loss),
+        max_late=_least(own.max_late, terms.max_late) or 0.0,
+    )
+
+
+def _least(*given: float | None) -> float | None:
+    return min((number for number in given if number is not None and isfinite(number)), default=None)
 
 
 class Patience:
@@ -181,14 +198,12 @@ def explain(reason: Reason, needs: Needs, link: Link, quality: Quality, now: flo
         case Reason.DISCONNECTED:
             return "the bridge has no session"
         case Reason.RTT:
-            return f"round trip {link.rtt * 1000:.0f} ms, the service bears {(needs.max_rtt_s or inf) * 1000:.0f} ms"
+            return f"round trip {link.rtt * 1000:.0f} ms, {(needs.max_rtt_s or inf) * 1000:.0f} ms at most"
         case Reason.LOSS:
             bears = 1.0 if needs.max_loss is None else needs.max_loss
-            return f"{link.loss:.0%} of {quality.lossy_topic or 'a topic'} lost, the service bears {bears:.0%}"
+            return f"{link.loss:.0%} of {quality.lossy_topic or 'a topic'} lost, {bears:.0%} at most"
         case Reason.LATE:
-            return (
-                f"{link.late:.0%} of {quality.late_topic or 'a topic'} too late, the service bears {needs.max_late:.0%}"
-            )
+            return f"{link.late:.0%} of {quality.late_topic or 'a topic'} too late, {needs.max_late:.0%} at most"
         case Reason.CLOCK:
             known = f"known to {link.clock_error * 1000:.0f} ms" if link.clock_error < inf else "not known"
             return f"the service's clock is {known}, needed is {needs.max_clock_error_s * 1000:.0f} ms"
