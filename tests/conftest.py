@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import secrets
@@ -32,6 +33,7 @@ TOGETHER = (
     "bridge/test_mtu.py",
     "cli/test_completion.py",
     "cli/test_doctor.py",
+    "cli/test_never_wait.py",
     "cli/test_relay.py",
     "cli/test_resources.py",
     "contracts/",
@@ -104,6 +106,20 @@ def require(name: str, reason: str) -> NoReturn:
     if name in promised:
         pytest.fail(f"'{name}' is listed in SKYTETHER_REQUIRE, but {reason}", pytrace=False)
     pytest.skip(reason)
+
+
+@pytest.fixture
+def full_pipe() -> Iterator[int]:
+    """The end to write to of a pipe that is full, and that nobody reads."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    yield writer
+    os.close(reader)
+    os.close(writer)
 
 
 @pytest.fixture(scope="session")

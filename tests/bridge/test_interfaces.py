@@ -58,7 +58,7 @@ def test_the_watcher_tells_changes_only(monkeypatch):
             done.set()
         return one if found is None else found
 
-    watcher = Watcher(look, told.append, one)
+    watcher = Watcher(look, lambda found: told.append(found) or found, one)
     assert done.wait(5)
     watcher.close()
     assert told == [other, one]
@@ -103,6 +103,38 @@ def test_networks_that_come_and_go_are_followed(ends, wait_for, monkeypatch):
     wait_for(lambda: [p.path for p in robot.stats().paths] == [2])
     assert robot.publish("force", b"still here")
     service.graph.wait_messages(1)
+
+
+def test_a_name_server_that_never_answers_keeps_no_path_waiting(ends, wait_for, monkeypatch):
+    """A network comes whose peer has a name of its own: what is under way on the others goes on."""
+    present = {"lo": ["127.0.0.1"]}
+    monkeypatch.setattr(interfaces, "POLL_INTERVAL", 0.01)
+    monkeypatch.setattr("skytether.bridge.endpoint.addresses", lambda _family: dict(present))
+    asked, dead = threading.Event(), threading.Event()
+    real = socket.getaddrinfo
+
+    def ask(name, *arguments, **more):
+        if name == "service.example":
+            if more.get("flags", 0) & socket.AI_NUMERICHOST:
+                raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+            asked.set()
+            dead.wait(60)
+            name = "127.0.0.1"
+        return real(name, *arguments, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", ask)
+    service = ends.start(Role.SERVICE)
+    paths = (LocalPath("127.0.0.1"), LocalPath("eth7", 1, ("service.example", service.address[1])))
+    robot = ends.start(Role.ROBOT, peer=service.address, paths=paths)
+    robot.graph.wait_connected()
+    present["eth7"] = ["127.0.0.3"]
+    assert asked.wait(30)
+    for i in range(20):
+        assert robot.publish("force", b"%d" % i)
+        service.graph.wait_messages(i + 1)
+    assert [p.path for p in robot.stats().paths] == [1]
+    dead.set()
+    wait_for(lambda: [p.path for p in robot.stats().paths] == [1, 2])
 
 
 def test_without_any_network_the_first_socket_serves(ends):

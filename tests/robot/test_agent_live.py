@@ -1,5 +1,6 @@
 """The agent with real bridges on loopback, in real time; the service's end is a thread that sends commands."""
 
+import socket
 import threading
 import time
 
@@ -106,3 +107,40 @@ def test_the_cloud_drives_and_silence_hands_over_within_300_ms_and_back(base, or
         assert report.fallback_transitions == {"start": 1, "recovered": 2, "no_command": 1}
         assert {topic.topic for topic in report.topics} == {"force", "cmd_vel"}
     assert base.velocity == (0.0, 0.0)
+
+
+def test_a_name_server_that_never_answers_delays_no_hand_over(base, orchestrator, service, monkeypatch):
+    """The service is said to have moved to a host that has to be asked for; the name server is dead meanwhile."""
+    host, port = service.bridge.address
+    there = Session(id=ID, key=KEY, host=host, port=port, topics=TOPICS, needs=Needs(max_rtt_ms=600, max_loss=0.2))
+    elsewhere = there.model_copy(update={"host": "service.example"})
+    asked, dead = threading.Event(), threading.Event()
+    real = socket.getaddrinfo
+
+    def ask(name, *arguments, **more):
+        if name == "service.example" and not more.get("flags", 0) & socket.AI_NUMERICHOST:
+            asked.set()
+            dead.wait(60)
+        return real(name, *arguments, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", ask)
+    config = AgentConfig(
+        robot="walker", url="", token="", service="x", fallback="admittance", bind=("127.0.0.1", 0), renew_s=0.2
+    )
+    orchestrator.session = there
+    with Agent(config, base, client=orchestrator) as agent:
+        wait_for(lambda: agent.source is Source.CLOUD)
+        orchestrator.session = elsewhere
+        assert asked.wait(30)
+        service.sending.clear()
+        silent = time.monotonic()
+        wait_for(lambda: agent.source is Source.FALLBACK)
+        assert agent.status().driver.transitions[-1].at - silent < 0.3
+        service.sending.set()
+        wait_for(lambda: agent.source is Source.CLOUD)
+        wait_for(lambda: "service.example: the name server does not answer" in agent.status().trouble)
+        begin, renewals = time.monotonic(), sum(name == "renew" for name, _ in orchestrator.calls)
+        wait_for(lambda: sum(name == "renew" for name, _ in orchestrator.calls) > renewals + 2, 30)
+        assert time.monotonic() - begin < 15, "the lease is kept"
+        wait_for(lambda: agent.source is Source.CLOUD)
+        dead.set()

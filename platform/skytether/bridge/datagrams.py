@@ -126,14 +126,21 @@ class DatagramSocket:
         """Give the port back."""
         self._socket.close()
 
-    def resolve(self, host: str, port: int) -> Address:
+    def resolve(self, host: str, port: int, numeric: bool = False) -> Address:
         """Find the address of a peer that this socket can send to. May ask the name service, so it may block.
+
+        Args:
+            host: Name or address.
+            port: UDP port.
+            numeric: Take addresses only, and ask nobody.
 
         Raises:
             OSError: There is none of this socket's family.
         """
         family = self._socket.family
         flags = socket.AI_V4MAPPED if family == socket.AF_INET6 else 0
+        if numeric:
+            flags |= socket.AI_NUMERICHOST
         # typeshed allows for address families other than IP
         return socket.getaddrinfo(host, port, family=family, type=socket.SOCK_DGRAM, flags=flags)[0][4]  # type: ignore[return-value]
 

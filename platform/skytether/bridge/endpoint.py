@@ -29,7 +29,7 @@ from .calls import CallFailedError, Calls, Handler
 from .datagrams import Address, DatagramSocket
 from .driver import Driver
 from .interfaces import LocalPath, Network, Wanted, Watcher, addresses, select
-from .paths import LocalPaths
+from .paths import LocalPaths, PeerNames, UsablePath
 from .port import Port
 from .spec import SessionSpec
 
@@ -150,8 +150,9 @@ class Bridge:
             self._loop = _new_loop(self._socket)
             undo.callback(self._loop.close)
             self._driver = Driver(session, self._socket, self._port, self._calls, self._loop)
-            self._paths = LocalPaths(self._driver, self._socket.resolve)
-            networks = self._look() if self._wanted else {}
+            self._paths = LocalPaths(self._driver)
+            self._names = PeerNames(self._socket.resolve)
+            networks = self._names.known(self._look() if self._wanted else {})
             # Before the port is told: what it publishes from then on waits for the thread, and is not refused.
             self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
             undo.callback(setattr, self, "_thread", None)
@@ -161,7 +162,7 @@ class Bridge:
         self._loop.call_soon(self._paths.use, networks)
         self._thread.start()
         if self._wanted:
-            self._watcher = Watcher(self._look, lambda found: self._soon(lambda: self._paths.use(found)), networks)
+            self._watcher = Watcher(self._look, self._networks_changed, networks)
 
     def publish(self, topic: str, payload: bytes | memoryview) -> bool:
         if topic not in self._sends:
@@ -286,6 +287,16 @@ class Bridge:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+    def _networks_changed(self, found: dict[Network, LocalPath]) -> dict[Network, UsablePath]:
+        """In the watcher's thread: what can be used at once is, the rest when the name server has answered."""
+        usable = self._names.known(found)
+        self._soon(lambda: self._paths.use(usable))
+        if len(usable) == len(found):
+            return usable
+        named = self._names.ask(found)
+        self._soon(lambda: self._paths.use(named))
+        return named
 
     # --- in the bridge's thread ------------------------------------------------------------------------------------
 

@@ -16,6 +16,8 @@ import psutil
 
 POLL_INTERVAL = 1.0
 """Seconds until a change is noticed. A path that is cut is left sooner, by its missing answers."""
+_END_S = 0.5
+"""For a watch that is to end."""
 NOT_NETWORKS = ("lo", "docker", "br-", "veth", "virbr", "cni", "flannel", "cali", "lxc", "podman")
 """Beginnings of the names of interfaces that lead nowhere but into this machine."""
 COSTS = (("wl", 10), ("ww", 20), ("ppp", 20), ("usb", 20))
@@ -113,32 +115,32 @@ class Watcher:
 
     Args:
         look: Asks the system.
-        changed: Called with all networks to use, whenever they are others than before.
+        changed: Called with all networks to use, whenever they are others than before; gives those that are now used.
+            It may wait for a name server.
         known: Those that are used already.
     """
 
     def __init__(
         self,
         look: Callable[[], dict[Network, LocalPath]],
-        changed: Callable[[dict[Network, LocalPath]], object],
-        known: dict[Network, LocalPath],
+        changed: Callable[[dict[Network, LocalPath]], Mapping[Network, object]],
+        known: Iterable[Network],
     ) -> None:
         """Start."""
         self._look = look
         self._changed = changed
-        self._known = known
+        self._known = set(known)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="networks", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread; one that waits for a name server is left behind."""
         self._closing.set()
-        self._thread.join()
+        self._thread.join(_END_S)
 
     def _run(self) -> None:
         while not self._closing.wait(POLL_INTERVAL):
             found = self._look()
-            if found != self._known:
-                self._known = found
-                self._changed(found)
+            if found.keys() != self._known:
+                self._known = set(self._changed(found))

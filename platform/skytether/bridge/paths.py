@@ -4,12 +4,65 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from .datagrams import Address, DatagramSocket
 from .driver import Driver
 from .interfaces import LocalPath, Network
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class UsablePath:
+    """A network to use.
+
+    Attributes:
+        path: As it was wanted.
+        peer: Address of the service's end as seen from this network; None: the same as from everywhere.
+    """
+
+    path: LocalPath
+    peer: Address | None
+
+
+class PeerNames:
+    """Addresses of the peers that networks have of their own. Not in the bridge's thread: a name server may not answer.
+
+    Args:
+        resolve: Finds the address of a peer; its last argument is whether it must not ask a name server.
+    """
+
+    def __init__(self, resolve: Callable[[str, int, bool], Address]) -> None:
+        """Know none yet."""
+        self._resolve = resolve
+        self._known: dict[tuple[str, int], Address] = {}
+        self._told: set[Network] = set()
+
+    def known(self, found: Mapping[Network, LocalPath]) -> dict[Network, UsablePath]:
+        """The networks that can be used at once; never waits."""
+        return self._usable(found, asking=False)
+
+    def ask(self, found: Mapping[Network, LocalPath]) -> dict[Network, UsablePath]:
+        """The networks that can be used; one whose peer has no address is named once. May wait for a name server."""
+        return self._usable(found, asking=True)
+
+    def _usable(self, found: Mapping[Network, LocalPath], *, asking: bool) -> dict[Network, UsablePath]:
+        usable = {}
+        for network, path in found.items():
+            if path.peer is None:
+                usable[network] = UsablePath(path, None)
+                continue
+            if path.peer not in self._known:
+                try:
+                    self._known[path.peer] = self._resolve(*path.peer, not asking)
+                except OSError as error:
+                    if asking and network not in self._told:
+                        self._told.add(network)
+                        _log.warning("Network %s %s cannot be used: %s", network.interface, network.address, error)
+                    continue
+            usable[network] = UsablePath(path, self._known[path.peer])
+        return usable
 
 
 class LocalPaths:
@@ -19,18 +72,16 @@ class LocalPaths:
 
     Args:
         driver: Of the session.
-        resolve: Finds the address of a peer.
     """
 
-    def __init__(self, driver: Driver, resolve: Callable[[str, int], Address]) -> None:
+    def __init__(self, driver: Driver) -> None:
         """Open nothing yet."""
         self._driver = driver
-        self._resolve = resolve
         self._open: dict[Network, tuple[int, LocalPath]] = {}
         self._next = 1
         self._first = True
 
-    def use(self, found: Mapping[Network, LocalPath]) -> None:
+    def use(self, found: Mapping[Network, UsablePath]) -> None:
         """Have a path for each of these, and none else."""
         for network in [n for n in self._open if n not in found]:
             path, _ = self._open.pop(network)
@@ -49,16 +100,16 @@ class LocalPaths:
             if local in (wanted.local, network.address, network.interface):
                 self._driver.set_cost(path, cost)
 
-    def _add(self, network: Network, wanted: LocalPath) -> None:
+    def _add(self, network: Network, usable: UsablePath) -> None:
+        wanted = usable.path
         try:
-            peer = None if wanted.peer is None else self._resolve(*wanted.peer)
             sock = DatagramSocket((network.address, 0), device=network.interface)
-        except OSError as error:  # gone again already, or a name service that cannot be reached
+        except OSError as error:  # gone again already
             _log.warning("Network %s %s cannot be used: %s", network.interface, network.address, error)
             return
         path, self._next = self._next, self._next % 255 + 1
         try:
-            self._driver.open_path(path, sock, wanted.cost, peer)
+            self._driver.open_path(path, sock, wanted.cost, usable.peer)
         except ValueError as error:  # the event loop takes no more descriptors
             _log.warning("Network %s %s cannot be used: %s", network.interface, network.address, error)
             sock.close()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .never_wait import never_wait
 from .output import console, fail
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ def run(
     from .config_file import ConfigError
     from .robot_config import load_config, load_token
 
+    if not check:
+        never_wait()  # a log that nobody reads must cost no robot anything
     try:
         settings = load_config(config)
         token = load_token(settings, config.parent)

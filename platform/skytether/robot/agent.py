@@ -1,7 +1,8 @@
 """The program on the robot: asks for a service, runs its end of the bridge, drives (Mello, thesis, figure 18(a)).
 
 Three threads that never wait for each other: the control loop at a fixed rate with absolute deadlines, the asker that
-speaks REST, and a watch on the bridge's counters. The bridge has its own. What is decided is decided in `driver`.
+speaks REST, and a watch on the bridge's counters. The bridge has its own, and so has the log. What is decided is
+decided in `driver`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from .command import Source
 from .driver import Base, Clocks, Driver, Observer
 from .graph_base import Graph
 from .link import Quality
+from .log_queue import log_queue
 from .notices import Notices
+from .resolver import Resolver
 from .service_manager import ServiceManager, Terms, terms
 from .session import Endpoint, LiveSession
 from .snapshot import AgentStatus, report
@@ -204,6 +207,7 @@ class Agent:
         self._left = ""
         """The one before; its instance may still be told of."""
         self._notices = Notices(_log)
+        self._resolver = Resolver()
         self._stats: SessionStats | None = None
         self._tally = Tally(uuid.uuid4().hex)
         self._trouble = ""
@@ -212,9 +216,13 @@ class Agent:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._server: StatusServer | None = None
+        self._logs = False
 
     def start(self) -> None:
-        """Start driving and asking; returns at once."""
+        """Start driving and asking; returns at once. Until `close` no line of the log is waited for (`log_queue`)."""
+        if not self._logs:
+            self._logs = True
+            log_queue.use()
         warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
         self._serve()
@@ -240,6 +248,9 @@ class Agent:
         self._asker.release()
         if self._own_client is not None:
             self._own_client.close()
+        if self._logs:
+            self._logs = False
+            log_queue.done()
 
     @property
     def status_port(self) -> int | None:
@@ -281,6 +292,7 @@ class Agent:
             rtt=self._driver.quality.rtt,
             loss=self._driver.quality.loss,
             overruns=self._overruns,
+            log_lines_dropped=log_queue.dropped,
             late=self._driver.quality.late,
             decision=self._tasks.decision if self._tasks else None,
             load=self._tasks.robot.load if self._tasks else nan,
@@ -428,6 +440,7 @@ class Agent:
             return
         peer = self._config.route(granted.host, granted.port)
         try:
+            peer = self._resolver.address(*peer)
             if opened is not None:
                 opened.session.move(peer)
                 return

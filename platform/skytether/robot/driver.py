@@ -9,7 +9,7 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isnan, nan
+from math import inf, isfinite, nan
 from typing import Protocol
 
 from skytether.control.admittance import STANDSTILL, Velocity
@@ -320,7 +320,7 @@ class Driver:
         held = self._supervised.held.get(Source.CLOUD)
         link = Link(
             connected=self.session is not None and self.session.connected,
-            command_at=None if held is None or isnan(held.received_at) else held.received_at,
+            command_at=held.received_at if held is not None and isfinite(held.received_at) else None,
             rtt=self.quality.rtt,
             loss=self.quality.loss,
             late=self.quality.late,

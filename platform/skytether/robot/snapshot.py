@@ -27,6 +27,7 @@ class AgentStatus:
         rtt: Round trip [s].
         loss: Share of messages lost over the last seconds.
         overruns: Ticks that started more than one period late.
+        log_lines_dropped: Lines of the log that nobody read in time.
         late: Share of messages that missed their lifespan over the last seconds.
         decision: The task manager's; None: there is none.
         load: Share of the robot's processors that is busy; NaN: not known.
@@ -42,6 +43,7 @@ class AgentStatus:
     rtt: float
     loss: float
     overruns: int
+    log_lines_dropped: int = 0
     late: float = nan
     decision: Decision | None = None
     load: float = nan

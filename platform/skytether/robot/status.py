@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from math import isfinite
+from socketserver import TCPServer
 from typing import Any
 
 from skytether.api import rest
@@ -80,6 +81,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
         "errors": dict(driver.errors),
         "overruns": status.overruns,
         "stalls": driver.stalls,
+        "log_lines_dropped": status.log_lines_dropped,
     }
 
 
@@ -109,7 +111,7 @@ class StatusServer:
         class Handler(_Handler):
             pages = answers
 
-        self._server = HTTPServer((_LOOPBACK, port), Handler)
+        self._server = _Server((_LOOPBACK, port), Handler)
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="status", daemon=True)
         self._thread.start()
@@ -119,6 +121,13 @@ class StatusServer:
         self._server.shutdown()
         self._thread.join(_PATIENCE_S)
         self._server.server_close()
+
+
+class _Server(HTTPServer):
+    def server_bind(self) -> None:
+        """Without the name of the address, for which HTTPServer asks a name server: nobody needs it."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = _LOOPBACK, self.server_address[1]
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -166,7 +166,7 @@ def begin_anew(state: Supervised, now: float) -> Supervised:
 
     The sequence is kept: a command that came before does not come again.
     """
-    held = {source: replace(command, received_at=nan) for source, command in state.held.items()}
+    held = {source: replace(command, received_at=-inf) for source, command in state.held.items()}
     return Supervised(held=held, since=now)
 
 
