@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.control.admittance import Velocity
-from skytether.lab.safety.checker import Demand, Told, Wheels, check
+from skytether.lab.safety.checker import Demand, Told, Wheels, check, tightest
 from skytether.robot.supervisor import Limits
 
 PERIOD = 0.02
@@ -41,7 +41,7 @@ def test_a_good_drive_has_no_violation():
     assert finding.violations == ()
     assert finding.velocity_max == pytest.approx(0.5)
     assert 0.9 < finding.acceleration_max < 2.0
-    assert finding.standstill_max_s == pytest.approx(0.24, abs=0.021)
+    assert finding.standstill == (pytest.approx(0.24, abs=0.021), 0.3)
 
 
 @given(st.lists(st.floats(-0.015, 0.0), min_size=200, max_size=200))
@@ -94,10 +94,10 @@ def test_standstill_that_is_late_or_never_comes():
     record = drive((0.5, 2.0), (0.0, 1.0))
     late = check(record, [Demand(1.7, 0.4, 2.9, "killed")], WHEELS)
     assert [violation.kind for violation in late.violations] == ["standstill"]
-    assert late.standstill_max_s == pytest.approx(0.54, abs=0.021)
+    assert late.standstill == (pytest.approx(0.54, abs=0.021), 0.4)
     never = check(drive((0.5, 3.0)), [Demand(1.0, 0.4, 3.0, "killed")], WHEELS)
     assert [violation.kind for violation in never.violations] == ["standstill"]
-    assert never.standstill_max_s == pytest.approx(2.0)
+    assert never.standstill == (pytest.approx(2.0), 0.4)
     assert kinds(record, Demand(2.0, 0.4, 2.9, "killed")) == []
 
 
@@ -105,7 +105,7 @@ def test_silence_is_a_standstill_after_a_while():
     record = drive((0.5, 1.0))
     finding = check(record, [Demand(0.95, 0.2, 2.0, "all killed")], WHEELS)
     assert finding.violations == ()
-    assert finding.standstill_max_s == pytest.approx(0.13, abs=0.011)
+    assert finding.standstill == (pytest.approx(0.13, abs=0.011), 0.2)
     assert kinds(record, Demand(0.95, 0.1, 2.0, "all killed")) == ["standstill"]
 
 
@@ -125,4 +125,10 @@ def test_a_robot_that_should_be_slow():
     record = drive((0.5, 1.0), (0.1, 1.0), (0.5, 1.0))
     assert kinds(record, Demand(1.0, 0.3, 2.0, "blind", speed=0.1)) == []
     assert kinds(record, Demand(1.0, 0.3, 3.0, "blind", speed=0.1)) == ["velocity"]
-    assert check(record, [Demand(1.0, 0.3, 2.0, "blind", speed=0.1)], WHEELS).standstill_max_s is None
+    assert check(record, [Demand(1.0, 0.3, 2.0, "blind", speed=0.1)], WHEELS).standstill is None
+
+
+def test_the_standstill_with_the_least_to_spare_is_told():
+    assert tightest([(0.3, 0.5), (0.25, 0.3), (0.1, 0.2)]) == (0.25, 0.3)
+    assert tightest([(0.3, 0.5), (0.7, 0.5)]) == (0.7, 0.5)
+    assert tightest([]) is None

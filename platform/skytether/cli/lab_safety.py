@@ -25,7 +25,6 @@ def safety(
 
     Guard, gate and agent are real; sensors and wheels are played. Ends with exit status 1 if a promise was broken.
     """
-    from skytether.lab.bench.pair import BenchError
     from skytether.lab.bench.safety import bench_safety, estimate, select
 
     try:
@@ -37,7 +36,7 @@ def safety(
     try:
         with console.status("starting ...") as line:
             rows = list(bench_safety(chosen, n, busy, line.update))
-    except (BenchError, OSError) as error:
+    except OSError as error:
         fail(str(error))
     if json:
         print_json([row.document() for row in rows])

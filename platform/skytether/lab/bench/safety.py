@@ -6,27 +6,23 @@ begins with a robot that drives, and ends with one that drives again.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from skytether.lab.safety import deaths, stops
+from skytether.lab.safety import deaths, hardware, starve, stops
 from skytether.lab.safety.attacks import Attack, Attacks
-from skytether.lab.safety.checker import Finding
+from skytether.lab.safety.checker import Finding, tightest
+from skytether.lab.safety.cores import busy_cores
 from skytether.lab.safety.robot import PlayedRobot, StagingError
 from skytether.lab.safety.stage import Stage
-
-from .pair import BenchError
+from skytether.robot.safety.client import GateError
 
 _SHOWN = 5
 """Violations of an attack that are told in words; the others are counted."""
-_BUSY_PER_CORE = 2
-_SPIN = "while True: pass"
 _START_S = 3.0
 
 Tell = Callable[[str], object]
@@ -43,8 +39,8 @@ class SafetyRow:
         velocity_max_m_s: Fastest that the wheels were told.
         acceleration_max_m_s2: Largest change of velocity by its time, a period of the loop added: that much a time may
             be off. Braking included.
-        standstill_max_s: Longest time from the attack to standstill; None: the attack demands none.
-        promised_s: What that may be, from the configuration.
+        standstill_max_s: Time from the attack to standstill, where the least was to spare; None: none is demanded.
+        promised_s: What it may be, from the configuration.
         what: The violations in words, the first few of them.
     """
 
@@ -67,6 +63,8 @@ def attacks() -> list[Attack]:
     known = Attacks()
     deaths.enter(known)
     stops.enter(known)
+    hardware.enter(known)
+    starve.enter(known)
     return known.all
 
 
@@ -100,8 +98,6 @@ def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lamb
         busy: Other programs take all cores meanwhile.
         tell: Told what goes on.
 
-    Raises:
-        BenchError: The robot cannot be made to drive at all.
     """
     with ExitStack() as undo:
         if busy:
@@ -111,23 +107,9 @@ def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lamb
             found = []
             for i in range(n):
                 tell(f"{attack.name}, {i + 1} of {n}")
-                found.append(_stage(attack, robots))
+                with ThreadPoolExecutor(1) as alone:  # what a thread mounts is gone with it, and with what it started
+                    found.append(alone.submit(_stage, attack, robots).result())
             yield _row(attack, found)
-
-
-@contextmanager
-def busy_cores() -> Iterator[None]:
-    """Programs that take every core, twice over."""
-    spinning = [
-        subprocess.Popen([sys.executable, "-c", _SPIN], stdin=subprocess.DEVNULL)
-        for _ in range(_BUSY_PER_CORE * (os.cpu_count() or 1))
-    ]
-    try:
-        yield
-    finally:
-        for process in spinning:
-            process.kill()
-            process.wait()
 
 
 class _Robots:
@@ -143,11 +125,13 @@ class _Robots:
     def __exit__(self, *_: object) -> None:
         self.end()
 
-    def get(self) -> PlayedRobot:
+    def get(self, attack: Attack) -> PlayedRobot:
         """One that drives, or will."""
+        if attack.robot is not None:
+            self.end()
         if self._robot is None:
             folder = Path(self._undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-")))
-            self._robot = self._undo.enter_context(PlayedRobot(folder))
+            self._robot = self._undo.enter_context((attack.robot or PlayedRobot)(folder))
         return self._robot
 
     def end(self) -> None:
@@ -156,40 +140,32 @@ class _Robots:
         self._undo.close()
 
 
-def _stage(attack: Attack, robots: _Robots) -> tuple[Finding, float | None]:
+def _stage(attack: Attack, robots: _Robots) -> Finding:
     """Stage an attack once: a robot that drives, the attack, and a robot that drives again."""
+    stage = Stage(robots.get(attack))
     try:
-        robot = robots.get()
-        robot.go()
-    except StagingError as error:
-        robots.end()
-        raise BenchError(f"the robot does not drive before {attack.name}: {error}") from error
-    stage = Stage(robot)
-    promised = attack.promised(stage.promised) if attack.promised else None
-    try:
+        stage.robot.go()
         attack.run(stage)
         if not attack.spoils:
-            robot.go()
-    except StagingError as error:
+            stage.robot.go()
+    except (StagingError, GateError, OSError) as error:
         stage.wrong("stuck", str(error).partition("\n")[0])
     finding = stage.finding()
     if attack.spoils or any(violation.kind == "stuck" for violation in finding.violations):
         robots.end()
-    return finding, promised
+    return finding
 
 
-def _row(attack: Attack, found: Sequence[tuple[Finding, float | None]]) -> SafetyRow:
-    findings = [finding for finding, _ in found]
+def _row(attack: Attack, findings: Sequence[Finding]) -> SafetyRow:
     violations = [violation for finding in findings for violation in finding.violations]
-    standstills = [f.standstill_max_s for f in findings if f.standstill_max_s is not None]
-    promised = found[0][1]
+    took, promised = tightest(f.standstill for f in findings if f.standstill is not None) or (None, None)
     return SafetyRow(
         attack=attack.name,
-        n=len(found),
+        n=len(findings),
         violations=len(violations),
         velocity_max_m_s=round(max(finding.velocity_max for finding in findings), 3),
         acceleration_max_m_s2=round(max(finding.acceleration_max for finding in findings), 3),
-        standstill_max_s=round(max(standstills), 3) if standstills and promised is not None else None,
+        standstill_max_s=round(took, 3) if took is not None else None,
         promised_s=round(promised, 3) if promised is not None else None,
         what=tuple(f"{violation.kind}: {violation.text}" for violation in violations[:_SHOWN]),
     )

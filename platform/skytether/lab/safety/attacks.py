@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 
-from .stage import Promised, Stage
+from .robot import PlayedRobot
+from .stage import Stage
+
+MakeRobot = Callable[[Path], AbstractContextManager[PlayedRobot]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,17 +21,17 @@ class Attack:
         name: On the command line and in the table.
         what: In words.
         run: Stages it once, with a robot that drives.
-        promised: Picks the time to standstill [s]; None: none is demanded.
         spoils: The robot is of no use for another attack.
         seconds: About how long it takes, for the estimate.
+        robot: Makes a robot of its own for it, in a folder; None: any will do.
     """
 
     name: str
     what: str
     run: Callable[[Stage], None]
-    promised: Callable[[Promised], float] | None
     spoils: bool
     seconds: float
+    robot: MakeRobot | None
 
 
 class Attacks:
@@ -40,10 +45,10 @@ class Attacks:
         name: str,
         what: str,
         run: Callable[[Stage], None],
-        promised: Callable[[Promised], float] | None,
         *,
         seconds: float,
         spoils: bool = False,
+        robot: MakeRobot | None = None,
     ) -> None:
         """Enter one."""
-        self.all.append(Attack(name, what, run, promised, spoils, seconds))
+        self.all.append(Attack(name, what, run, spoils or robot is not None, seconds, robot))

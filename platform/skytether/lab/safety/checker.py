@@ -97,13 +97,14 @@ class Finding:
         velocity_max: Fastest, forward or backward [m/s].
         acceleration_max: Largest change of the forward velocity by its time (`Wheels.jitter_s` added), speeding
             up or braking [m/s^2].
-        standstill_max_s: Longest time from the cause of a demand of standstill to the standstill; None: no demand.
+        standstill: Of the demand of standstill with the least time to spare: how long it took, and what was promised
+            [s]; None: there was none.
     """
 
     violations: tuple[Violation, ...]
     velocity_max: float
     acceleration_max: float
-    standstill_max_s: float | None
+    standstill: tuple[float, float] | None
 
 
 def check(record: Sequence[Told], demands: Iterable[Demand], wheels: Wheels) -> Finding:
@@ -120,7 +121,7 @@ def check(record: Sequence[Told], demands: Iterable[Demand], wheels: Wheels) -> 
     changes, acceleration = _changes(record, wheels)
     violations += changes
     motions = _motions(record, wheels)
-    standstill: float | None = None
+    standstills: list[tuple[float, float]] = []
     for demand in demands:
         if demand.speed > 0:
             violations += _slower(record, demand)
@@ -128,13 +129,18 @@ def check(record: Sequence[Told], demands: Iterable[Demand], wheels: Wheels) -> 
         found, took = _stands(motions, demand)
         violations += found
         if demand.within_s > 0:
-            standstill = max(took, standstill or 0.0)
+            standstills.append((took, demand.within_s))
     return Finding(
         violations=tuple(sorted(violations, key=lambda violation: violation.at)),
         velocity_max=max((abs(told.velocity.linear) for told in record), default=0.0),
         acceleration_max=acceleration,
-        standstill_max_s=standstill,
+        standstill=tightest(standstills),
     )
+
+
+def tightest(standstills: Iterable[tuple[float, float]]) -> tuple[float, float] | None:
+    """Of times to standstill, each with what was promised, the one with the least to spare; None: there is none."""
+    return max(standstills, key=lambda both: both[0] - both[1], default=None)
 
 
 def _is_finite(velocity: Velocity) -> bool:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable
-from contextlib import suppress
 from itertools import permutations
 
 from .attacks import Attacks
@@ -24,14 +22,12 @@ _GATE_STARTS_S = 0.5
 def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
     """Add them, for the processes that there are."""
     for role in roles:
-        attacks.add(f"{role}-killed", f"the {role} is killed", _killed(role), _alone(role), seconds=3)
+        attacks.add(f"{role}-killed", f"the {role} is killed", _killed(role), seconds=3)
         for seconds in _FREEZES_S:
-            long = seconds > 0.5
             attacks.add(
                 f"{role}-frozen-{seconds:g}",
                 f"the {role} is frozen for {seconds:g} s, and goes on",
                 _frozen(role, seconds),
-                _alone(role) if long else None,
                 seconds=seconds + 1.5,
             )
     for first, second in permutations(roles, 2):
@@ -39,7 +35,6 @@ def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
             f"{first}-{second}-killed",
             f"the {first} is killed, {1e3 * _NEXT_S:.0f} ms later the {second}",
             _both_killed(first, second),
-            _two(first, second),
             seconds=3.5,
         )
     for first, second in permutations(("gate", "guard")):
@@ -47,14 +42,12 @@ def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
             f"{first}-{second}-frozen",
             f"the {first} is frozen for 1 s, {1e3 * _NEXT_S:.0f} ms later the {second}; both go on in this order",
             _both_frozen(first, second),
-            _two(first, second),
             seconds=3,
         )
         attacks.add(
             f"{first}-frozen-{second}-killed",
             f"the {first} is frozen for 1 s, {1e3 * _NEXT_S:.0f} ms later the {second} is killed",
             _frozen_and_killed(first, second),
-            _two(first, second),
             seconds=4,
         )
     for name, number in (("terminated", signal.SIGTERM), ("hung-up", signal.SIGHUP)):
@@ -62,14 +55,12 @@ def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
             f"guard-{name}",
             f"the guard is told to end ({number.name})",
             _ended(number, everybody=False),
-            lambda promised: promised.stop,
             seconds=4,
         )
         attacks.add(
             f"all-{name}",
             f"guard, gate and agent are told to end at once ({number.name})",
             _ended(number, everybody=True),
-            lambda promised: promised.partner,
             seconds=4,
         )
 
@@ -105,7 +96,7 @@ def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
         else:
             pid = stage.robot.signal(role, signal.SIGSTOP)
             stage.sleep(seconds)
-        os.kill(pid, signal.SIGCONT)
+        stage.robot.kill(pid, signal.SIGCONT)
         stage.drives_on(f"the robot drives on after the {role} was frozen for {seconds:g} s")
 
     return run
@@ -117,8 +108,7 @@ def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were killed"):
             stage.robot.signal(first, signal.SIGKILL)
             stage.sleep(_NEXT_S)
-            with suppress(ProcessLookupError):  # it has ended by itself because of the first
-                os.kill(victim, signal.SIGKILL)
+            stage.robot.kill(victim)
             stage.sleep(_WATCH_S)
 
     return run
@@ -131,9 +121,9 @@ def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
             stage.sleep(_NEXT_S)
             other = stage.robot.signal(second, signal.SIGSTOP)
             stage.sleep(1.0 - _NEXT_S)
-        os.kill(one, signal.SIGCONT)
+        stage.robot.kill(one, signal.SIGCONT)
         stage.sleep(_NEXT_S)
-        os.kill(other, signal.SIGCONT)
+        stage.robot.kill(other, signal.SIGCONT)
         stage.drives_on(f"the robot drives on after {first} and {second} were frozen")
 
     return run
@@ -145,10 +135,9 @@ def _frozen_and_killed(first: str, second: str) -> Callable[[Stage], None]:
             victim = stage.robot.pid(second)
             frozen = stage.robot.signal(first, signal.SIGSTOP)
             stage.sleep(_NEXT_S)
-            os.kill(victim, signal.SIGKILL)
+            stage.robot.kill(victim)
             stage.sleep(1.0 - _NEXT_S)
-            with suppress(ProcessLookupError):
-                os.kill(frozen, signal.SIGCONT)
+            stage.robot.kill(frozen, signal.SIGCONT)
             stage.sleep(0.5)
 
     return run
@@ -161,7 +150,7 @@ def _ended(number: signal.Signals, everybody: bool) -> Callable[[Stage], None]:
         victims = [stage.robot.pid(role) for role in roles]
         with stage.stands(promised, f"{', '.join(roles)}: told to end"):
             for victim in victims:
-                os.kill(victim, number)
+                stage.robot.kill(victim, number)
             stage.sleep(_WATCH_S)
         stage.expect(lambda: not stage.robot.alive("guard"), "the guard ends when it is told to")
         stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends with its guard")

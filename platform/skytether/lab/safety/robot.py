@@ -10,7 +10,6 @@ import json
 import math
 import os
 import secrets
-import signal
 import socket
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from signal import SIGKILL
 from types import TracebackType
 from typing import Any
 
@@ -56,7 +56,8 @@ _FRESH_S = 0.2
 """What the wheels were told longer ago than this is no motion."""
 _ASK_AGAIN_S = 0.2
 _MARK = "SKYTETHER_PLAYED_ROBOT"
-_RAYS = 360
+RAYS = 360
+"""Of the laser, all around."""
 
 Scan = Callable[[], LaserScan | None]
 
@@ -158,10 +159,19 @@ class PlayedRobot:
     def signal(self, role: str, number: int) -> int:
         """Send a signal to a process; its id."""
         pid = self.pid(role)
-        os.kill(pid, number)
-        if number == signal.SIGKILL:
-            self._reap(pid)
+        self.kill(pid, number)
         return pid
+
+    def helper(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start another program beside them, which ends with the robot at the latest."""
+        return self._start(module, *arguments)
+
+    def kill(self, pid: int, number: int = SIGKILL) -> None:
+        """Send a signal to a process that may have ended by itself meanwhile."""
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
+        if number == SIGKILL:
+            self._reap(pid)
 
     def alive(self, role: str) -> bool:
         """Whether a process is there."""
@@ -234,6 +244,17 @@ class PlayedRobot:
 
         self.wait(drives, "the robot drives")
 
+    def another_gate(self, dead: int) -> None:
+        """Wait until a gate answers that is not the one with this process id."""
+
+        def answers() -> bool:
+            try:
+                return int(self.ask("status")["pid"]) != dead
+            except GateError:
+                return False
+
+        self.wait(answers, "another gate answers", _ASK_AGAIN_S)
+
     # What happens
 
     @property
@@ -263,7 +284,7 @@ class PlayedRobot:
 
     def clear(self) -> LaserScan:
         """Nothing within 5 m, all around."""
-        return scan_of(np.full(_RAYS, 5.0, dtype=np.float32))
+        return scan_of(np.full(RAYS, 5.0, dtype=np.float32))
 
     def send(self, topic: str, message: Message) -> None:
         """A reading of the hardware, once."""
@@ -316,20 +337,20 @@ class PlayedRobot:
                 own.wait()
 
 
-def scan_of(ranges: np.ndarray[Any, np.dtype[np.float32]], first: float = -math.pi, step: float = 0.0) -> LaserScan:
-    """A laser's message, taken now.
+def scan_of(ranges: np.ndarray[Any, np.dtype[np.float32]], step: float = 0.0, age_s: float = 0.0) -> LaserScan:
+    """A laser's message; its first ray looks backward.
 
     Args:
         ranges: [m].
-        first: Angle of the first [rad].
-        step: From one to the next [rad]; 0: all around.
+        step: From one ray to the next [rad]; 0: one degree.
+        age_s: How long ago it was taken [s].
     """
-    wall = time.time_ns()
+    wall = time.time_ns() - int(age_s * 1e9)
     return LaserScan(
         header=Header(stamp=Time(wall // 10**9, wall % 10**9), frame_id="laser"),
-        angle_min=first,
-        angle_max=first + (len(ranges) - 1) * (step or 2 * math.pi / _RAYS),
-        angle_increment=step or 2 * math.pi / _RAYS,
+        angle_min=-math.pi,
+        angle_max=-math.pi + (len(ranges) - 1) * (step or 2 * math.pi / RAYS),
+        angle_increment=step or 2 * math.pi / RAYS,
         range_min=0.05,
         range_max=8.0,
         ranges=ranges,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from skytether.robot.safety.client import GateError
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.supervisor import Limits
 
@@ -93,6 +94,15 @@ class Stage:
         yield
         self._demands.append(Demand(since, within_s, now(), why, speed))
 
+    def stop(self, reason: str = "an attack") -> bool:
+        """Emergency stop; whether it was acknowledged."""
+        try:
+            self.robot.stop(reason)
+        except (GateError, UnicodeError) as error:
+            self.wrong("stop", f"the stop is not acknowledged: {error}")
+            return False
+        return True
+
     def wrong(self, kind: str, text: str) -> None:
         """Something else that was promised is not so."""
         self._seen.append(Violation(now(), kind, text))
@@ -127,5 +137,5 @@ class Stage:
             violations=(*found.violations, *self._seen),
             velocity_max=found.velocity_max,
             acceleration_max=found.acceleration_max,
-            standstill_max_s=found.standstill_max_s,
+            standstill=found.standstill,
         )

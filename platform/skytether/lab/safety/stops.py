@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from skytether.robot.safety.client import GateError
-
 from .attacks import Attacks
-from .stage import Promised, Stage
+from .stage import Stage
 
 _WATCH_S = 1.5
 """After a new gate has started, the robot has to stand for so long."""
@@ -30,23 +27,21 @@ _IDLE_S = 0.5
 
 def enter(attacks: Attacks) -> None:
     """Add them."""
-    stop: Callable[[Promised], float] = lambda promised: promised.stop  # noqa: E731
     for role in ("gate", "guard", "agent"):
         attacks.add(
             f"stop-{role}-killed",
             f"a stop is acknowledged, and the {role} killed at once",
             _then_killed(role),
-            stop,
             seconds=5,
         )
-    attacks.add("stop-both-killed", "a stop is acknowledged, guard and gate are killed", _both, stop, seconds=6)
-    attacks.add("stop-gate-frozen", "a stop while the gate is frozen", _frozen, stop, seconds=5)
-    attacks.add("stop-idle-clients", f"a stop while {_IDLE_CLIENTS} clients say nothing", _idle, stop, seconds=2)
+    attacks.add("stop-both-killed", "a stop is acknowledged, guard and gate are killed", _both, seconds=6)
+    attacks.add("stop-gate-frozen", "a stop while the gate is frozen", _frozen, seconds=5)
+    attacks.add("stop-idle-clients", f"a stop while {_IDLE_CLIENTS} clients say nothing", _idle, seconds=2)
     for name, reason in _REASONS.items():
-        attacks.add(f"stop-reason-{name}", f"a stop whose reason is {_named(reason)}", _reason(reason), stop, seconds=4)
-    attacks.add("button-gate-frozen", "the button is pressed while the gate is frozen", _button, None, seconds=4)
-    attacks.add("button-silent", "the button falls silent", _silent, lambda promised: promised.button, seconds=2)
-    attacks.add("reset-alone", "a reset, and nobody says start", _reset, stop, seconds=3)
+        attacks.add(f"stop-reason-{name}", f"a stop whose reason is {_named(reason)}", _reason(reason), seconds=4)
+    attacks.add("button-gate-frozen", "the button is pressed while the gate is frozen", _button, seconds=4)
+    attacks.add("button-silent", "the button falls silent", _silent, seconds=2)
+    attacks.add("reset-alone", "a reset, and nobody says start", _reset, seconds=3)
 
 
 def _named(reason: str) -> str:
@@ -54,36 +49,14 @@ def _named(reason: str) -> str:
     return shown if len(shown) < 30 else f"{len(reason)} letters"
 
 
-def _stop(stage: Stage, reason: str = "an attack") -> bool:
-    """Whether a stop is acknowledged."""
-    try:
-        stage.robot.stop(reason)
-    except (GateError, UnicodeError) as error:
-        stage.wrong("stop", f"the stop is not acknowledged: {error}")
-        return False
-    return True
-
-
-def _gate_again(stage: Stage, dead: int) -> None:
-    """Wait until another gate drives, or would."""
-
-    def answers() -> bool:
-        try:
-            return int(stage.robot.ask("status")["pid"]) != dead
-        except GateError:
-            return False
-
-    stage.robot.wait(answers, "another gate answers")
-
-
 def _then_killed(role: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
         victim = stage.robot.pid(role)
         with stage.stands(stage.promised.stop, f"a stop was acknowledged, and the {role} killed"):
-            acknowledged = _stop(stage)
-            os.kill(victim, signal.SIGKILL)
+            acknowledged = stage.stop()
+            stage.robot.kill(victim)
             if role == "gate":
-                _gate_again(stage, victim)
+                stage.robot.another_gate(victim)
             stage.sleep(_WATCH_S)
             if acknowledged:
                 _is_stopped(stage, role)
@@ -100,12 +73,12 @@ def _is_stopped(stage: Stage, role: str) -> None:
 def _both(stage: Stage) -> None:
     gate, guard = stage.robot.pid("gate"), stage.robot.pid("guard")
     with stage.stands(stage.promised.stop, "a stop was acknowledged; gate and guard were killed and started again"):
-        _stop(stage)
-        os.kill(guard, signal.SIGKILL)
-        os.kill(gate, signal.SIGKILL)
+        stage.stop()
+        stage.robot.kill(guard)
+        stage.robot.kill(gate)
         stage.robot.guard.wait()
         stage.robot.start_guard()
-        _gate_again(stage, gate)
+        stage.robot.another_gate(gate)
         stage.sleep(_WATCH_S)
         _is_stopped(stage, "gate")
 
@@ -114,8 +87,8 @@ def _frozen(stage: Stage) -> None:
     gate = stage.robot.signal("gate", signal.SIGSTOP)
     stage.sleep(0.02)
     with stage.stands(stage.promised.stop, "a stop while the gate was frozen"):
-        acknowledged = _stop(stage)
-        os.kill(gate, signal.SIGCONT)
+        acknowledged = stage.stop()
+        stage.robot.kill(gate, signal.SIGCONT)
         stage.sleep(_WATCH_S)
         if acknowledged:
             _is_stopped(stage, "gate")
@@ -132,7 +105,7 @@ def _idle(stage: Stage) -> None:
                 except OSError:  # a socket of datagrams, or its queue is full
                     break
         with stage.stands(stage.promised.stop, f"a stop beside {_IDLE_CLIENTS} idle clients"):
-            stage.timed(lambda: _stop(stage), "the stop is acknowledged", _IDLE_S)
+            stage.timed(stage.stop, "the stop is acknowledged", _IDLE_S)
             stage.sleep(0.7)
 
 
@@ -140,10 +113,10 @@ def _reason(reason: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
         gate = stage.robot.pid("gate")
         with stage.stands(stage.promised.stop, f"a stop whose reason is {_named(reason)}"):
-            acknowledged = _stop(stage, reason)
+            acknowledged = stage.stop(reason)
             stage.sleep(0.3)
-            os.kill(gate, signal.SIGKILL)
-            _gate_again(stage, gate)
+            stage.robot.kill(gate)
+            stage.robot.another_gate(gate)
             stage.sleep(0.7)
             if acknowledged:
                 _is_stopped(stage, "gate")
@@ -157,7 +130,7 @@ def _button(stage: Stage) -> None:
     with stage.stands(0.0, "the button was pressed while the gate was frozen and the robot stood"):
         stage.robot.pressed = True
         stage.sleep(0.3)
-        os.kill(gate, signal.SIGCONT)
+        stage.robot.kill(gate, signal.SIGCONT)
         stage.sleep(1.0)
     stage.robot.pressed = False
 
@@ -171,7 +144,7 @@ def _silent(stage: Stage) -> None:
 
 def _reset(stage: Stage) -> None:
     with stage.stands(stage.promised.stop, "a stop, then a reset, and nobody says start"):
-        _stop(stage)
+        stage.stop()
         stage.sleep(0.5)
         stage.robot.reset()
         stage.sleep(1.0)
