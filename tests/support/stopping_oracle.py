@@ -25,7 +25,7 @@ from skytether.robot.safety.protocol import Beat
 from skytether.robot.safety.rules import Gate
 from skytether.robot.safety.sources import Hand
 
-_RAYS = 1440
+_RAYS = 7200
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""
 

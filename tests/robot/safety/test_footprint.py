@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.robot.safety.footprint import Footprint, circle, polygon
+from skytether.robot.safety.footprint import Footprint, Outlines, circle, polygon
 
 SQUARE = polygon([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 
@@ -128,3 +128,15 @@ def _seen(point: tuple[float, float], linear: float, angular: float, t: float) -
     turn, radius = angular * t, linear / angular
     x, y = point[0] - radius * math.sin(turn), point[1] - radius * (1 - math.cos(turn))
     return x * math.cos(turn) + y * math.sin(turn), -x * math.sin(turn) + y * math.cos(turn)
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=3, max_size=8), st.floats(0.0, 0.5))
+def test_more_room_around_is_the_same_as_so_much_room_at_once(corners, more):
+    try:
+        outline = polygon(corners)
+    except ValueError:
+        return
+    grown, whole = Outlines(outline, 0.1)(more), outline.inflated(0.1 + more)
+    # Neither has a corner outside of the other.
+    assert grown.outside(whole.vertices).max() <= 1e-6
+    assert whole.outside(grown.vertices).max() <= 1e-6

@@ -1,15 +1,21 @@
 """The stopping way, against an oracle that turns gate, guard and wheels step by step."""
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from stopping_oracle import Drive, Faults, deepest
 
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.stopping import Stages, fastest, stopping_way
 
 WALL = np.array([(6.0, y) for y in np.linspace(-1.0, 1.0, 201)])
-TOLERANCE = 0.04
-"""Of the motion since the scan [m]."""
+TOLERANCE = 0.002
+"""Of the laser's rays, and of the steps that the oracle takes [m]."""
+CURVES = 0.01
+"""The same on curves, where a ray's width counts more and things hide behind each other [m]."""
 
 
 def config(rate_hz: float = 50.0, guard_s: float | None = None, **limits: float) -> SafetyConfig:
@@ -39,17 +45,83 @@ def test_the_reaction_is_the_sum_of_its_stages():
     assert stages.reaction_s(age=0.3) == pytest.approx(0.61)
 
 
-@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 500.0])
+@pytest.mark.parametrize(
+    "rate", [10.0, 20.0, 50.0, *(pytest.param(rate, marks=pytest.mark.slow) for rate in (100.0, 500.0))]
+)
 def test_at_every_rate_the_robot_stands_before_a_wall(rate):
     # At 10 Hz a turn counted for half its time: 0.83 m/s^2 instead of 2.0, and 0.25 m of the wall in the footprint.
     drive = Drive(config(rate), WALL, lambda _: (1.5, 0.0), Faults(jitter=0.2))
-    assert deepest(drive, 12.0) <= TOLERANCE
+    assert deepest(drive, 9.0) <= TOLERANCE
     assert drive.fastest == pytest.approx(1.5)
     assert drive.pose.x > 5.4  # it goes as near as it may: 0.35 and 0.1 before the wall, and a little
 
 
 @pytest.mark.parametrize("rate", [10.0, 50.0])
 def test_a_gate_that_dies_on_the_way_to_a_wall_is_no_worse(rate):
-    for dies in np.arange(3.0, 5.5, 0.25):
+    for dies in (3.5, 4.0, 4.5):
         drive = Drive(config(rate), WALL, lambda _: (1.5, 0.0), Faults(gate_dies_at=dies))
-        assert deepest(drive, 8.0) <= TOLERANCE
+        assert deepest(drive, dies + 2.0) <= TOLERANCE
+
+
+@st.composite
+def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
+    """A robot of any kind, among things of any kind, with an agent that wants anything."""
+    rate = draw(st.sampled_from(rates))
+    acceleration, turning = draw(st.floats(0.3, 3.0)), draw(st.floats(0.5, 4.0))
+    front, back, side = draw(st.floats(0.1, 0.6)), draw(st.floats(0.1, 0.6)), draw(st.floats(0.1, 0.4))
+    robot = SafetyConfig.model_validate(
+        {
+            "footprint": {"polygon": [[front, side], [front, -side], [-back, -side], [-back, side]]},
+            "limits": {
+                "linear_max": draw(st.floats(0.1, 2.0)),
+                "linear_min": draw(st.floats(-1.0, 0.0)),
+                "angular_max": draw(st.floats(0.1, 2.0)),
+                "linear_acceleration": acceleration,
+                "angular_acceleration": turning,
+                "linear_braking": acceleration * draw(st.floats(1.0, 2.0)),
+                "angular_braking": turning * draw(st.floats(1.0, 2.0)),
+                "max_gap_s": 1.0,
+            },
+            "zones": {
+                "stop_m": draw(st.floats(0.05, 0.2)),
+                "sensing_s": draw(st.floats(0.001, 0.15)),
+                "reaction_s": draw(st.floats(0.01, 0.3)),
+            },
+            "sensors": {"scan": {"range_max": 50.0, "max_gap_deg": 360}},
+            "rate_hz": rate,
+            "guard_s": draw(st.floats(max(0.02, 2 / rate), 0.25)),
+            "sockets": {},
+        }
+    )
+    things = draw(st.lists(st.tuples(st.floats(0.0, 3.0), st.floats(-math.pi, math.pi)), min_size=1, max_size=12))
+    outline = robot.rules().footprint.inflated(robot.zones.stop_m)
+    found = [(outline.radius + 0.02 + far) * np.array([math.cos(a), math.sin(a)]) for far, a in things]
+    legs = draw(st.lists(st.tuples(st.floats(-1.2, 2.2), st.floats(-2.2, 2.2)), min_size=1, max_size=6))
+    faults = Faults(
+        jitter=draw(st.floats(0.0, 0.9)),
+        gate_hangs=draw(st.sampled_from([0.0, 0.0, 0.02, 0.2])),
+        gate_dies_at=draw(st.sampled_from([math.inf, math.inf, draw(st.floats(0.5, 6.0))])),
+        late_wheels=draw(st.booleans()),
+        scan_s=draw(st.floats(0.02, 0.25)),
+    )
+    seconds = 1.2 * len(legs)
+    drive = Drive(robot, np.array(found), lambda at: legs[min(int(at / 1.2), len(legs) - 1)], faults, draw(seeds))
+    return drive, seconds
+
+
+seeds = st.integers(0, 2**32)
+
+
+@settings(max_examples=5)
+@given(drives(10.0, 15.0, 30.0))
+def test_whatever_the_robot_and_whatever_it_wants_nothing_gets_into_the_stop_zone(drawn):
+    drive, seconds = drawn
+    assert deepest(drive, seconds) <= CURVES
+
+
+@pytest.mark.slow
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@given(drives(10.0, 15.0, 30.0, 50.0, 100.0, 250.0, 500.0))
+def test_over_many_configurations_nothing_gets_into_the_stop_zone(drawn):
+    drive, seconds = drawn
+    assert deepest(drive, seconds) <= CURVES

@@ -131,6 +131,28 @@ class Footprint:
         return first / abs(angular)
 
 
+class Outlines:
+    """An outline with more and less room around it, quickly: which corner of it meets which of the room's never changes.
+
+    Args:
+        outline: Without room.
+        margin: The least room [m], above 0.
+    """
+
+    def __init__(self, outline: Footprint, margin: float) -> None:
+        self.least = outline.inflated(margin)
+        self._margin = margin
+        octagon = np.array(_regular(1.0, 8))
+        sums = outline.vertices[:, None, :] + margin * octagon[None, :, :]
+        found = [int(np.hypot(*(sums.reshape(-1, 2) - v).T).argmin()) for v in self.least.vertices]
+        self._corners = outline.vertices[[i // 8 for i in found]]
+        self._ways = octagon[[i % 8 for i in found]]
+
+    def __call__(self, more: float) -> Footprint:
+        """With so much more room [m], 0 or above."""
+        return self.least if more <= 0 else Footprint(self._corners + (self._margin + more) * self._ways)
+
+
 def polygon(corners: Iterable[tuple[float, float]]) -> Footprint:
     """The convex hull of corners in any order [m] (Andrew's monotone chain).
 

@@ -18,6 +18,7 @@ from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import kinematics as reach
+from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
 from .sensing import Action, RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
@@ -88,6 +89,8 @@ class Gate:
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.limits.clock_tolerance_s)
+        oldest = max((sensor.max_age_s for sensor in rules.sensors.values()), default=0.0)
+        self._reckoning = DeadReckoning(oldest + rules.stages.reaction_s(0.0))
         self._zone = Zone.CLEAR
         self._events: dict[str, str] = {}
 
@@ -147,6 +150,7 @@ class Gate:
             troubles["internal"] = f"the gate itself failed and stops the robot: {type(error).__name__}: {error}"
             decision = Decision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
             self._supervised = Supervised(held=self._supervised.held)
+        self._reckoning.tell(decision.velocity, now)
         self.counts.update(troubles.keys())
         return decision
 
@@ -176,9 +180,10 @@ class Gate:
 
     def _see(self, wanted: Velocity, now: float, troubles: dict[str, str]) -> Allowed:
         """What zones and sensors leave of a velocity."""
-        scene = self._sensing.see(now)
+        scene = self._sensing.see(now, self._reckoning)
         troubles.update(scene.troubles)
-        allowed = self._zones.allow(wanted, scene.points, scene.age, self._zone)
+        varied = self._reckoning.varied(now - scene.age - self._rules.stages.late_s, wanted)
+        allowed = self._zones.allow(wanted, scene.points, varied, self._zone)
         most = {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[scene.action]
         return replace(allowed, share=min(allowed.share, most))
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from skytether.messages import LaserScan, Message, Range
 
+from .dead_reckoning import DeadReckoning
 from .footprint import Points
 from .ranges import UNKNOWN, Mount, Sight, View, view
 
@@ -50,7 +51,7 @@ class Scene:
     """What all sensors together see now.
 
     Attributes:
-        points: Everything that is seen, base frame, shape (n, 2) [m].
+        points: Everything that is seen, where it lies by now, base frame, shape (n, 2) [m].
         age: Of the oldest of them [s].
         action: What the poorest sensor asks for.
         troubles: Of each sensor that does not see: a sentence for people, by kind.
@@ -96,8 +97,8 @@ class Sensing:
         self._seen[topic] = _Seen(view(self._sensors[topic].mount, message), now, stamp)
         return None
 
-    def see(self, now: float) -> Scene:
-        """What is seen now."""
+    def see(self, now: float, reckoning: DeadReckoning) -> Scene:
+        """What is seen now, moved by how the robot moved since."""
         points, oldest, worst = [_NOTHING], 0.0, Action.FREE
         troubles = {}
         for topic, sensor in self._sensors.items():
@@ -107,7 +108,7 @@ class Sensing:
                 sight, detail = Sight.STALE, "nothing has come yet" if seen is None else f"silent for {age:.1f} s"
             else:
                 sight, detail = seen.view.sight, seen.view.detail
-                points.append(seen.view.points)
+                points.append(reckoning.now_at(seen.view.points, seen.at, now))
                 oldest = max(oldest, age)
             action = _action(sensor, sight)
             if action is not Action.FREE:

@@ -9,9 +9,11 @@ gets into the stop zone. All metres are those of the outermost corner. A curve i
 together, so v / a is the time 1 / d in which the slower axis can brake (`kinematics.slowdown`).
 
 **Why.** The scan shows the world as it was ``sensing + age`` before the decision: ``sensing`` from the light to the
-message at the gate, ``age`` since then. In that time the robot went on as it was told before; where that was
-another curve, the points are moved by it (`zones`). What is decided now is felt by the wheels up to ``wheels``
-later: the drives' own dead time and the way there. It is then held for ``hold`` at most before the brakes are told:
+message at the gate, ``age`` since then. While the message aged the robot went on as it was told, on other curves
+maybe: the points are moved by that (`dead_reckoning`), and the inequality is then asked for with no age. The wheels
+feel what is decided now up to ``wheels`` later (the drives' dead time). ``sensing + writer + wheels`` is the time by
+which their real motion may lag behind the told one; the stop zone is larger by what that can make wrong. What is
+decided is then held for ``hold`` at most before the brakes are told:
 
 - The gate's next turn may brake, a period later; but the gate may hang. The guard brakes once the gate's word is
   older than ``guard``, and looks every ``period``, up to a period late: ``hold = guard + 2 period + writer``. A
@@ -62,6 +64,11 @@ class Stages:
     def longest_step_s(self) -> float:
         """The longest turn that counts in full; what lasts longer is a stall, in which the guard brakes."""
         return self.guard_s
+
+    @property
+    def late_s(self) -> float:
+        """How much later than told the wheels may have moved, counted from a scan's message: nobody knows how much."""
+        return self.sensing_s + self.writer_s + self.wheels_s
 
     def reaction_s(self, age: float) -> float:
         """From the light to the first effect of the brakes, at worst, with a message of this age at the gate."""

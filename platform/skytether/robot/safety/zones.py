@@ -23,8 +23,9 @@ from skytether.control.admittance import Velocity
 from skytether.control.numbers import check_positive
 from skytether.robot.supervisor import Limits
 
-from . import kinematics as reach
-from .footprint import Footprint, Points
+from . import kinematics
+from .dead_reckoning import Variation
+from .footprint import Footprint, Outlines, Points
 from .stopping import Stages, fastest
 
 _TOUCH_M = 0.005
@@ -96,7 +97,8 @@ class Zones:
     """
 
     def __init__(self, params: ZoneParams, footprint: Footprint, limits: Limits, stages: Stages) -> None:
-        self.stop = footprint.inflated(params.stop_m)
+        self._outlines = Outlines(footprint, params.stop_m)
+        self.stop = self._outlines.least
         self._params = params
         self._stages = stages
         self._limits = limits
@@ -111,24 +113,26 @@ class Zones:
         speed = self.speed(velocity)
         return min(1.0, self._params.slow_speed / speed) if speed else 1.0
 
-    def allow(self, velocity: Velocity, points: Points, age: float, before: Zone) -> Allowed:
+    def allow(self, velocity: Velocity, points: Points, varied: Variation, before: Zone) -> Allowed:
         """Say what share of a velocity is safe.
 
         Args:
             velocity: What is wanted.
-            points: Everything that is seen, shape (n, 2), base frame [m].
-            age: Of the oldest of them [s].
+            points: Everything that is seen, where it lies by now, shape (n, 2), base frame [m].
+            varied: How the velocity changed since the oldest of them was seen, and a little before.
             before: What was said the time before.
         """
         speed = self.speed(velocity)
         if speed == 0:
             return Allowed(1.0, before, inf)
         p = self._params
-        reaction = self._stages.reaction_s(age)
-        slowdown = reach.slowdown(self._limits, velocity)
+        reaction = self._stages.reaction_s(0.0)
+        slowdown = kinematics.slowdown(self._limits, velocity)
         horizon = max(p.slow_m + p.hysteresis_m, speed * (reaction + 0.5 / slowdown))
-        near = points[np.hypot(points[:, 0], points[:, 1]) <= self.stop.radius + horizon]
-        contact = self.stop.time_to_contact(near, velocity.linear, velocity.angular)
+        reach = self.stop.radius + horizon
+        unsure = self._stages.late_s * (varied.linear + varied.angular * reach)
+        near = points[np.hypot(points[:, 0], points[:, 1]) <= reach + unsure]
+        contact = self._outlines(unsure).time_to_contact(near, velocity.linear, velocity.angular)
         way = contact * speed
         zone = self._zone(way, before)
         if zone is Zone.STOP:
