@@ -28,6 +28,8 @@ from skytether.robot.safety.sources import Hand
 _RAYS = 7200
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""
+_NEUTRAL_S = 0.5
+"""An agent wants a standstill first; the times of a drive count from the end of it."""
 
 
 @dataclass
@@ -108,7 +110,7 @@ class Drive:
 
     def run(self, seconds: float) -> Iterator[None]:
         """Drive; yields after every piece of the way."""
-        end = self.now + seconds
+        end = self.now + _NEUTRAL_S + seconds
         for kind in ("measure", "gate", "guard"):
             self._at(self.now, kind)
         while self._events[0][0] < end:
@@ -164,10 +166,11 @@ class Drive:
         self.gate.sense("scan", scan, self.now)
 
     def _do_gate(self, _: None) -> None:
-        if self.now - 100.0 > self.faults.gate_dies_at:
+        at = self.now - 100.0 - _NEUTRAL_S
+        if at > self.faults.gate_dies_at:
             return
         self._commands += 1
-        linear, angular = self.wanted(self.now - 100.0)
+        linear, angular = self.wanted(at) if at > 0 else (0.0, 0.0)
         self.gate.command(Command(Hand.AGENT, linear, angular, 1, self._commands, self.now, 0.0, self.now), self.now)
         decision = self.gate.step(self.now)
         self._at(self.now + 1e-4, "beat", Beat(self.now, decision.velocity))

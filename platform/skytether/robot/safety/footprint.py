@@ -132,7 +132,7 @@ class Footprint:
 
 
 class Outlines:
-    """An outline with more and less room around it, quickly: which corner of it meets which of the room's never changes.
+    """An outline with more and less room around it, quickly: which corners meet never changes.
 
     Args:
         outline: Without room.
