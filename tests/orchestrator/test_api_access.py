@@ -34,7 +34,7 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("GET", f"{API}/sites", None, (401, 401, 200, 200, 200)),
     ("POST", f"{API}/sites", {"name": "tmp", "tier": "robot", "runtime": "fake"}, (401, 401, 403, 403, 201)),
     ("GET", f"{API}/sites/lab", None, (401, 401, 200, 200, 200)),
-    ("GET", f"{API}/sites/lab/probe", None, (204, 204, 204, 204, 204)),
+    ("GET", f"{API}/sites/lab/probe", None, (401, 401, 204, 204, 204)),
     ("DELETE", f"{API}/sites/tmp", None, (401, 401, 403, 403, 204)),
     ("GET", f"{API}/robots", None, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/robots", {"name": "tmp"}, (401, 401, 403, 403, 201)),

@@ -9,8 +9,8 @@ import skytether
 
 from . import problems
 from .core import Orchestrator
-from .crowd import Crowd
 from .logs import Audit
+from .reception import Reception
 from .routers import catalog, health, instances, robots, sites, tokens
 from .routers.deps import plain_request
 
@@ -28,9 +28,9 @@ def create_app(core: Orchestrator) -> FastAPI:
         telemetry=_NO_TELEMETRY,
     )
     app.state.core = core
-    problems.install(app, core.settings.limits.body_bytes)
+    problems.install(app)
     for router in (catalog.router, sites.router, instances.router, robots.router, tokens.router, health.router):
         app.include_router(router)
-    app.add_middleware(Crowd, most=core.settings.limits.requests_at_once)
+    app.add_middleware(Reception, doorman=core, limits=core.settings.limits, strain=core.strain)
     app.add_middleware(Audit)
     return app

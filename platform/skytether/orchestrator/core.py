@@ -13,7 +13,7 @@ from sqlalchemy.exc import ProgrammingError, SQLAlchemyError
 from skytether.api.report_metrics import Owner
 from skytether.api.rest import Report, ScrapeTargets
 
-from .access import Access
+from .access import Access, Principal
 from .accounts import Account
 from .catalogue import Catalogue
 from .db import GONE
@@ -32,6 +32,7 @@ from .security import SecretFileError, Secrets
 from .settings import Settings
 from .sites import Sites, load_runtime
 from .store import Store
+from .strain import Strain
 from .throttle import Throttle
 
 log = logging.getLogger(__name__)
@@ -77,6 +78,7 @@ class Orchestrator:
         )
         self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
+        self.strain = Strain()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
         self.reconciler = Reconciler(
@@ -89,6 +91,7 @@ class Orchestrator:
             clock,
             self._wake_placer,
             lambda: self.leadership.leads,
+            strain=self.strain,
         )
         self.sites = Sites(
             settings.state_dir / "sites",
@@ -127,6 +130,20 @@ class Orchestrator:
     def _wake_placer(self) -> None:
         self.placer.wake()
 
+    def authenticate(self, token: str | None, address: str) -> Principal:
+        """Find out who asks: see ``Access.authenticate``.
+
+        Raises:
+            OutdatedError: This orchestrator has no say any more.
+        """
+        if self.refuses:
+            raise OutdatedError
+        return self.access.authenticate(token, address)
+
+    def recent(self, token: str | None) -> Principal | None:
+        """Who showed this token in the last seconds: see ``Access.recent``. Does not wait."""
+        return None if self.refuses else self.access.recent(token)
+
     def start(self) -> None:
         """Bring the database up to date, load the catalogue, adopt what runs, begin to reconcile.
 
@@ -149,6 +166,9 @@ class Orchestrator:
     def _write_reports(self) -> float:
         with contextlib.suppress(*GONE):  # they are kept until it answers
             self.reports.write()
+            # Another one leads, and cannot know whom this one refused.
+            if not self.leadership.leads and (self.strain.felt() or self.strain.owed()):
+                self.store.extend_leases(self._clock())
         return PERIOD
 
     def _elect(self) -> float:

@@ -10,9 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from sqlalchemy.exc import ProgrammingError
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skytether.api.faults import faults
 from skytether.api.rest import Problem
@@ -56,27 +54,11 @@ _HTTP = {
     400: ("Invalid input", "the body is no JSON that can be read"),
     404: ("Not found", "there is nothing at {path}: see /docs for what there is"),
     405: ("Method not allowed", "{method} is not possible on {path}: see /docs for what is"),
-    413: ("Too large", "the request is larger than {limit} bytes"),
 }
 
 
-def install(app: FastAPI, body_limit: int) -> None:
+def install(app: FastAPI) -> None:
     """Make an app answer every error with a problem document."""
-
-    async def on_domain(request: Request, error: Exception) -> JSONResponse:
-        status, title = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
-        errors: list[dict[str, Any]] = []
-        if isinstance(error, InvalidError):
-            errors = [_fault(fault) for fault in error.faults]
-        elif isinstance(error, NoSiteError):
-            errors = list(error.refused)
-        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
-        if isinstance(error, TooManyError):
-            headers["Retry-After"] = str(error.retry_after)
-        if isinstance(error, OutdatedError):
-            # A proxy's next request is to find another orchestrator, not this connection.
-            headers |= {"Retry-After": _RETRY_AFTER, "Connection": "close"}
-        return answer(request, status, title, str(error), errors, headers)
 
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, RequestValidationError):
@@ -89,60 +71,47 @@ def install(app: FastAPI, body_limit: int) -> None:
         if not isinstance(error, HTTPException):
             raise error
         title, text = _HTTP.get(error.status_code, ("Error", "{detail}"))
-        values = {"path": request.url.path, "method": request.method, "limit": body_limit, "detail": error.detail}
+        values = {"path": request.url.path, "method": request.method, "detail": error.detail}
         return answer(request, error.status_code, title, text.format(**values), headers=dict(error.headers or {}))
 
-    async def on_database(request: Request, error: Exception) -> JSONResponse:
-        log.warning("%s %s: the database does not answer (%s)", request.method, request.url.path, type(error).__name__)
-        text = "the orchestrator's database does not answer: try again in a few seconds"
-        return answer(request, 503, "Not possible now", text, headers={"Retry-After": _RETRY_AFTER})
-
-    async def on_schema(request: Request, error: Exception) -> JSONResponse:
-        core: Orchestrator = request.app.state.core
-        outdated = await asyncio.to_thread(core.look_outdated)
-        return await (on_domain(request, OutdatedError()) if outdated else on_anything(request, error))
-
-    async def on_anything(request: Request, error: Exception) -> JSONResponse:
-        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return answer(request, 500, "Internal error", "a mistake in the orchestrator: its log has the details")
-
-    app.add_exception_handler(DomainError, on_domain)
+    app.add_exception_handler(DomainError, answer_to)
     app.add_exception_handler(RequestValidationError, on_invalid)
     app.add_exception_handler(HTTPException, on_http)
-    app.add_exception_handler(ProgrammingError, on_schema)
-    for gone in GONE:
-        app.add_exception_handler(gone, on_database)
-    app.add_exception_handler(Exception, on_anything)
-    app.add_middleware(BodyLimit, limit=body_limit)
+    for kind in (ProgrammingError, *GONE, Exception):
+        app.add_exception_handler(kind, answer_to)
 
 
-class BodyLimit:
-    """ASGI middleware: a request that is too large, or says that it is, is answered with 413 once somebody reads it."""
+async def answer_to(request: Request, error: Exception) -> JSONResponse:
+    """What is said of an error that a request met, wherever it was raised."""
+    if isinstance(error, DomainError):
+        return _on_domain(request, error)
+    if isinstance(error, GONE):
+        name = type(error).__name__
+        log.warning("%s %s: the database does not answer (%s)", request.method, request.url.path, name)
+        text = "the orchestrator's database does not answer: try again in a few seconds"
+        return answer(request, 503, "Not possible now", text, headers={"Retry-After": _RETRY_AFTER})
+    if isinstance(error, ProgrammingError):
+        core: Orchestrator = request.app.state.core
+        if await asyncio.to_thread(core.look_outdated):
+            return _on_domain(request, OutdatedError())
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return answer(request, 500, "Internal error", "a mistake in the orchestrator: its log has the details")
 
-    def __init__(self, app: ASGIApp, limit: int) -> None:
-        """``limit`` in bytes."""
-        self._app = app
-        self._limit = limit
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        if scope["type"] != "http":
-            return await self._app(scope, receive, send)
-        declared = Headers(scope=scope).get("content-length", "")
-        largest = int(declared) if declared.isdigit() else 0
-        received = 0
-
-        async def limited() -> Message:
-            nonlocal received
-            if largest > self._limit:
-                raise HTTPException(413)
-            message = await receive()
-            received += len(message.get("body", b""))
-            if received > self._limit:
-                raise HTTPException(413)
-            return message
-
-        return await self._app(scope, limited, send)
+def _on_domain(request: Request, error: DomainError) -> JSONResponse:
+    status, title = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    errors: list[dict[str, Any]] = []
+    if isinstance(error, InvalidError):
+        errors = [_fault(fault) for fault in error.faults]
+    elif isinstance(error, NoSiteError):
+        errors = list(error.refused)
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
+    if isinstance(error, TooManyError):
+        headers["Retry-After"] = str(error.retry_after)
+    if isinstance(error, OutdatedError):
+        # A proxy's next request is to find another orchestrator, not this connection.
+        headers |= {"Retry-After": _RETRY_AFTER, "Connection": "close"}
+    return answer(request, status, title, str(error), errors, headers)
 
 
 def answer(

@@ -27,6 +27,7 @@ from .security import Secrets
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
 from .store import Store
+from .strain import Strain
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +65,13 @@ class Reconciler:
         wake_placer: Callable[[], None],
         leads: Callable[[], bool] = lambda: True,
         steady: Callable[[], float] = time.monotonic,
+        strain: Strain | None = None,
     ) -> None:
-        """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets."""
+        """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
+
+        While ``strain`` is felt no lease runs out.
+        """
+        self._strain = strain or Strain(steady)
         self._store = store
         self._secrets = secrets
         self._metrics = metrics
@@ -152,6 +158,10 @@ class Reconciler:
                 self._times_set += 1
                 text = "the clock was set %s by %.0f s, or this machine slept: leases and waits count anew"
                 log.warning(text, "forward" if by > 0 else "back", abs(by))
+            if self._strain.owed() and self._leads():
+                self._store.extend_leases(now)
+                self._times_set += 1
+                log.warning("robots could not renew for a while, for want of room or of time: leases count anew")
             self._set_clock.accept(now, steady)
             return now
 
@@ -440,6 +450,8 @@ class Reconciler:
         }
 
     def _expire(self, record: Record) -> None:
+        if self._strain.felt():
+            return  # its robot may have been refused, or wait for its answer
         now = self._clock()
         reason = f"the robot did not renew its lease of {record.lease_s:g} s"
         to = State.STOPPED if record.site is None else State.STOPPING

@@ -6,6 +6,7 @@ import fcntl
 import gc
 import ipaddress
 import logging
+import math
 import os
 import resource
 import signal
@@ -14,12 +15,13 @@ import ssl
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 from alembic.util import CommandError
 from sqlalchemy.exc import DatabaseError, SQLAlchemyError
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from skytether.bridge.echo import EchoServer
 
@@ -27,6 +29,7 @@ from . import logs
 from .app import create_app
 from .core import Orchestrator
 from .db import AddressError
+from .door import Door, GuardedProtocol
 from .errors import InvalidError, OutdatedError
 from .security import SecretFileError
 from .settings import Settings
@@ -41,10 +44,6 @@ _FILES = 16_384
 _SWITCH = 0.001
 """Seconds that one thread computes while others wait. An answer passes through several threads, each of which waits so
 long for a reconcile pass that is under way: at Python's own 5 ms that adds up."""
-
-
-_MOST_AROUND = 1 << 18
-"""Bytes of a request that are not its body: line, headers, what frames chunks."""
 
 
 class StartError(Exception):
@@ -144,26 +143,6 @@ def _start(core: Orchestrator) -> None:
         raise StartError(f"the database cannot be used: {text}") from error
 
 
-class _Protocol(HttpToolsProtocol):
-    """Uvicorn's, which has no bound on what is not body: a single client could fill the memory and hold up all."""
-
-    _around = 0
-
-    def data_received(self, data: bytes) -> None:
-        self._around += len(data)
-        super().data_received(data)
-        if self._around > _MOST_AROUND and not self.transport.is_closing():
-            self.send_400_response("The request's headers are too large.")
-
-    def on_message_begin(self) -> None:
-        self._around = 0
-        super().on_message_begin()
-
-    def on_body(self, body: bytes) -> None:
-        self._around -= len(body)
-        super().on_body(body)
-
-
 class _Server(uvicorn.Server):
     """Uvicorn that tells its address, and lets event streams end when it is to end."""
 
@@ -171,7 +150,9 @@ class _Server(uvicorn.Server):
         tls = core.settings.tls
         config = uvicorn.Config(
             create_app(core),
-            http=_Protocol,
+            http=GuardedProtocol,
+            ws="none",
+            timeout_keep_alive=math.ceil(core.settings.limits.idle_s),
             log_config=None,
             access_log=False,
             lifespan="off",
@@ -197,7 +178,14 @@ class _Server(uvicorn.Server):
         self._url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
+        """Uvicorn's own would take every connection; the rest of it is for lifespans and several workers."""
+        limits, proxies = self._core.settings.limits, self._core.settings.proxies
+        most = min(limits.connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+        make = partial(GuardedProtocol, config=self.config, server_state=self.server_state, app_state={})
+        strain = self._core.strain
+        doors: list[Any] = [Door(one, make, self.config.ssl, limits, most, proxies, strain) for one in sockets or ()]
+        self.servers = doors
+        self.started = True
         draft = self._address.with_name("address.new")
         draft.write_text(f"{self._url}\n")
         draft.replace(self._address)
@@ -210,6 +198,7 @@ class _Server(uvicorn.Server):
         self._address.unlink(missing_ok=True)
         self._core.broker.close()
         await super().shutdown(sockets)
+        self._core.strain.rest()
 
 
 def _loopback(host: str) -> bool:

@@ -81,12 +81,32 @@ class Limits(Group):
 
     body_bytes: Count = 1 << 20
     """Largest request."""
+    robot_body_bytes: Count = 1 << 18
+    """Largest request of a robot: its parameters, or all that it reports with a renewal."""
+    connections: Count = 4096
+    """Open connections of all, at most half of the files that the system lets the program have. Of more, one that has
+    shown no good token gives way, the oldest first."""
+    connections_per_address: Count = 512
+    """The same of one address (IPv6: one /64 network), as of all robots behind one router; not of `proxies`."""
+    connections_per_robot: Count = 32
+    """Of more, the one that was quiet for the longest is closed."""
+    head_s: Seconds = 10.0
+    """By when a connection has sent the head of a request, TLS included."""
+    body_s: Seconds = 30.0
+    """By when the body has followed: 1 MB at 300 kbit/s."""
+    idle_s: Seconds = 30.0
+    """How long a connection is kept for another request."""
     requests_per_s: Annotated[float, Field(gt=0, le=1e6)] = 100.0
     """Requests that one robot's token may make, and one address without a valid token; an operator's are free."""
     requests_burst: Count = 200
     """Requests at once above which that rate holds."""
     requests_at_once: Count = 256
-    """Requests under way, of all callers; whoever comes beyond gets 503 and `Retry-After`, as robots take it."""
+    """Requests under way, of all callers; whoever comes beyond gets 503 and `Retry-After`, as robots take it. A request
+    counts once all of it has arrived from somebody with a good token."""
+    requests_for_renewals: Annotated[int, Field(ge=0, le=1_000_000_000)] = 64
+    """How many of these are for robots that renew a lease."""
+    robot_requests_at_once: Count = 16
+    """Requests of one robot under way, those included of which the body has not arrived."""
     ended_age: Seconds = 86_400.0
     """How long ended instances, their logs and idempotency keys are kept."""
     ended_count: Count = 200

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 from fastapi import Depends, Request, Response
@@ -13,7 +14,8 @@ from skytether.api.rest import Problem, Scope
 
 from ..access import Principal
 from ..core import Orchestrator
-from ..errors import InvalidError, NotFoundError, OutdatedError
+from ..errors import InvalidError, NotFoundError
+from ..reception import PRINCIPAL, RUN
 
 PREFIX = "/api/v1"
 _LARGE = 16_384
@@ -33,23 +35,33 @@ Core = Annotated[Orchestrator, Depends(_core)]
 Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 
 
-def authenticated(core: Core, request: Request, token: Bearer) -> Principal:
-    """Whoever sends this token.
+async def _asker(request: Request, _: Bearer) -> Principal:
+    known: Principal = getattr(request.state, PRINCIPAL)  # the reception has asked
+    return known
+
+
+def authenticated(core: Orchestrator, request: Request, token: HTTPAuthorizationCredentials | None) -> Principal:
+    """Whoever sends this token, where not everybody needs one.
 
     Raises:
         OutdatedError: This orchestrator has no say any more.
         UnauthenticatedError: Nobody we know.
         TooManyError: They asked too often.
     """
-    if core.refuses:
-        raise OutdatedError
     address = request.client.host if request.client else ""
-    principal = core.access.authenticate(token.credentials if token else None, address)
+    principal = core.authenticate(token.credentials if token else None, address)
     request.state.who = principal.owner  # for the audit
     return principal
 
 
-Authenticated = Annotated[Principal, Depends(authenticated)]
+async def _thread(request: Request) -> Callable[..., Awaitable[Any]]:
+    run: Callable[..., Awaitable[Any]] = getattr(request.state, RUN)
+    return run
+
+
+InThread = Annotated[Callable[..., Awaitable[Any]], Depends(_thread)]
+"""Runs a function beside the loop, in a thread for this kind of request."""
+Authenticated = Annotated[Principal, Depends(_asker)]
 """Anybody with a token, whatever it may."""
 
 

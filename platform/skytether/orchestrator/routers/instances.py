@@ -19,7 +19,7 @@ from ..instances import utc
 from ..records import Record
 from ..runtimes.base import LogStream
 from ..store import EventRow
-from .deps import PREFIX, Actor, Bearer, Caller, Core, authenticated, made, says
+from .deps import PREFIX, Actor, Caller, Core, InThread, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
 
@@ -68,11 +68,10 @@ def delete(core: Core, caller: Actor, instance: str) -> None:
 
 
 @router.post("/{instance}/renew", responses=says(404, 422))
-def renew(core: Core, request: Request, token: Bearer, instance: str, asked: Renew) -> Instance:
+async def renew(core: Core, caller: Actor, run: InThread, instance: str, asked: Renew) -> Instance:
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
-    caller = authenticated(core, request, token)
-    caller.require_scope("instances", robots=True)
-    return core.instances.renew(caller, instance, asked)
+    renewed: Instance = await run(core.instances.renew, caller, instance, asked)
+    return renewed
 
 
 @router.post("/{instance}/migrate", status_code=201, responses=says(403, 404, 409, 422))

@@ -63,8 +63,8 @@ def delete_site(core: Core, _: SitesOperator, site: str) -> None:
     core.metrics.forget_site(site)
 
 
-@router.get("/{site}/probe", status_code=204, responses=says(404))
-async def probe(core: Core, site: str) -> Response:
-    """Answer at once, so that a robot can measure its round trip: no token, no database, no thread, no body."""
+@router.get("/{site}/probe", status_code=204, responses=says(401, 403, 404))
+async def probe(core: Core, _: Caller, site: str) -> Response:
+    """Answer at once, so that a robot can measure its round trip: no database after the first, no thread, no body."""
     core.sites.get(site)
     return Response(status_code=204)

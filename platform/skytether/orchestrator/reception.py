@@ -1,0 +1,268 @@
+"""What becomes of a request before anybody serves it: who asks, all of what they ask, and a place to be served at.
+
+In this order, so that each step is paid by who was let through the one before: nothing is read of a body before its
+sender has shown a good token, and no place is taken before all of it is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any, Protocol
+
+from anyio import CapacityLimiter, to_thread
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from .access import Principal
+from .door import GUEST
+from .errors import TooManyError
+from .problems import answer, answer_to
+from .settings import Limits
+from .strain import Strain
+
+PRINCIPAL = "principal"
+"""Key of who asks in the state of a request."""
+RUN = "run"
+"""Key of what runs a function beside the loop, in a thread for this kind of request."""
+_FREE = "/healthz"
+"""Costs nothing; and to take an orchestrator for dead because it has much to do would help nobody."""
+_API = "/api/"
+_RENEWAL = re.compile(r"/api/v1/instances/[^/]+/renew")
+_PROBE = re.compile(r"/api/v1/sites/[^/]+/probe")
+_MOST_HELD = 64 << 20
+"""Bytes of bodies, of all that have not arrived whole: as many as 64 manifests of the largest size."""
+_STRANGERS = 16
+"""Requests under way of those who need no token: they must not take the places of those who have one."""
+_THREADS = 8
+"""For what a renewal needs of the database: others' requests are not waited for."""
+
+
+class Doorman(Protocol):
+    """Knows tokens."""
+
+    def authenticate(self, token: str | None, address: str) -> Principal:
+        """Who owns a token that came from an address; may wait, for a database.
+
+        Raises:
+            DomainError: Nobody, or too often.
+        """
+
+    def recent(self, token: str | None) -> Principal | None:
+        """The same at once, if it was known a moment ago. Raises as ``authenticate``."""
+
+
+class Reception:
+    """ASGI middleware: authenticates, reads the body, and bounds the requests under way."""
+
+    def __init__(self, app: ASGIApp, doorman: Doorman, limits: Limits, strain: Strain) -> None:
+        """``strain`` is told when a robot that wants to renew is refused."""
+        self._app = app
+        self._doorman = doorman
+        self._limits = limits
+        self._strain = strain
+        self._places, self._strangers = _Places(), _Places()
+        self._of: Counter[str] = Counter()
+        self._held = 0
+        self._limiter: CapacityLimiter | None = None
+        """Made where there is a loop."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+        if scope["path"] == _FREE:
+            return await self._app(scope, _nothing, send)
+        if not scope["path"].startswith(_API):  # whatever is open to all, or asks for a token itself, takes no body
+            return await self._place(scope, b"", send, renewal=False)
+        renewal = scope["method"] == "POST" and _RENEWAL.fullmatch(scope["path"]) is not None
+        try:
+            caller = await self._who(scope, renewal)
+        except Exception as error:  # whatever it is, there is one place that knows what to say of it
+            return await (await answer_to(Request(scope), error))(scope, receive, send)
+        with self._one_of(caller) as allowed:
+            if not allowed:
+                most = self._limits.robot_requests_at_once
+                text = f"{most} requests of this robot are under way: wait for their answers"
+                return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
+            return await self._serve(scope, receive, send, caller, renewal)
+
+    async def _who(self, scope: Scope, renewal: bool) -> Principal:
+        kind, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
+        given = token.strip() if kind.lower() == "bearer" else None
+        address = scope["client"][0] if scope.get("client") else ""
+        run: Callable[..., Awaitable[Principal]] = self._for_renewals if renewal else to_thread.run_sync
+        # What measures a round trip is not to measure a database too.
+        probe = self._doorman.recent(given) if _PROBE.fullmatch(scope["path"]) else None
+        caller = probe or await run(self._doorman.authenticate, given, address)
+        scope.setdefault("state", {}).update({PRINCIPAL: caller, "who": caller.owner, RUN: run})
+        if (guest := scope.get(GUEST)) is not None:
+            guest.know(caller.owner)
+        return caller
+
+    async def _for_renewals(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Runs a function in one of the few threads that renewals have for themselves."""
+        if self._limiter is None:
+            self._limiter = CapacityLimiter(_THREADS)
+        return await to_thread.run_sync(function, *arguments, limiter=self._limiter)
+
+    @contextlib.contextmanager
+    def _one_of(self, caller: Principal) -> Iterator[bool]:
+        """Whether a robot may have another one under way."""
+        if caller.robot is None:
+            yield True
+            return
+        if self._of[caller.owner] >= self._limits.robot_requests_at_once:
+            yield False
+            return
+        self._of[caller.owner] += 1
+        try:
+            yield True
+        finally:
+            self._of[caller.owner] -= 1
+            if not self._of[caller.owner]:
+                del self._of[caller.owner]
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send, caller: Principal, renewal: bool) -> None:
+        limit = self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
+        with _Body(self, limit) as body:
+            try:
+                await body.read(scope, receive)
+            except _RefusedError as why:
+                await why.answer(Request(scope))(scope, receive, send)
+                return
+            except _LeftError:
+                return
+            whole = bytes(body.data)
+        await self._place(scope, whole, send, renewal=renewal, receive=receive)
+
+    def hold(self, count: int) -> bool:
+        """Whether there is room for more bytes of bodies that have not arrived whole; a negative count gives back."""
+        if count > 0 and self._held + count > _MOST_HELD:
+            return False
+        self._held += count
+        return True
+
+    async def _place(
+        self, scope: Scope, body: bytes, send: Send, *, renewal: bool, receive: Receive | None = None
+    ) -> None:
+        """Serve it where there is a place; without ``receive`` the caller has shown no token."""
+        counts, most = (self._places, self._most(renewal)) if receive is not None else (self._strangers, _STRANGERS)
+        if counts.taken >= most:
+            if renewal:
+                self._strain.note()
+            text = f"{most} requests are under way already: try again in a second"
+            refusal = answer(Request(scope), 503, "Too busy", text, headers={"Retry-After": "1"})
+            await refusal(scope, _nothing, send)
+            return
+        with contextlib.ExitStack() as until_answered:
+            until_answered.enter_context(counts.one())
+            if renewal:
+                until_answered.enter_context(self._strain.renewing())
+
+            async def noting(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    until_answered.close()
+                await send(message)
+
+            await self._app(scope, _replaying(body, receive), noting)
+
+    def _most(self, renewal: bool) -> int:
+        limits = self._limits
+        return limits.requests_at_once if renewal else max(1, limits.requests_at_once - limits.requests_for_renewals)
+
+
+class _Places:
+    """How many are taken. Streams count until they begin only, so watching many instances keeps nobody out."""
+
+    taken = 0
+
+    @contextlib.contextmanager
+    def one(self) -> Iterator[None]:
+        self.taken += 1
+        try:
+            yield
+        finally:
+            self.taken -= 1
+
+
+class _LeftError(Exception):
+    """The sender is gone."""
+
+
+class _RefusedError(Exception):
+    """The body is not taken."""
+
+    def __init__(self, status: int, title: str, text: str) -> None:
+        super().__init__(text)
+        self._said = status, title, text
+
+    def answer(self, request: Request) -> Response:
+        status, title, text = self._said
+        return answer(request, status, title, text, headers={"Retry-After": "1"} if status == 503 else {})
+
+
+class _Body:
+    """One that arrives; what it holds is given back at the end."""
+
+    def __init__(self, reception: Reception, limit: int) -> None:
+        self._reception = reception
+        self._limit = limit
+        self.data = bytearray()
+
+    def __enter__(self) -> _Body:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reception.hold(-len(self.data))
+
+    async def read(self, scope: Scope, receive: Receive) -> None:
+        """All of it.
+
+        Raises:
+            _RefusedError: It is too large, or there is no room.
+            _LeftError: Its sender has left, or was too slow.
+        """
+        declared = Headers(scope=scope).get("content-length", "")
+        self._check(int(declared) if declared.isdigit() else 0)
+        while True:
+            message = await receive()
+            if message["type"] != "http.request":
+                raise _LeftError
+            chunk = message.get("body", b"")
+            self._check(len(self.data) + len(chunk))
+            if not self._reception.hold(len(chunk)):
+                raise _RefusedError(503, "Too busy", "too many large requests are on their way: try again in a second")
+            self.data += chunk
+            if not message.get("more_body", False):
+                return
+
+    def _check(self, length: int) -> None:
+        if length > self._limit:
+            raise _RefusedError(413, "Too large", f"the request is larger than {self._limit} bytes")
+
+
+def _replaying(body: bytes, receive: Receive | None) -> Receive:
+    """Gives the body, and from then on what the server says: that the sender has left."""
+    given = False
+
+    async def replay() -> Message:
+        nonlocal given
+        if not given:
+            given = True
+            return {"type": "http.request", "body": body, "more_body": False}
+        if receive is None:
+            return await _nothing()
+        while (message := await receive())["type"] == "http.request":
+            pass
+        return message
+
+    return replay
+
+
+async def _nothing() -> Message:
+    return {"type": "http.request", "body": b"", "more_body": False}

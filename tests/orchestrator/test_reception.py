@@ -1,0 +1,149 @@
+"""What becomes of a request before it is served: in order, bounded, and nobody at another one's cost."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+from skytether.orchestrator.access import Principal
+from skytether.orchestrator.errors import UnauthenticatedError
+from skytether.orchestrator.reception import Reception
+from skytether.orchestrator.settings import Limits
+from skytether.orchestrator.strain import Strain
+
+RENEWAL = "/api/v1/instances/i1/renew"
+OTHER = "/api/v1/instances"
+
+
+class Knows:
+    """Knows each token as the robot of that name, and ``operator``."""
+
+    def authenticate(self, token: str | None, address: str) -> Principal:
+        if not token:
+            raise UnauthenticatedError("a token is needed")
+        return Principal(None, scopes=frozenset()) if token == "operator" else Principal(token)
+
+    def recent(self, token: str | None) -> Principal | None:
+        return None
+
+
+class Scene:
+    """A reception before an app that answers when it is told to."""
+
+    def __init__(self, **limits: Any) -> None:
+        self.go = asyncio.Event()
+        self.read: list[bytes] = []
+        self.now = 0.0
+        self.strain = Strain(lambda: self.now)
+        self.reception = Reception(self.app, Knows(), Limits(**limits), self.strain)
+
+    async def app(self, scope: Any, receive: Any, send: Any) -> None:
+        self.read.append((await receive())["body"])
+        await self.go.wait()
+        if scope["path"].endswith("broken"):
+            raise ValueError
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    async def ask(
+        self, path: str = OTHER, token: str = "operator", body: list[bytes] | None = None, declares: int | None = None
+    ) -> tuple[int, dict[bytes, bytes]]:
+        """Status and headers; without a body it never comes."""
+        chunks = [b""] if body is None else list(body)
+        told: list[Any] = []
+
+        async def receive() -> dict[str, Any]:
+            if not chunks:
+                await asyncio.Event().wait()
+            return {"type": "http.request", "body": chunks.pop(0), "more_body": bool(chunks) or not body}
+
+        async def whole() -> dict[str, Any]:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        async def send(message: Any) -> None:
+            told.append(message)
+
+        headers = [(b"authorization", f"Bearer {token}".encode())] if token else []
+        headers += [(b"content-length", str(declares).encode())] if declares else []
+        scope = {"type": "http", "path": path, "method": "POST", "headers": headers, "query_string": b""}
+        await self.reception(scope, whole if body is None else receive, send)
+        return next((m["status"], dict(m["headers"])) for m in told if "status" in m)
+
+
+def run(scene: Any) -> None:
+    asyncio.run(asyncio.wait_for(scene(), 30))
+
+
+async def settle() -> None:
+    for _ in range(50):
+        await asyncio.sleep(0.002)
+
+
+def test_beyond_the_bound_they_are_told_to_come_again_and_renewals_have_room_of_their_own() -> None:
+    async def scene() -> None:
+        at = Scene(requests_at_once=3, requests_for_renewals=1)
+        waiting = [asyncio.create_task(at.ask()), asyncio.create_task(at.ask("/api/broken"))]
+        await settle()
+        status, headers = await at.ask()
+        assert (status, headers[b"retry-after"]) == (503, b"1")
+        assert not at.strain.felt()
+        renewing = asyncio.create_task(at.ask(RENEWAL, "walker"))
+        await settle()
+        assert (await at.ask(RENEWAL, "runner"))[0] == 503
+        assert at.strain.felt()
+        free = asyncio.create_task(at.ask("/healthz", ""))
+        at.go.set()
+        assert (await renewing)[0] == (await free)[0] == 200
+        assert isinstance((await asyncio.gather(*waiting, return_exceptions=True))[1], ValueError)
+        assert [(await at.ask())[0] for _ in range(4)] == [200] * 4
+
+    run(scene)
+
+
+def test_nothing_is_read_of_a_body_before_its_sender_is_known_and_none_takes_a_place_before_it_is_there() -> None:
+    async def scene() -> None:
+        at = Scene(requests_at_once=2, requests_for_renewals=1, robot_requests_at_once=2)
+        at.go.set()
+        assert (await at.ask(token="", body=[]))[0] == 401
+        slow = [asyncio.create_task(at.ask(token=f"r{n}", body=[])) for n in range(20)]
+        await settle()
+        assert (await at.ask(body=[b"whole"]))[0] == 200
+        again = asyncio.create_task(at.ask(token="r0", body=[]))
+        await settle()
+        assert (await at.ask(token="r0"))[0] == 429
+        for one in (*slow, again):
+            one.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.gather(*slow, again)
+        assert (await at.ask(token="r0"))[0] == 200
+        assert at.read == [b"whole", b""]
+
+    run(scene)
+
+
+def test_a_body_is_bounded_whether_it_says_so_or_not_and_a_robots_is_smaller() -> None:
+    async def scene() -> None:
+        at = Scene(body_bytes=100, robot_body_bytes=10)
+        at.go.set()
+        assert (await at.ask(body=[b"a" * 60, b"a" * 40]))[0] == 200
+        assert (await at.ask(body=[b"a" * 60, b"a" * 41]))[0] == 413
+        assert (await at.ask(body=[], declares=101))[0] == 413
+        assert (await at.ask(token="walker", body=[b"a" * 11]))[0] == 413
+        assert at.read == [b"a" * 100]
+
+    run(scene)
+
+
+def test_who_needs_no_token_takes_no_place_of_those_who_have_one() -> None:
+    async def scene() -> None:
+        at = Scene(requests_at_once=2, requests_for_renewals=1)
+        waiting = [asyncio.create_task(at.ask("/readyz", "", body=[])) for _ in range(30)]
+        await settle()
+        assert sum(one.done() for one in waiting) == 14  # 503
+        served = asyncio.create_task(at.ask())
+        await settle()
+        at.go.set()
+        assert (await served)[0] == 200
+        await asyncio.gather(*waiting)
+
+    run(scene)
