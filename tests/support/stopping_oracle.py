@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.protocol import Beat
+from skytether.guard.velocity import STANDSTILL, Velocity
+from skytether.guard.watch import Watch
 from skytether.messages import Header, LaserScan, Time
 from skytether.robot.command import Command
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.footprint import Points
-from skytether.robot.safety.guard import Watch
-from skytether.robot.safety.protocol import Beat
+from skytether.robot.safety.heartbeat import differs
 from skytether.robot.safety.rules import Gate
 from skytether.robot.safety.sources import Hand
 
@@ -97,7 +98,8 @@ class Drive:
         self.random = Random(self.seed)
         self.rules = self.config.rules()
         self.gate = Gate(self.rules)
-        self.watch = Watch(self.rules.limits, self.config.guard_s)
+        self.watch = Watch(self.config.bounds(), 1 / self.config.rate_hz, self.config.guard_s)
+        self.said = STANDSTILL
         self.now = 100.0
         for sequence, earlier in ((-1, 0.5), (0, 0.1)):  # the agent begins from a standstill
             then = self.now - earlier
@@ -172,7 +174,11 @@ class Drive:
         self._commands += 1
         linear, angular = self.wanted(at) if at > 0 else (0.0, 0.0)
         self.gate.command(Command(Hand.AGENT, linear, angular, 1, self._commands, self.now, 0.0, self.now), self.now)
+        told = differs(self.watch.told, self.said, self.now, self.config.guard_s, 1 / self.config.rate_hz)
+        if told is not None:
+            self.gate.rebase(*told)
         decision = self.gate.step(self.now)
+        self.said = decision.velocity
         self._at(self.now + 1e-4, "beat", Beat(self.now, decision.velocity))
         gap = self._period()
         if self.random.random() < self.faults.gate_hangs:
@@ -193,10 +199,11 @@ class Drive:
 
     def _look(self) -> None:
         self._looked = self.now
-        self.watch.look(self.now)
+        velocity, _ = self.watch.want(self.now)
+        self.watch.wrote(velocity, self.now)
         stages = self.rules.stages
         self._felt = max(self._felt, self.now + self._drawn(stages.writer_s) + self._drawn(stages.wheels_s))
-        self._at(self._felt, "feel", self.watch.velocity)
+        self._at(self._felt, "feel", velocity)
 
     def _do_feel(self, velocity: Velocity) -> None:
         self._aim = velocity

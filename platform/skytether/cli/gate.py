@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,42 +18,35 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON document on standar
 def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With a section safety.")]) -> None:
     """Own the wheels: let velocities through that are safe, and stop the robot when there are none.
 
-    Runs beside the agent, as processes of its own, and needs neither network nor agent. docs/safety.md tells more.
+    Runs beside the agent, as processes of its own, and needs neither network nor agent. This command checks the
+    configuration and then becomes the guard, a small process that reads no file. docs/safety.md tells more.
     """
-    from skytether.robot.safety.guard import Guard, GuardError
-    from skytether.robot.safety.process import log_without_waiting
-    from skytether.robot.safety.ways import open_wheels
+    from skytether.robot.safety.start import become_guard
 
     from .config_file import ConfigError
     from .gate_config import load_safety
 
     try:
-        settings = load_safety(config)
-        guard = Guard(settings, wheels := open_wheels(settings, "guard"))
+        become_guard(load_safety(config))
     except ConfigError as error:
         fail(str(error), 2)
-    except (GuardError, OSError) as error:
-        fail(str(error))
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    console.print(f"gate: guards the wheels; its sockets are in {settings.place()}", markup=False, soft_wrap=True)
-    if not settings.sensors:
-        console.print("warning: safety.sensors is empty: the robot does not see what it drives into", style="yellow")
-    log_without_waiting()
-    try:
-        guard.run(ended.is_set)
-    finally:
-        wheels.close()
+    except OSError as error:
+        fail(f"the gate cannot be started: {error}")
 
 
 def stop(
     reason: Annotated[str, typer.Argument(help="For whoever finds the robot stopped.")] = "",
     folder: Folder = None,
 ) -> None:
-    """Emergency stop, until `skytether robot reset`."""
-    _ask(folder, {"do": "stop", "reason": reason})
+    """Emergency stop, until `skytether robot reset`.
+
+    Goes to guard and gate at once: one of them that hangs does not hold it up.
+    """
+    answer = _ask(folder, {"do": "stop", "reason": reason})
     console.print("the robot is stopped; `skytether robot reset` lets it go again", markup=False)
+    if "note" in answer:
+        console.print("warning: ", style="yellow", end="")
+        console.print(str(answer["note"]), markup=False, soft_wrap=True)
 
 
 def reset(folder: Folder = None) -> None:

@@ -56,7 +56,15 @@ class Robot:
                 [sys.executable, "-m", "skytether.cli", "robot", "gate", str(config)], stdout=output, stderr=output
             )
         self.agent = self.start_agent()
+        wait(self._reset, "the first act is a reset", self)
         self.start()
+
+    def _reset(self) -> bool:
+        try:
+            ask(self.folder, {"do": "reset"}, timeout=PATIENCE_S)
+        except GateError:
+            return False
+        return True
 
     def start_agent(self) -> subprocess.Popen[bytes]:
         with self._log.open("ab") as output:
@@ -209,8 +217,8 @@ def test_the_gate_killed_or_frozen(robot):
     robot.start()
     robot.drives()
     ask(robot.folder, {"do": "stop", "reason": "a test"}, PATIENCE_S)
+    assert "a test" in (robot.folder / "latch").read_text()
     robot.stands()
-    wait(lambda: "a test" in (robot.folder / "latch").read_text(), "the stop is kept", robot)
     os.kill(third, signal.SIGKILL)
     gate_pid(robot, other_than=third)
     robot.stands()
@@ -237,7 +245,7 @@ def test_the_guard_frozen_or_killed(robot):
 def test_the_disk_is_full(tmp_path, netns):
     disk = tmp_path / "disk"
     disk.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], check=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(disk)], check=True)
     try:
         folder = disk / "run"
         folder.mkdir()
@@ -248,8 +256,8 @@ def test_the_disk_is_full(tmp_path, netns):
                 fill(disk / "fill")
             robot.drives()
             ask(folder, {"do": "stop", "reason": "full"}, PATIENCE_S)
+            assert "full" in (folder / "latch").read_text()  # on a full disk, too
             robot.stands()
-            wait(lambda: "full" in (folder / "latch").read_text(), "the stop is kept on a full disk", robot)
             first = gate_pid(robot)
             os.kill(first, signal.SIGKILL)
             gate_pid(robot, other_than=first)
@@ -299,7 +307,7 @@ def test_people_and_things_in_the_way(robot):
     told = subprocess.run([*cli, "start", *there], check=True, capture_output=True, text=True)
     assert "may drive: agent" in told.stderr + told.stdout
     robot.drives()
-    for name in ("control.sock", "command.sock", "sensors.sock"):
+    for name in ("control.sock", "command.sock", "sensors.sock", "stop.sock"):
         assert (robot.folder / name).stat().st_mode & 0o007 == 0  # closed to other users
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import socket
 import time
 from collections.abc import Callable
@@ -10,11 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from skytether.guard.clock import now as boottime
+from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.velocity import Velocity
 
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, pack_command, unpack_state
 
 _LARGEST_ANSWER = 256 * 1024
+_LONGEST_REASON = 500
+"""Characters that are sent; fewer are kept."""
+_GUARD_S = 1.0
 _LARGEST_STATE = 512
 _MOST_STATES = 600
 """Taken in one call; the kernel keeps as many as net.unix.max_dgram_qlen says, 10 or 512."""
@@ -71,22 +76,90 @@ class GateLink:
 def ask(folder: Path, request: dict[str, Any], timeout: float = 3.0) -> dict[str, Any]:
     """Put a request to the gate: ``{"do": "status"}``, ``"reset"``, ``"start"``, or ``"stop"`` with a ``"reason"``.
 
+    Returns:
+        The gate's status; under ``guard`` the guard's, or None if that does not answer. Of a stop, the status of
+        whoever keeps it, and a ``note`` if it is in effect but could not be kept.
+
     Raises:
         GateError: It does not answer, or answers no.
     """
-    path = folder / CONTROL_SOCKET
+    if request.get("do") == "stop":
+        return stop(folder, str(request.get("reason") or ""), timeout)
+    answer = _ask(folder / CONTROL_SOCKET, request, timeout)
+    if request.get("do") == "status":
+        try:
+            answer["guard"] = _ask(folder / STOP_SOCKET, request, min(timeout, _GUARD_S))
+        except GateError:
+            answer["guard"] = None
+    return answer
+
+
+def stop(folder: Path, reason: str = "", timeout: float = 3.0) -> dict[str, Any]:
+    """Emergency stop: asks guard and gate at once, so that one of them suffices.
+
+    Returns:
+        What the first says that has kept it; a ``note`` in it says that it is in effect, but could not be kept.
+
+    Raises:
+        GateError: Neither took it.
+    """
+    request = json.dumps({"do": "stop", "reason": reason[:_LONGEST_REASON]}).encode()
+    links: dict[socket.socket, Path] = {}
+    errors: list[GateError] = []
+    for path in (folder / STOP_SOCKET, folder / CONTROL_SOCKET):
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        link.setblocking(False)
+        try:
+            link.connect(str(path))
+            link.send(request)
+            links[link] = path
+        except OSError as error:
+            link.close()
+            errors.append(_explained(path, error))
+    noted: dict[str, Any] | None = None
+    end = time.monotonic() + timeout
+    try:
+        while links and (left := end - time.monotonic()) > 0:
+            for link in select.select(list(links), [], [], left)[0]:
+                path = links.pop(link)
+                with link:
+                    try:
+                        answer = _checked(path, link.recv(_LARGEST_ANSWER))
+                    except (OSError, ValueError, GateError) as error:
+                        errors.append(error if isinstance(error, GateError) else _explained(path, error))
+                        continue
+                if "note" not in answer:
+                    return answer
+                noted = answer
+    finally:
+        for link in links:
+            link.close()
+    if noted is not None:
+        return noted
+    raise errors[0] if errors else GateError(f"neither guard nor gate in {folder} answers within {timeout:g} s")
+
+
+def _ask(path: Path, request: dict[str, Any], timeout: float) -> dict[str, Any]:
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
             link.settimeout(timeout)
             link.connect(str(path))
             link.send(json.dumps(request).encode())
-            answer = json.loads(link.recv(_LARGEST_ANSWER))
-    except PermissionError as error:
-        raise GateError(f"{path} is not open to you: only the user that the gate runs as may ask it") from error
-    except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise GateError(f"no gate listens at {path}; start it with: skytether robot gate robot.yaml") from error
+            return _checked(path, link.recv(_LARGEST_ANSWER))
     except (OSError, ValueError) as error:
-        raise GateError(f"the gate at {path} does not answer: {error}") from error
+        raise _explained(path, error) from error
+
+
+def _checked(path: Path, data: bytes) -> dict[str, Any]:
+    answer = json.loads(data)
     if not isinstance(answer, dict) or "refused" in answer:
-        raise GateError(answer["refused"] if isinstance(answer, dict) else f"{path} answers no JSON object")
+        raise GateError(str(answer["refused"]) if isinstance(answer, dict) else f"{path} answers no JSON object")
     return answer
+
+
+def _explained(path: Path, error: Exception) -> GateError:
+    if isinstance(error, PermissionError):
+        return GateError(f"{path} is not open to you: only the user that the gate runs as may ask it")
+    if isinstance(error, FileNotFoundError | ConnectionRefusedError):
+        return GateError(f"no gate listens at {path}; start it with: skytether robot gate robot.yaml")
+    return GateError(f"the gate at {path} does not answer: {error}")

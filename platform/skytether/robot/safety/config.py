@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from dataclasses import replace
 from math import radians
 from pathlib import Path
@@ -10,13 +11,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from skytether.guard.kinematics import Bounds
 from skytether.messages import LaserScan, Message, Range
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name
 
 from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
-from .protocol import default_folder
+from .protocol import default_folder, default_record
 from .ranges import Mount
 from .rules import Rules
 from .sensing import Action, RangeSensor
@@ -165,6 +167,9 @@ class SafetyConfig(SourcesConfig):
     """The guard brakes when the gate has said nothing for this long, and the gate when the guard has not."""
     folder: Path | None = None
     """Of the gate's sockets; null: ``/run/skytether`` for root, else ``$XDG_RUNTIME_DIR/skytether``."""
+    record: Path | None = None
+    """Of the event record; null: ``record`` in a ``folder`` that is given, else ``/var/lib/skytether/safety-record``
+    for root, and the user's state folder for others."""
     sockets: SocketsConfig | None = None
     """Drivers that are no ROS nodes; the way to the hardware unless ``ros1`` or ``ros2`` is given."""
     ros1: Ros1Way | None = None
@@ -213,6 +218,28 @@ class SafetyConfig(SourcesConfig):
         """The gate's folder."""
         return self.folder or default_folder()
 
+    def bounds(self) -> Bounds:
+        """What the wheels may do, as the guard takes it."""
+        limits = self.limits or Limits()
+        return Bounds(*(float(getattr(limits, name)) for name in Bounds._fields))
+
+    def frozen(self) -> SafetyConfig:
+        """With everything looked up that could make somebody wait later: names of hosts, folders.
+
+        Raises:
+            OSError: A host's name is not known.
+        """
+        changes: dict[str, object] = {"folder": self.place().absolute(), "record": self.record_file().absolute()}
+        if self.sockets is not None and self.sockets.wheels is not None:
+            wheels = numeric(address(self.sockets.wheels))
+            text = f"unix:{wheels}" if isinstance(wheels, str) else f"udp:{wheels[0]}:{wheels[1]}"
+            changes["sockets"] = self.sockets.model_copy(update={"wheels": text})
+        return self.model_copy(update=changes)
+
+    def record_file(self) -> Path:
+        """Of the event record. A folder of its own has its own, unless it is said."""
+        return self.record or (self.folder / "record" if self.folder is not None else default_record())
+
     def kinds(self) -> dict[str, type[Message]]:
         """Message type of each topic that the gate listens to."""
         kinds: dict[str, type[Message]] = {
@@ -236,3 +263,15 @@ def address(text: str) -> str | tuple[str, int]:
     if kind == "udp" and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536:
         return host.strip("[]"), int(port)
     raise ValueError(f"must be unix:PATH or udp:HOST:PORT, not '{text}'")
+
+
+def numeric(where: str | tuple[str, int]) -> str | tuple[str, int]:
+    """The same with the address of a host instead of its name: who writes to it must not wait for a name server.
+
+    Raises:
+        OSError: The name is not known.
+    """
+    if isinstance(where, str):
+        return where
+    found = socket.getaddrinfo(*where, type=socket.SOCK_DGRAM)[0][4]
+    return str(found[0]), where[1]

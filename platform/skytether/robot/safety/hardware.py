@@ -12,8 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from skytether.control.admittance import Velocity
-from skytether.messages import DecodeError, Message, Twist, Vector3, decode, encode
+from skytether.guard import wheels
+from skytether.guard.protocol import Told
+from skytether.guard.velocity import Velocity
+from skytether.messages import DecodeError, Message, decode
 
 _LARGEST = 256 * 1024
 """Bytes of one reading; more is cut off and then no message."""
@@ -32,6 +34,10 @@ class Wheels(Protocol):
         Raises:
             OSError: It did not get there.
         """
+        ...
+
+    def listeners(self) -> frozenset[str] | None:
+        """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
     def close(self) -> None:
@@ -59,17 +65,19 @@ class SocketWheels:
     """
 
     def __init__(self, address: Address) -> None:
-        self._address = address
-        self._socket = _datagrams(address)
+        self._wheels = wheels.SocketWheels(address)
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: send it."""
-        twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
-        self._socket.sendto(encode(twist), self._address)
+        self._wheels.write(velocity, Told(), 0.0)
+
+    def listeners(self) -> frozenset[str] | None:
+        """Wheels: not known."""
+        return None
 
     def close(self) -> None:
         """Close the socket."""
-        self._socket.close()
+        self._wheels.close()
 
 
 class SocketSensors:

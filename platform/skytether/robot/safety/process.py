@@ -1,11 +1,9 @@
-"""What gate and guard share as programs: logs that never wait, and what systemd is told."""
+"""Logs of gate and writer, which never wait."""
 
 from __future__ import annotations
 
 import logging
-import os
 import queue
-import socket
 from contextlib import suppress
 from logging.handlers import QueueHandler, QueueListener
 
@@ -30,26 +28,3 @@ def log_without_waiting() -> None:
     root.handlers[:] = [_NeverWaits(lines)]
     root.setLevel(logging.INFO)
     QueueListener(lines, *handlers, respect_handler_level=True).start()
-
-
-class Systemd:
-    """Tells the service manager how it is going (sd_notify(3)); without one does nothing."""
-
-    def __init__(self) -> None:
-        self._address = os.environ.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if self._address else None
-        if self._socket is not None:
-            self._socket.setblocking(False)
-
-    def tell(self, state: str) -> None:
-        """``READY=1``, ``WATCHDOG=1``, ``STATUS=...``, ``STOPPING=1``."""
-        if self._socket is not None:
-            try:
-                self._socket.sendto(state.encode(), self._address)
-            except OSError:  # a watchdog that does not hear us acts on that
-                return
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()

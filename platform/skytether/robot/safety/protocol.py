@@ -1,4 +1,4 @@
-"""Bytes between the agent, the gate and the guard on one machine, whose clock is the same for all."""
+"""Bytes between the agent and the gate on one machine, whose clock is the same for both, and where they meet."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from skytether.robot.command import Command
 
 _COMMAND = struct.Struct("<4sQQddd")
 _MAGIC = b"SkG1"
-_BEAT = struct.Struct("<4sddd")
 _STATE = struct.Struct("<4sdddd16s")
 _STATE_MAGIC = b"SkS1"
 _REASON_BYTES = 200
@@ -24,14 +23,6 @@ CONTROL_SOCKET = "control.sock"
 """In the gate's folder: one request and one answer, both JSON, on a connection."""
 SENSORS_SOCKET = "sensors.sock"
 WHEELS_SOCKET = "wheels.sock"
-
-
-@dataclass(frozen=True, slots=True)
-class Beat:
-    """What the gate tells the guard at every turn."""
-
-    at: float
-    velocity: Velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,21 +79,16 @@ def unpack_command(data: bytes, source: StrEnum, now: float) -> Command | None:
     return Command(source, linear, angular, epoch, sequence, sent_at, 0.0, now)
 
 
-def pack_beat(beat: Beat) -> bytes:
-    """For the guard."""
-    return _BEAT.pack(_MAGIC, beat.at, *beat.velocity)
-
-
-def unpack_beat(data: bytes) -> Beat | None:
-    """From the gate; None: the bytes are none."""
-    if len(data) != _BEAT.size or data[:4] != _MAGIC:
-        return None
-    _, at, linear, angular = _BEAT.unpack(data)
-    return Beat(at, Velocity(linear, angular))
-
-
 def default_folder() -> Path:
     """Where the sockets of a gate are unless it is told otherwise."""
     if os.geteuid() == 0:
         return Path("/run/skytether")
     return Path(os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/skytether-{os.geteuid()}") / "skytether"  # noqa: S108
+
+
+def default_record() -> Path:
+    """Where the event record is unless it is told otherwise: on a disk that a reboot leaves as it is."""
+    if os.geteuid() == 0:
+        return Path("/var/lib/skytether/safety-record")
+    state = os.environ.get("STATE_DIRECTORY") or os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
+    return Path(state) / "skytether" / "safety-record"

@@ -23,7 +23,7 @@ class Ros1Wheels:
 
     Args:
         way: Where it is.
-        role: Ends the node's name: ``guard`` or ``gate``.
+        role: Ends the node's name: ``guard`` for the writer, or ``gate``.
 
     Raises:
         OSError: The node cannot be.
@@ -38,6 +38,10 @@ class Ros1Wheels:
         """Wheels: publish it."""
         twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
         self._publication.publish(encode(twist, "ros1"))
+
+    def listeners(self) -> frozenset[str]:
+        """Wheels: the nodes that listen."""
+        return frozenset(self._publication.subscribers)
 
     def close(self) -> None:
         """Leave the graph."""

@@ -25,7 +25,7 @@ class Ros2Wheels:
 
     Args:
         way: Where it is.
-        role: Ends the node's name: ``guard`` or ``gate``.
+        role: Ends the node's name: ``guard`` for the writer, or ``gate``.
 
     Raises:
         OSError: The node cannot be.
@@ -34,8 +34,8 @@ class Ros2Wheels:
     def __init__(self, way: Ros2Way, role: str) -> None:
         self._way = way
         self._node = _start(way, role)
-        topic = resolve(way.cmd_vel, way.namespace)
-        self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, topic, way.cmd_vel_type))
+        self._topic = resolve(way.cmd_vel, way.namespace)
+        self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type))
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
@@ -45,6 +45,10 @@ class Ros2Wheels:
             self._publication.put(encode(TwistStamped(header, twist)))
         else:
             self._publication.put(encode(twist))
+
+    def listeners(self) -> frozenset[str]:
+        """Wheels: the nodes that listen."""
+        return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))
 
     def close(self) -> None:
         """Leave the graph."""

@@ -140,6 +140,19 @@ class Gate:
         """Sources that must be neutral before they may drive, and after what."""
         return self._sources.waiting
 
+    def refuses_reset(self, now: float) -> str:
+        """Why `reset` would be refused now; empty: it would not."""
+        return self._sources.refuses_reset(now)
+
+    def rebase(self, velocity: Velocity, at: float) -> None:
+        """The wheels were told something else than the last step decided: the next one goes on from there.
+
+        Args:
+            velocity: What they were told.
+            at: When [s]; before the time of the next step.
+        """
+        self._supervised = replace(self._supervised, velocity=velocity, now=at)
+
     def step(self, now: float) -> Decision:
         """Decide what the wheels are told until the next step. Never raises; whatever fails stands still."""
         troubles: dict[str, str] = self._events

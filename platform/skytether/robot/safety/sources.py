@@ -187,6 +187,10 @@ class Sources:
             self._sources[name] = replace(self._sources[name], neutral=Neutral())
         return may, ""
 
+    def refuses_reset(self, now: float) -> str:
+        """Why `reset` would be refused now; empty: it would not."""
+        return latch.reset(self._rules.button, self._latch, now)[1]
+
     def expects(self, topic: str, message: Message) -> bool:
         """Whether `hear` is for this message."""
         rules = self._rules

@@ -1,0 +1,88 @@
+"""A process that the guard starts and watches: the gate, or the writer to a graph."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+
+_HANGS_S = 3.0
+"""One that says nothing for this long is ended and started anew."""
+_STARTS_S = 15.0
+"""It may take this long to say its first word."""
+
+vars(subprocess)["_USE_VFORK"] = (
+    False  # as its documentation has it: a vfork waits until the disk has given the program
+)
+
+
+class Child:
+    """The process and the socket to it. It is started by a thread: a disk that hangs holds up nothing else.
+
+    Args:
+        name: For people.
+        command: Its arguments; the number of the socket comes after them.
+        config: File descriptor of its configuration, whose number comes last.
+        now: [s]
+    """
+
+    def __init__(self, name: str, command: Sequence[str], config: int, now: float) -> None:
+        self.name = name
+        self.heard_at: float | None = None
+        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.socket.setblocking(False)
+        self.gone = False
+        """It has closed its end."""
+        self._started_at = now
+        self._process: subprocess.Popen[bytes] | None = None
+        self._failed = ""
+        self._ended = False
+        threading.Thread(target=self._start, args=(tuple(command), theirs, config), daemon=True).start()
+
+    @property
+    def pid(self) -> int:
+        """0: it is being started."""
+        return self._process.pid if self._process is not None else 0
+
+    def ended(self, now: float) -> str:
+        """Why it has to be started anew; empty: it has not."""
+        if self._failed:
+            return f"cannot be started: {self._failed}"
+        status = self._process.poll() if self._process is not None else None
+        if status is not None:
+            return f"ended with status {status}"
+        if self.gone:
+            return "ended"
+        if self.heard_at is None:
+            return f"did not start within {_STARTS_S:g} s" if now - self._started_at > _STARTS_S else ""
+        return f"hangs for {_HANGS_S:g} s" if now - self.heard_at > _HANGS_S else ""
+
+    def end(self) -> None:
+        """Have the kernel end it. One that cannot die now is not waited for."""
+        self._ended = True
+        self.socket.close()
+        if self._process is not None:
+            self._process.kill()
+
+    def reaped(self) -> bool:
+        """Whether nothing is left of it."""
+        return bool(self._failed) or (self._process is not None and self._process.poll() is not None)
+
+    def _start(self, command: tuple[str, ...], theirs: socket.socket, config: int) -> None:
+        with theirs:
+            with suppress(OSError):  # it takes its own priority, and is to start with none
+                os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            try:
+                self._process = subprocess.Popen(
+                    [*command, str(theirs.fileno()), str(config)],
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=[theirs.fileno(), config],
+                    start_new_session=True,  # a Ctrl-C is for the guard, which ends its children when the wheels stand
+                )
+            except OSError as error:
+                self._failed = error.strerror or str(error)
+        if self._ended and self._process is not None:
+            self._process.kill()

@@ -1,0 +1,325 @@
+"""The guard's loop: what the gate says goes in, one velocity goes to the wheels, and nothing is ever waited for.
+
+The gate and the writer are started, watched and started anew. The emergency stop lives here, and so does a way to
+stop the robot that needs no gate.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import time
+from collections import deque
+from collections.abc import Callable
+
+from .child import Child
+from .clock import now as boottime
+from .latch import Keeper, Latch, boot_id, clean
+from .log import Log
+from .protocol import LARGEST, STOP_SOCKET, Answer, Beat, pack_answer, unpack_beat, unpack_note
+from .record import Record
+from .requests import Reply, Requests
+from .settings import Settings
+from .systemd import Systemd
+from .velocity import STANDSTILL
+from .watch import Watch
+from .wheels import SocketWheels, WriterWheels
+
+LATCH_FILE = "latch"
+LOCK_FILE = "lock"
+_AGAIN_S = 1.0
+"""Between starts of a child."""
+_DEATHS, _DEATHS_S = 3, 60.0
+"""A gate that ended so often within that time is not to be trusted: a person has to look at it."""
+_KEPT_S = 1.0
+"""A stop that is not on disk after so long is answered as such."""
+_ENDS_S = 10.0
+"""A guard that is told to end brakes for so long at most."""
+_LEAVES_S = 2.0
+"""For the writer to leave its graph, and for the disk."""
+_MOST_PACKETS = 64
+"""Taken from the gate in one turn; one that says more has gone mad, and the rest waits."""
+_LAST_STOPS = 5
+"""Said at the end."""
+_SLACK = 1.25
+"""Periods without a word of the gate after which the wheels are told anew."""
+
+
+class GuardError(Exception):
+    """The guard cannot start; the text says why and what to do."""
+
+
+class Guard:
+    """The loop.
+
+    Args:
+        settings: What is configured.
+        log: For people.
+        refused: What `privileges.take` was not permitted, for the status.
+        clock: `clock.now`; replaced by tests only.
+
+    Raises:
+        GuardError: Another guard has this folder, or the folder cannot be made.
+    """
+
+    def __init__(self, settings: Settings, log: Log, refused: list[str], clock: Callable[[], float] = boottime) -> None:
+        self._refused = refused
+        self._settings = settings
+        self._log = log
+        self._clock = clock
+        self._lock = _take_folder(settings.folder)
+        boot = boot_id()
+        self._record = Record(settings.record, boot)
+        keeper = Keeper(os.path.join(settings.folder, LATCH_FILE), boot, self._not_kept)
+        self._latch = Latch(keeper)
+        keeper.start()
+        try:
+            self._requests = Requests(os.path.join(settings.folder, STOP_SOCKET), self._answer)
+        except OSError as error:
+            raise GuardError(f"cannot have {STOP_SOCKET} in {settings.folder}: {error.strerror}") from error
+        self._watch = Watch(settings.bounds, settings.period_s, settings.patience_s)
+        self._wheels = WriterWheels() if settings.wheels is None else SocketWheels(settings.wheels)
+        self._systemd = Systemd()
+        self._gate: Child | None = None
+        self._writer: Child | None = None
+        self._tried: dict[str, float] = {}
+        self._restarts: dict[str, int] = {}
+        self._dead: list[Child] = []
+        self._deaths: deque[float] = deque(maxlen=_DEATHS)
+        self._due = self._last = self._started = clock()
+        self._troubles: dict[str, str] = {}
+        self._ready = self._ends = False
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Guard until told to end; the wheels stand at the end."""
+        for sentence in self._refused:
+            self._log.line("INFO", sentence)
+        self._event("guard", "start", self._latch.reason or "released")
+        while not ended():
+            self.turn()
+        self._systemd.tell("STOPPING=1")
+        self._event("guard", "end", "told to end")
+        self._brake()
+        if self._gate is not None:
+            self._gate.end()
+        if self._writer is not None:
+            self._writer.socket.close()  # it says standstill for a while, leaves the graph and ends
+        self._requests.close()
+        end = time.monotonic() + _LEAVES_S
+        while time.monotonic() < end and not (
+            self._record.written and self._latch.kept and (self._writer is None or self._writer.reaped())
+        ):
+            time.sleep(0.01)
+        if self._writer is not None:
+            self._writer.end()
+
+    def turn(self) -> None:
+        """Wait for the gate, a period at most, and tell the wheels once."""
+        now = self._clock()
+        if now < self._last:  # it went back
+            self._due = now
+        if now < self._due:
+            waited = self._requests.sockets()
+            if self._gate is not None and not self._gate.gone and now >= self._last + self._settings.period_s / 4:
+                waited.append(self._gate.socket)
+            select.select(waited, [], [], max(0.0, min(self._due - now, self._settings.period_s)))
+        self._requests.turn()
+        now = self._clock()
+        beat = self._hear()
+        if beat or now >= self._due:
+            self._tell(now)
+            self._last, self._due = now, now + _SLACK * self._settings.period_s
+            if beat:
+                self._answer_gate(now)
+                self._ready = True
+        self._look_after(self._clock())
+        self._systemd.tell("READY=1\nWATCHDOG=1" if self._ready else "WATCHDOG=1")
+
+    def _hear(self) -> bool:
+        """Take in what the gate says. True if it said anything."""
+        gate, newest = self._gate, None
+        for _ in range(_MOST_PACKETS):
+            if gate is None or gate.gone:
+                break
+            try:
+                data = gate.socket.recv(LARGEST)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""
+            if not data:
+                gate.gone = True
+                self._watch.forget()
+                break
+            beat = unpack_beat(data)
+            note = unpack_note(data) if beat is None else None
+            if beat is not None:
+                newest = beat
+                self._stop_as_the_gate_says(beat)
+            elif note:
+                self._event("gate", "trouble", note)
+        if newest is None or gate is None:
+            return False
+        gate.heard_at = self._clock()
+        self._watch.hear(newest)
+        fresh = 0 <= gate.heard_at - newest.at <= self._settings.patience_s
+        if newest.reset and fresh and self._latch.reset(newest.seen):
+            self._event("person", "reset", "the emergency stop was reset")
+        return True
+
+    def _stop_as_the_gate_says(self, beat: Beat) -> None:
+        # What the gate said before it knew of the last reset is what the reset has ended.
+        if beat.stopped and beat.seen == self._latch.generation:
+            self._stop("gate", beat.stopped)
+
+    def _tell(self, now: float) -> None:
+        if (told := self._wheels.hear()) is not None:
+            self._watch.learn(told)
+        velocity, wrong = self._watch.want(now, bool(self._latch.reason))
+        if wrong and self._gate is not None and self._gate.heard_at is not None and not self._ends:
+            self._trouble(wrong.split()[0], "brake", f"the gate {wrong}; the guard stops the wheels", now)
+        if self._clock() - now > self._settings.period_s:
+            return  # this process stood still in between: hear first what the gate told the wheels meanwhile
+        try:
+            told = self._wheels.write(velocity, self._watch.told, now)
+            if told is not None:
+                self._watch.wrote(*told)
+            self._troubles.pop("wheels", None)
+        except OSError as error:  # tried again in a moment; a motor drive that hears nothing stops by itself
+            self._watch.failed(now)
+            sentence = f"the wheels cannot be told anything: {error.strerror or error}"
+            self._troubles["wheels"] = sentence
+            self._trouble("wheels", "wheels", sentence, now)
+
+    def _answer_gate(self, now: float) -> None:
+        latch = self._latch
+        take = self._settings.wheels is None and now - self._writer_heard() > self._settings.patience_s
+        answer = Answer(now, self._watch.told, latch.generation, take, latch.kept, latch.reason)
+        if self._gate is not None:
+            try:
+                self._gate.socket.send(pack_answer(answer))
+            except OSError:  # it does not read; it will hang or have ended
+                return
+
+    def _writer_heard(self) -> float:
+        heard = self._wheels.heard_at if isinstance(self._wheels, WriterWheels) else None
+        return self._started if heard is None else heard
+
+    def _look_after(self, now: float) -> None:
+        """Start what is not there, end what hangs."""
+        self._dead = [child for child in self._dead if not child.reaped()]
+        self._gate = self._kept_alive("gate", self._gate, self._settings.gate, now)
+        if self._settings.writer:
+            writer = self._kept_alive("writer", self._writer, self._settings.writer, now)
+            if writer is not self._writer and isinstance(self._wheels, WriterWheels):
+                self._wheels.link = writer.socket if writer is not None else None
+            self._writer = writer
+            if writer is not None and isinstance(self._wheels, WriterWheels) and self._wheels.heard_at is not None:
+                writer.heard_at = max(writer.heard_at or 0.0, self._wheels.heard_at)
+
+    def _kept_alive(self, name: str, child: Child | None, command: tuple[str, ...], now: float) -> Child | None:
+        if child is None:
+            if now - self._tried.get(name, -_AGAIN_S) < _AGAIN_S:
+                return None
+            self._tried[name] = now
+            return Child(name, command, self._settings.config, now)
+        why = child.ended(now)
+        if not why:
+            return child
+        self._log.line("ERROR", f"the {name} {why}; the wheels stand and it is started anew")
+        self._event(name, "death", why)
+        self._restarts[name] = self._restarts.get(name, 0) + 1
+        child.end()
+        self._dead.append(child)
+        if name == "gate":
+            self._watch.forget()
+            self._deaths.append(now)
+            if len(self._deaths) == _DEATHS and now - self._deaths[0] <= _DEATHS_S:
+                self._stop("guard", f"the gate ended {_DEATHS} times within a minute, at last: {why}")
+        return None
+
+    def _brake(self) -> None:
+        """The wheels are braked before the guard ends, whatever was wanted."""
+        self._ends = True
+        self._watch.forget()
+        end, last = self._clock() + _ENDS_S, _LAST_STOPS
+        while last and self._clock() < end:
+            now = self._clock()
+            if self._watch.told.velocity == STANDSTILL or now - self._watch.told.at > self._settings.patience_s:
+                last -= 1
+            self._hear()
+            self._watch.forget()
+            self._tell(now)
+            self._answer_gate(now)
+            self._systemd.tell("WATCHDOG=1")
+            time.sleep(self._settings.period_s)
+
+    def _stop(self, who: str, reason: str) -> None:
+        if self._latch.stop(reason):
+            self._log.line("WARNING", f"emergency stop: {self._latch.reason}")
+            self._event(who, "stop", self._latch.reason)
+
+    def _trouble(self, kind: str, what: str, sentence: str, now: float) -> None:
+        if self._log.trouble(kind, sentence, now):
+            self._event("guard", what, sentence)
+
+    def _not_kept(self, why: str) -> None:
+        self._log.line("ERROR", f"{why}; the emergency stop would not outlive the guard")
+
+    def _event(self, who: str, what: str, detail: str) -> None:
+        self._record.add(who, what, detail, time.time(), self._clock())
+
+    def _answer(self, asked: object) -> Reply | Callable[[], Reply | None]:
+        request = asked if isinstance(asked, dict) else {}
+        what = request["do"]
+        if what == "status":
+            return self._status()
+        if what != "stop":
+            return {"refused": f"there is no request {str(what)[:40]!r}; the guard knows status and stop"}
+        self._stop("person", clean(request.get("reason")) or "somebody asked for it")
+        end = self._clock() + _KEPT_S
+
+        def kept() -> Reply | None:
+            if self._latch.kept or not self._latch.reason:
+                return self._status()
+            if self._latch.unkept or self._clock() > end:
+                why = self._latch.unkept or "the disk does not answer"
+                return {**self._status(), "note": f"the stop is in effect, but could not be kept: {why}"}
+            return None
+
+        return kept
+
+    def _status(self) -> dict[str, object]:
+        told, latch = self._watch.told, self._latch
+        if self._record.trouble:
+            self._troubles["record"] = self._record.trouble
+        return {
+            "stopped": latch.reason,
+            "kept": latch.kept,
+            "linear_m_s": told.velocity.linear,
+            "angular_rad_s": told.velocity.angular,
+            "told_s_ago": round(self._clock() - told.at, 3) if told.at == told.at else None,
+            "pid": os.getpid(),
+            "gate_pid": self._gate.pid if self._gate is not None else 0,
+            "writer_pid": self._writer.pid if self._writer is not None else 0,
+            "gate_restarts": self._restarts.get("gate", 0),
+            "writer_restarts": self._restarts.get("writer", 0),
+            "seconds": round(self._clock() - self._started, 1),
+            "not_permitted": list(self._refused),
+            "troubles": list(self._troubles.values()),
+        }
+
+
+def _take_folder(folder: str) -> int:
+    try:
+        os.makedirs(folder, exist_ok=True)
+        lock = os.open(os.path.join(folder, LOCK_FILE), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise GuardError(f"cannot use the folder {folder} for the gate's sockets: {error.strerror}") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise GuardError(f"another gate runs in {folder}; end it, or name another safety.folder") from error
+    return lock

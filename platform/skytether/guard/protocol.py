@@ -1,0 +1,123 @@
+"""Bytes between guard, gate and writer: whole packets on socket pairs, and a velocity for the wheels. Pure.
+
+All times are `clock.now` [s]. What was told carries when it was: whoever reads it later knows how much of it counts.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import nan
+from typing import NamedTuple
+
+from .velocity import STANDSTILL, Velocity
+
+REASON_BYTES = 200
+"""Of a reason; the rest is cut off."""
+LARGEST = 512
+"""Bytes of a packet between guard, gate and writer."""
+NOTE_BYTES = 400
+STOP_SOCKET = "stop.sock"
+"""In the gate's folder: the guard's own way to stop the robot; one request and one answer, both JSON."""
+
+_BEAT = struct.Struct("<4sddddddIB")
+_ANSWER = struct.Struct("<4sddddIB")
+_TWIST = struct.Struct("<4s6d")
+_BEAT_MAGIC, _ANSWER_MAGIC, _NOTE_MAGIC = b"SkB2", b"SkA2", b"SkN2"
+_LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
+_TAKE, _KEPT = 1, 2
+
+
+class Told(NamedTuple):
+    """What the wheels were told last, and when; ``at`` is NaN if they never were."""
+
+    velocity: Velocity = STANDSTILL
+    at: float = nan
+
+
+class Beat(NamedTuple):
+    """What the gate tells the guard at every turn, and the guard a writer."""
+
+    at: float
+    velocity: Velocity
+    """Wanted."""
+    wrote: Told = Told()
+    """What the sender itself told the wheels last, while the receiver did not."""
+    seen: int = 0
+    """The newest generation of the emergency stop that the sender knows."""
+    reset: bool = False
+    """A person wants the emergency stop ``seen`` to end, and the button allows it."""
+    stopped: str = ""
+    """The sender's own emergency stop; empty: it has none."""
+
+
+class Answer(NamedTuple):
+    """What the guard answers, and a writer the guard."""
+
+    at: float
+    told: Told
+    generation: int = 0
+    """Counts the changes of the emergency stop."""
+    take: bool = False
+    """The guard's own way to the wheels is gone: the gate is to stop them by its own."""
+    kept: bool = True
+    """The emergency stop is on disk as it is."""
+    stopped: str = ""
+    """Why the robot stands until a person resets it; empty: it does not."""
+
+
+def pack_beat(beat: Beat) -> bytes:
+    """For the guard or a writer."""
+    head = _BEAT.pack(
+        _BEAT_MAGIC, beat.at, *beat.velocity, *beat.wrote.velocity, beat.wrote.at, beat.seen & 0xFFFFFFFF, beat.reset
+    )
+    return head + cut(beat.stopped, REASON_BYTES)
+
+
+def unpack_beat(data: bytes) -> Beat | None:
+    """None: the bytes are none."""
+    if not _BEAT.size <= len(data) <= _BEAT.size + REASON_BYTES or data[:4] != _BEAT_MAGIC:
+        return None
+    _, at, linear, angular, own_linear, own_angular, own_at, seen, reset = _BEAT.unpack_from(data)
+    wrote = Told(Velocity(own_linear, own_angular), own_at)
+    return Beat(at, Velocity(linear, angular), wrote, seen, reset == 1, _text(data[_BEAT.size :]))
+
+
+def pack_answer(answer: Answer) -> bytes:
+    """For the gate or the guard."""
+    flags = (_TAKE if answer.take else 0) | (_KEPT if answer.kept else 0)
+    told = answer.told
+    head = _ANSWER.pack(_ANSWER_MAGIC, answer.at, *told.velocity, told.at, answer.generation & 0xFFFFFFFF, flags)
+    return head + cut(answer.stopped, REASON_BYTES)
+
+
+def unpack_answer(data: bytes) -> Answer | None:
+    """None: the bytes are none."""
+    if not _ANSWER.size <= len(data) <= _ANSWER.size + REASON_BYTES or data[:4] != _ANSWER_MAGIC:
+        return None
+    _, at, linear, angular, told_at, generation, flags = _ANSWER.unpack_from(data)
+    told = Told(Velocity(linear, angular), told_at)
+    return Answer(at, told, generation, flags & _TAKE != 0, flags & _KEPT != 0, _text(data[_ANSWER.size :]))
+
+
+def pack_note(text: str) -> bytes:
+    """Something that the gate wants in the guard's event record."""
+    return _NOTE_MAGIC + cut(text, NOTE_BYTES)
+
+
+def unpack_note(data: bytes) -> str | None:
+    """None: the bytes are none."""
+    return _text(data[4 : 4 + NOTE_BYTES]) if data[:4] == _NOTE_MAGIC else None
+
+
+def pack_twist(velocity: Velocity) -> bytes:
+    """A geometry_msgs/msg/Twist as CDR, little endian."""
+    return _TWIST.pack(_LITTLE_ENDIAN_CDR, velocity.linear, 0.0, 0.0, 0.0, 0.0, velocity.angular)
+
+
+def cut(text: str, most: int) -> bytes:
+    """At most so many bytes of UTF-8, whole characters; what is none (a lone surrogate) becomes a question mark."""
+    return text.encode(errors="replace")[:most].decode(errors="ignore").encode()
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="replace")

@@ -1,0 +1,122 @@
+"""A socket for people's requests within a loop that never waits: one request, one answer, both JSON.
+
+Clients that say nothing cost nothing, and when there are too many the one that waited longest goes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+_CLIENTS = 16
+"""At the same time; people are few, and each needs a moment."""
+_EACH_TURN = 4
+"""Requests and new clients in one turn of a loop."""
+_LARGEST = 4096
+
+Reply = Mapping[str, object]
+Handler = Callable[[Mapping[str, object]], "Reply | Callable[[], Reply | None]"]
+"""Gets a request; gives the answer, or something to be asked at every turn until it has one."""
+
+
+class Requests:
+    """The socket and its clients.
+
+    Args:
+        path: Of the socket; only the own user may open it.
+        handle: What to do with a request.
+
+    Raises:
+        OSError: The path cannot be had.
+    """
+
+    def __init__(self, path: str, handle: Handler) -> None:
+        self._handle = handle
+        self._clients: dict[socket.socket, Callable[[], Reply | None] | None] = {}
+        with suppress(FileNotFoundError):
+            os.unlink(path)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.setblocking(False)
+        before = os.umask(0o177)
+        try:
+            self._listener.bind(path)
+        finally:
+            os.umask(before)
+        self._listener.listen(_CLIENTS)
+
+    def sockets(self) -> list[socket.socket]:
+        """What to wait for."""
+        return [self._listener, *(client for client, pending in self._clients.items() if pending is None)]
+
+    def turn(self) -> None:
+        """Take what is there, answer what can be answered. Never waits."""
+        for client, pending in list(self._clients.items()):
+            answer = pending() if pending is not None else None
+            if answer is not None:
+                self._send(client, answer)
+        ready, _, _ = select.select(self.sockets(), [], [], 0)
+        for source in ready[:_EACH_TURN]:
+            if source is self._listener:
+                self._accept()
+            else:
+                self._take(source)
+
+    def close(self) -> None:
+        """Close all."""
+        for client in [self._listener, *self._clients]:
+            client.close()
+
+    def _accept(self) -> None:
+        for _ in range(_EACH_TURN):
+            try:
+                client, _ = self._listener.accept()
+            except OSError:  # nobody more
+                return
+            client.setblocking(False)
+            if len(self._clients) >= _CLIENTS:
+                idle = [known for known, pending in self._clients.items() if pending is None]
+                self._drop(next(iter(idle or self._clients)))
+            self._clients[client] = None
+            self._take(client)
+
+    def _take(self, client: socket.socket) -> None:
+        try:
+            data = client.recv(_LARGEST)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client)
+            return
+        answer = self.answer(data)
+        if callable(answer):
+            self._clients[client] = answer
+        else:
+            self._send(client, answer)
+
+    def answer(self, data: bytes) -> Reply | Callable[[], Reply | None]:
+        """What a request gets; whatever it is, this does not raise."""
+        try:
+            asked = json.loads(data)
+        except (ValueError, RecursionError):
+            asked = None
+        if not isinstance(asked, dict) or not isinstance(asked.get("do"), str):
+            return {"refused": 'the request must be JSON such as {"do": "status"}'}
+        try:
+            return self._handle(asked)
+        except Exception as error:  # a bug in an answer must not stop the loop
+            return {"refused": f"the request failed: {type(error).__name__}: {error}"}
+
+    def _send(self, client: socket.socket, answer: Reply) -> None:
+        with suppress(OSError, ValueError):  # who does not take the answer goes without
+            client.send(json.dumps(answer, allow_nan=False).encode())
+        self._drop(client)
+
+    def _drop(self, client: socket.socket) -> None:
+        self._clients.pop(client, None)
+        client.close()

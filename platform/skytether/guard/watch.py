@@ -1,0 +1,94 @@
+"""What the wheels are told next. Pure: time is an argument.
+
+It starts from what the wheels were really told last, never from what somebody wanted: a gap in the telling, a failed
+write, or nobody who listens counts as standstill, because drives that hear nothing stop by themselves.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from .kinematics import Bounds, brake, toward
+from .protocol import Beat, Told
+from .velocity import STANDSTILL, Velocity
+
+_ROUNDING = 1e-6
+
+
+class Watch:
+    """Follows what is wanted while that is fresh, a number and within the limits; else brakes.
+
+    Args:
+        bounds: Of the wheels.
+        period_s: Of the loop; what a step counts for when the time before is not known [s].
+        patience_s: Oldest word that is followed, and longest gap in the telling that is no standstill [s].
+    """
+
+    def __init__(self, bounds: Bounds, period_s: float, patience_s: float) -> None:
+        self.told = Told()
+        """What the wheels were told last."""
+        self._bounds = bounds
+        self._period_s = period_s
+        self._patience_s = patience_s
+        self._beat: Beat | None = None
+
+    def hear(self, beat: Beat) -> None:
+        """Take in what is wanted, and what the sender told the wheels itself."""
+        self._beat = beat
+        self.learn(beat.wrote)
+
+    def forget(self) -> None:
+        """Whoever said what is wanted is gone."""
+        self._beat = None
+
+    def learn(self, told: Told) -> None:
+        """Somebody else told the wheels something; the newest counts."""
+        if not self.told.at >= told.at and isfinite(told.at) and _finite(told.velocity):
+            self.told = told
+
+    def wrote(self, velocity: Velocity, at: float) -> None:
+        """The wheels were told so."""
+        self.told = Told(velocity, at)
+
+    def failed(self, at: float) -> None:
+        """The wheels could not be told anything, or nobody listens."""
+        self.told = Told(STANDSTILL, at)
+
+    def want(self, now: float, stopped: bool = False) -> tuple[Velocity, str]:
+        """Decide what the wheels are told now.
+
+        Args:
+            now: [s]
+            stopped: Brake, whatever is wanted.
+
+        Returns:
+            The velocity, and what is wrong with the one who says what is wanted (empty: nothing).
+        """
+        wrong = self._wrong(now)
+        gap = now - self.told.at
+        if 0 <= gap <= self._patience_s:
+            base, step = self.told.velocity, gap
+        elif gap > self._patience_s or not isfinite(self.told.at):
+            base, step = STANDSTILL, self._period_s
+        else:  # the clock went back, or is no number
+            return brake(self._bounds, self.told.velocity, self._period_s), wrong or "has a clock that went back"
+        if wrong or stopped or self._beat is None:
+            return brake(self._bounds, base, step), wrong
+        return toward(self._bounds, base, self._beat.velocity, step), ""
+
+    def _wrong(self, now: float) -> str:
+        beat, bounds = self._beat, self._bounds
+        if beat is None or not 0 <= now - beat.at + _ROUNDING <= self._patience_s:
+            return "says nothing"
+        linear, angular = beat.velocity
+        if not _finite(beat.velocity):
+            return "sends what is no number"
+        if not bounds.linear_min - _ROUNDING <= linear <= bounds.linear_max + _ROUNDING:
+            return f"wants {linear:g} m/s, which is beyond the limits"
+        if abs(angular) > bounds.angular_max + _ROUNDING:
+            return f"wants {angular:g} rad/s, which is beyond the limits"
+        return ""
+
+
+def _finite(velocity: Velocity) -> bool:
+    return isfinite(velocity.linear) and isfinite(velocity.angular)

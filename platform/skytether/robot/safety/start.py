@@ -1,0 +1,53 @@
+"""From a checked configuration to the guard's process, which has none of what checking needs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import NoReturn
+
+from skytether.guard.settings import Settings, dump, freeze
+
+from .config import SafetyConfig, SocketsConfig, address
+from .protocol import WHEELS_SOCKET
+
+_PYTHON = (sys.executable, "-P")
+
+
+def become_guard(config: SafetyConfig) -> NoReturn:
+    """Replace this process by the guard. What is to be said is said by it, whose log is never waited for.
+
+    Raises:
+        OSError: A host's name is not known, or the kernel refuses.
+    """
+    config = config.frozen()
+    settings = guard_settings(config, freeze("skytether-gate", config.model_dump_json()))
+    file = freeze("skytether-guard", dump(settings))
+    os.execv(sys.executable, [*_PYTHON, "-m", "skytether.guard", str(file)])  # noqa: S606 - a list of arguments
+
+
+def guard_settings(config: SafetyConfig, file: int) -> Settings:
+    """What the guard is told.
+
+    Args:
+        config: Frozen, see `SafetyConfig.frozen`.
+        file: Descriptor of the configuration of gate and writer.
+    """
+    on_graph = config.ros1 is not None or config.ros2 is not None
+    sockets = config.sockets or SocketsConfig()
+    wheels = str(config.place() / WHEELS_SOCKET) if sockets.wheels is None else address(sockets.wheels)
+    say = [f"guards the wheels; its sockets are in {config.place()}"]
+    if not config.sensors:
+        say.append("safety.sensors is empty: the robot does not see what it drives into")
+    return Settings(
+        folder=str(config.place()),
+        record=str(config.record_file()),
+        period_s=1 / config.rate_hz,
+        patience_s=config.guard_s,
+        bounds=config.bounds(),
+        wheels=None if on_graph else wheels,
+        gate=(*_PYTHON, "-m", "skytether.robot.safety.gate"),
+        writer=(*_PYTHON, "-m", "skytether.robot.safety.writer") if on_graph else (),
+        config=file,
+        say=tuple(say),
+    )

@@ -1,0 +1,146 @@
+"""The writer as a process: ``python -m skytether.robot.safety.writer FD CONFIG``, started by the guard.
+
+It publishes on the robot's graph what the guard wants, and answers what it told, and whether anybody listens. The
+guard has no library of a graph in its process so. A writer whose guard is silent brakes by itself, ramped from what it
+told last, and keeps saying standstill.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import select
+import signal
+import socket
+import sys
+from collections.abc import Callable
+
+from skytether.guard import privileges
+from skytether.guard.clock import now as boottime
+from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat
+from skytether.guard.settings import thaw
+from skytether.guard.velocity import STANDSTILL
+from skytether.guard.watch import Watch
+from skytether.messages import Twist, warm
+from skytether.robot.notices import Notices
+
+from .config import SafetyConfig
+from .hardware import Wheels
+from .process import log_without_waiting
+from .ways import open_wheels
+
+_log = logging.getLogger("skytether.writer")
+_SLACK = 1.25
+"""Periods without a word of the guard after which the wheels are told anew."""
+_LAST_STOPS_S = 0.5
+"""How long a writer without a guard says standstill before it ends."""
+_PACKETS = 64
+
+
+class Writer:
+    """The loop.
+
+    Args:
+        config: The section of robot.yaml.
+        guard: The socket to the guard; whole packets, never waits.
+        wheels: On the graph.
+        clock: `skytether.guard.clock.now`; replaced by tests only.
+    """
+
+    def __init__(
+        self, config: SafetyConfig, guard: socket.socket, wheels: Wheels, clock: Callable[[], float] = boottime
+    ) -> None:
+        self._guard = guard
+        self._wheels = wheels
+        self._clock = clock
+        self._period = 1 / config.rate_hz
+        self._watch = Watch(config.bounds(), self._period, config.guard_s)
+        self._notices = Notices(_log)
+        self._listeners: frozenset[str] = frozenset()
+        self._gone = False
+        self._due = clock()
+
+    def run(self) -> None:
+        """Write until the guard is gone, then stop the wheels."""
+        while not self._gone:
+            select.select([self._guard], [], [], max(0.0, min(self._due - self._clock(), self._period)))
+            self.turn()
+        _log.error("the guard is gone; the writer stops the wheels and ends")
+        stood = 0.0
+        while stood < _LAST_STOPS_S:
+            select.select([], [], [], self._period)
+            self._tell(self._clock())
+            stood = stood + self._period if self._watch.told.velocity == STANDSTILL else 0.0
+
+    def turn(self) -> None:
+        """Take in what the guard wants, and tell the wheels if it is time."""
+        now = self._clock()
+        if not self._hear() and now < self._due:
+            return
+        self._tell(now)
+        self._due = now + _SLACK * self._period
+        try:
+            self._guard.send(pack_answer(Answer(now, self._watch.told)))
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._gone = True
+
+    def _hear(self) -> bool:
+        newest = None
+        for _ in range(_PACKETS):
+            try:
+                data = self._guard.recv(LARGEST)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""
+            if not data:
+                self._gone = True
+                self._watch.forget()
+                break
+            newest = unpack_beat(data) or newest
+        if newest is not None:
+            self._watch.hear(newest)
+        return newest is not None
+
+    def _tell(self, now: float) -> None:
+        listeners = self._wheels.listeners()
+        if listeners is not None:
+            if not listeners & self._listeners:
+                self._watch.failed(now)  # nobody, or somebody who knows nothing of what was told before
+            self._listeners = listeners
+        velocity, _ = self._watch.want(now)
+        if self._clock() - now > self._period:
+            return  # this process stood still in between
+        try:
+            self._wheels.write(velocity)
+            self._watch.wrote(velocity, now)
+        except Exception as error:  # tried again in a moment
+            self._watch.failed(now)
+            self._notices.say("wheels", f"the wheels cannot be told anything: {error}", now)
+
+
+def main() -> None:
+    """Run as the guard's child."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends when the guard does, with the wheels at a standstill
+    config = SafetyConfig.model_validate_json(thaw(int(sys.argv[2])))
+    logging.basicConfig(format="%(levelname)s writer: %(message)s", level=logging.INFO)
+    log_without_waiting()
+    guard = socket.socket(fileno=int(sys.argv[1]))
+    guard.setblocking(False)
+    warm([Twist], "cdr" if config.ros1 is None else "ros1")
+    privileges.take(privileges.WRITER)
+    wheels = open_wheels(config, "guard")
+    writer = Writer(config, guard, wheels)
+    gc.collect()
+    gc.freeze()
+    try:
+        writer.run()
+    finally:
+        wheels.close()
+
+
+if __name__ == "__main__":
+    main()

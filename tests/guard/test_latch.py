@@ -1,0 +1,109 @@
+"""The emergency stop on disk: whatever is found there, only a whole release of this boot releases."""
+
+import os
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.guard.latch import FIRST_ACT, SIZE, Keeper, Latch, clean, decode, encode
+
+BOOT = "7f0c"
+
+
+@pytest.mark.parametrize(
+    "reason", ["released", "stopped", "released\n7f0c\n", "\udcff\udc00", "x" * 9999, "a\nb", "ö" * 300]
+)
+def test_no_reason_looks_like_a_release(reason):
+    kept = encode(reason, BOOT)
+    assert len(kept) == SIZE
+    assert decode(kept, BOOT) != ""
+    assert clean(reason)[:5] in decode(kept, BOOT)
+
+
+def test_a_release_holds_for_its_boot_only():
+    assert decode(encode("", BOOT), BOOT) == ""
+    assert decode(encode("", BOOT), "another") == FIRST_ACT
+    assert decode(encode("", ""), "") == FIRST_ACT
+    assert decode(None, BOOT) == FIRST_ACT
+
+
+@given(st.integers(0, SIZE - 1))
+def test_a_torn_file_is_stopped(size):
+    assert decode(encode("", BOOT)[:size], BOOT) != ""
+
+
+@given(st.binary(max_size=600))
+def test_any_other_file_is_stopped(data):
+    assert decode(data, BOOT) != ""
+
+
+def test_a_reason_is_said_once_to_be_from_before():
+    once = decode(encode("somebody fell", BOOT), BOOT)
+    assert once == "somebody fell (before the guard was started again)"
+    assert decode(encode(once, BOOT), BOOT) == once
+    assert decode(encode(FIRST_ACT, BOOT), BOOT) == FIRST_ACT
+
+
+@given(st.text())
+def test_a_reason_is_one_line(reason):
+    assert all(c.isprintable() for c in clean(reason))
+    assert len(clean(reason).encode()) <= 200
+
+
+def wait(condition):
+    """Threads write when they may."""
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_acknowledged_is_kept(tmp_path):
+    path = str(tmp_path / "latch")
+    keeper = Keeper(path, BOOT, pytest.fail)
+    latch = Latch(keeper)
+    assert latch.reason == FIRST_ACT
+    assert not latch.kept
+    keeper.start()
+    wait(lambda: latch.kept)
+    assert not latch.reset(latch.generation - 1)  # somebody who knows another stop
+    assert latch.reset(latch.generation)
+    wait(lambda: latch.kept)
+    assert Keeper(path, BOOT, pytest.fail).before() == ""
+    assert latch.stop("released")
+    assert not latch.stop("the first reason is kept")
+    wait(lambda: latch.kept)
+    assert Keeper(path, BOOT, pytest.fail).before() == "released (before the guard was started again)"
+
+
+def test_what_cannot_be_kept_is_said(tmp_path):
+    folder = tmp_path / "latch"
+    folder.mkdir()
+    told = []
+    keeper = Keeper(str(folder), BOOT, told.append)
+    latch = Latch(keeper)
+    assert "cannot be read" in latch.reason
+    keeper.start()
+    wait(lambda: bool(told))
+    assert "directory" in told[0]
+    assert not latch.kept
+    assert "directory" in latch.unkept
+
+
+def test_where_nothing_can_be_written_a_release_is_taken_away(tmp_path, monkeypatch):
+    path = tmp_path / "latch"
+    path.write_bytes(encode("", BOOT))
+    keeper = Keeper(str(path), BOOT, lambda why: 1 / 0)  # nothing ends the thread
+    latch = Latch(keeper)
+    assert latch.reason == ""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    keeper.start()
+    latch.stop("somebody fell")
+    wait(lambda: latch.kept)
+    assert Keeper(str(path), BOOT, pytest.fail).before() == FIRST_ACT
