@@ -58,6 +58,7 @@ TOGETHER = (
     "orchestrator/test_tls_and_logs.py",
     "robot/safety/test_footprint.py",
     "robot/safety/test_rules.py",
+    "robot/safety/test_sensing.py",
     "robot/test_arbiter.py",
     "robot/test_ros2.py",
     "robot/test_supervisor.py",

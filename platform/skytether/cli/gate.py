@@ -71,7 +71,8 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     if json:
         print_json(answer)
         return
-    way = "nothing near" if answer["way_m"] is None else f"{answer['way_m']:.2f} m to the stop zone"
+    nothing = "not all of it is seen" if answer["zone"] == "unknown" else "nothing near"
+    way = nothing if answer["way_m"] is None else f"{answer['way_m']:.2f} m to the stop zone"
     print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
     print(f"ahead     {answer['zone']}: {way}")
     print(f"stopped   {answer['stopped'] or 'no'}")

@@ -8,7 +8,7 @@ from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
 from skytether.messages import Joy, LaserScan, Range
 from skytether.robot.safety.config import SafetyConfig, address, default_folder
-from skytether.robot.safety.sensing import Action
+from skytether.robot.safety.coverage import Action
 
 LEAST = {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}}
 

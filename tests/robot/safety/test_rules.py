@@ -14,12 +14,13 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Time, Twist
 from skytether.robot.command import Command
 from skytether.robot.notices import Notices
+from skytether.robot.safety.coverage import Action
 from skytether.robot.safety.footprint import Points, polygon
 from skytether.robot.safety.joystick import JoystickParams
 from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.ranges import Mount
 from skytether.robot.safety.rules import Decision, Gate, Rules
-from skytether.robot.safety.sensing import Action, RangeSensor
+from skytether.robot.safety.sensing import RangeSensor
 from skytether.robot.safety.sources import Hand, SourceRules
 from skytether.robot.safety.zones import Zone, ZoneParams
 from skytether.robot.supervisor import Limits, Objection

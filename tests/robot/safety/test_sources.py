@@ -12,6 +12,7 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, Time, Twist, TwistStamped, Vector3
 from skytether.robot.command import Command
 from skytether.robot.safety import joystick, neutral
+from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.joystick import RELEASED_S, Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams
@@ -27,6 +28,7 @@ NAVIGATION, KEYBOARD = SourceParams("navigation", 20, 0.5), SourceParams("keyboa
 RULES = Rules(
     footprint=circle(0.3),
     limits=LIMITS,
+    unseen=UnseenParams(Action.FREE),  # it has no sensors
     sources=SourceRules(
         joystick=PAD,
         further={"nav_vel": NAVIGATION, "key_vel": KEYBOARD},

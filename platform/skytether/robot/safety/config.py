@@ -5,23 +5,21 @@ from __future__ import annotations
 import os
 import socket
 from dataclasses import replace
-from math import radians
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
-from skytether.messages import LaserScan, Message, Range
+from skytether.messages import Message
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name
 
 from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
 from .protocol import default_folder, default_record
-from .ranges import Mount
 from .rules import Rules
-from .sensing import Action, RangeSensor
+from .sensor_config import SensorConfig, UnseenConfig
 from .source_config import SourcesConfig
 from .stopping import Stages
 from .zones import ZoneParams
@@ -47,51 +45,6 @@ class OutlineConfig(Numbers):
     def footprint(self) -> Footprint:
         """The outline as geometry."""
         return polygon(self.polygon) if self.polygon is not None else circle(self.radius or 0.0)
-
-
-class SensorConfig(Numbers):
-    """A laser or a sonar, as it is mounted."""
-
-    kind: Literal["laser", "sonar"] = "laser"
-    """sensor_msgs/msg/LaserScan or sensor_msgs/msg/Range."""
-    x: Metres = 0.0
-    """Forward of the base's origin [m]."""
-    y: Metres = 0.0
-    """Left of it [m]."""
-    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Where its middle looks; positive to the left."""
-    upside_down: bool = False
-    range_min: Annotated[float, Field(ge=0)] = 0.0
-    """[m]; 0: as its messages say."""
-    range_max: Annotated[float, Field(ge=0)] = 0.0
-    """[m]; 0: as its messages say."""
-    ignore_deg: tuple[tuple[float, float], ...] = ()
-    """Sectors (from, to), in its own angles, in which it sees the robot itself."""
-    max_gap_deg: Annotated[float, Field(ge=0, le=360)] = 5.0
-    """Widest sector without a reading that is not blindness."""
-    no_echo_is_free: bool = False
-    """NaN and zero mean that nothing is there (lasers outdoors); never where all readings are such."""
-    max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Silence after which it is stale."""
-    on_unknown: Literal["stop", "slow"] = "stop"
-    """When it is blind, silent or makes no sense."""
-    on_empty: Literal["stop", "slow", "free"] = "slow"
-    """When a laser reports nothing within reach in any direction."""
-
-    def sensor(self) -> RangeSensor:
-        """The sensor as the rules take it."""
-        mount = Mount(
-            x=self.x,
-            y=self.y,
-            yaw=radians(self.yaw_deg),
-            upside_down=self.upside_down,
-            range_min=self.range_min,
-            range_max=self.range_max,
-            ignore=tuple((radians(first), radians(last)) for first, last in self.ignore_deg),
-            max_gap=radians(self.max_gap_deg),
-            no_echo_is_free=self.no_echo_is_free,
-        )
-        return RangeSensor(mount, self.max_age_s, Action(self.on_unknown), Action(self.on_empty))
 
 
 class SocketsConfig(Numbers):
@@ -160,7 +113,9 @@ class SafetyConfig(SourcesConfig):
     """Of the wheels, whoever drives; null: the file's own ``limits``."""
     zones: ZoneParams = ZoneParams()
     sensors: Annotated[dict[Topic, SensorConfig], Field(max_length=32)]
-    """By topic. Without any the robot is blind and drives all the same: write ``{}`` to have that."""
+    """By topic. Without any (``{}``) the robot is blind, and all that it does is moving where no sensor looks."""
+    unseen: UnseenConfig = UnseenConfig()
+    """Moving where no sensor looks."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
@@ -204,6 +159,7 @@ class SafetyConfig(SourcesConfig):
             limits=limits,
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
+            unseen=self.unseen.params(),
             stages=stages,
             sources=self.source_rules(),
         )
@@ -242,9 +198,7 @@ class SafetyConfig(SourcesConfig):
 
     def kinds(self) -> dict[str, type[Message]]:
         """Message type of each topic that the gate listens to."""
-        kinds: dict[str, type[Message]] = {
-            name: LaserScan if sensor.kind == "laser" else Range for name, sensor in self.sensors.items()
-        }
+        kinds = {name: sensor.message() for name, sensor in self.sensors.items()}
         return kinds | dict(self.source_kinds())
 
 

@@ -64,6 +64,17 @@ class Footprint:
         beyond: NDArray[np.float64] = (points @ self._normals.T - self._offsets).max(axis=1)
         return beyond
 
+    def ways_out(self, origin: tuple[float, float], bearings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far it is from a point within the outline to its edge [m], by direction [rad]; 0 from outside."""
+        inside = np.maximum(self._offsets - self._normals @ np.asarray(origin), 0.0)
+        if not (self.outside(np.array([origin])) <= 0).all():
+            return np.zeros(len(bearings))
+        rates = np.column_stack((np.cos(bearings), np.sin(bearings))) @ self._normals.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ways = np.where(rates > 0, inside / rates, inf)
+        nearest: NDArray[np.float64] = ways.min(axis=1)
+        return nearest
+
     def time_to_contact(self, points: Points, linear: float, angular: float) -> float:
         """When the first of the points, which stand still, is touched if the robot goes on like that.
 

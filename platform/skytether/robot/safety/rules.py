@@ -18,9 +18,10 @@ from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import kinematics as reach
+from .coverage import Action, Unseen, UnseenParams
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
-from .sensing import Action, RangeSensor, Sensing
+from .sensing import RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
 from .stopping import Stages
 from .zones import Allowed, Zone, ZoneParams, Zones
@@ -40,6 +41,7 @@ class Rules:
         limits: The supervisor's; `max_gap_s` is the age at which a command of the agent ends.
         zones: Sizes of the zones.
         sensors: By topic.
+        unseen: What to do about moving where none of them looks.
         sources: Who may drive, and who may stop the robot.
         stages: Latencies from the light to the brakes.
     """
@@ -48,6 +50,7 @@ class Rules:
     limits: Limits = field(default_factory=Limits)
     zones: ZoneParams = field(default_factory=ZoneParams)
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
+    unseen: UnseenParams = field(default_factory=UnseenParams)
     sources: SourceRules = field(default_factory=SourceRules)
     stages: Stages = field(default_factory=Stages)
 
@@ -60,7 +63,7 @@ class Decision:
         velocity: For the wheels.
         hand: Who drives: a `Hand`, or the name of a further source.
         zone: What lies ahead.
-        way: Of the outermost corner until the stop zone [m]; inf: nothing near.
+        way: Of the outermost corner until what is seen gets into the stop zone [m]; inf: nothing that is seen is near.
         share: Of the wanted velocity that zones and sensors left.
         troubles: All that stands in the way now: a sentence for people, by kind.
     """
@@ -88,7 +91,8 @@ class Gate:
         self._zones = Zones(rules.zones, rules.footprint, rules.limits, rules.stages)
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
-        self._sensing = Sensing(rules.sensors, rules.limits.clock_tolerance_s)
+        self._sensing = Sensing(rules.sensors, rules.footprint, rules.limits.clock_tolerance_s)
+        self._unseen = Unseen(rules.unseen, rules.footprint, rules.zones.slow_speed)
         oldest = max((sensor.max_age_s for sensor in rules.sensors.values()), default=0.0)
         self._reckoning = DeadReckoning(oldest + rules.stages.reaction_s(0.0))
         self._zone = Zone.CLEAR
@@ -126,6 +130,7 @@ class Gate:
         """
         refused = self._sources.reset(now)
         if not refused:
+            self._sensing.relearn()
             self._supervised = replace(
                 self._supervised, held={k: replace(v, received_at=-inf) for k, v in self._supervised.held.items()}
             )
@@ -178,7 +183,6 @@ class Gate:
         if not (isfinite(velocity.linear) and isfinite(velocity.angular)):
             velocity = STANDSTILL
         self._supervised = replace(self._supervised, velocity=velocity)
-        self._zone = allowed.zone
         return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
     def _supervise(self, hand: str, now: float, troubles: dict[str, str]) -> Velocity:
@@ -197,8 +201,16 @@ class Gate:
         troubles.update(scene.troubles)
         varied = self._reckoning.varied(now - scene.age - self._rules.stages.late_s, wanted)
         allowed = self._zones.allow(wanted, scene.points, varied, self._zone)
+        self._zone = allowed.zone
+        covers = [part.cover for part in scene.parts]
+        unseen = self._unseen.share(wanted, covers, self._zones.way(wanted))
+        if unseen < 1:
+            verb = "does not go there" if unseen == 0 else "goes there slowly"
+            troubles["unseen"] = f"no sensor looks where the robot is to move (safety.unseen); it {verb}"
         most = {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[scene.action]
-        return replace(allowed, share=min(allowed.share, most))
+        unknown = allowed.zone is not Zone.STOP and (scene.unknown or unseen < 1)
+        zone = Zone.UNKNOWN if unknown else allowed.zone
+        return replace(allowed, share=min(allowed.share, most, unseen), zone=zone)
 
     def _hear(self, topic: str, message: Message, now: float) -> None:
         command, wrong = self._sources.hear(topic, message, now)

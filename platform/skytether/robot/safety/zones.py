@@ -38,6 +38,8 @@ class Zone(StrEnum):
     CLEAR = "clear"
     SLOW = "slow"
     STOP = "stop"
+    UNKNOWN = "unknown"
+    """Nothing is known to be in the way, but not all of it is seen. `Zones` itself never says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,14 @@ class Zones:
         """The share of a velocity that is not faster than the slow zone allows."""
         speed = self.speed(velocity)
         return min(1.0, self._params.slow_speed / speed) if speed else 1.0
+
+    def way(self, velocity: Velocity) -> float:
+        """Of the outermost corner until it stands, and the room that it must have then [m]."""
+        speed = self.speed(velocity)
+        if speed == 0:
+            return self._params.stop_m
+        slowdown = kinematics.slowdown(self._limits, velocity)
+        return speed * (self._stages.reaction_s(0.0) + 0.5 / slowdown) + self._params.stop_m
 
     def allow(self, velocity: Velocity, points: Points, varied: Variation, before: Zone) -> Allowed:
         """Say what share of a velocity is safe.

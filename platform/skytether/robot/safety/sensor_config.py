@@ -1,0 +1,111 @@
+"""The part of the section ``safety`` of robot.yaml that is about sensors: what people write, checked."""
+
+from __future__ import annotations
+
+from math import radians
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from skytether.messages import LaserScan, Message, Range
+
+from .config_base import Metres, Numbers
+from .coverage import Action, UnseenParams
+from .ranges import Mount
+from .sensing import RangeSensor
+from .stamps import StampRule
+
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Sector = tuple[Degrees, Degrees]
+"""From, and counter-clockwise to; the second below the first goes over the seam."""
+
+
+class SensorConfig(Numbers):
+    """A laser or a sonar, as it is mounted, and what its messages must be."""
+
+    kind: Literal["laser", "sonar"] = "laser"
+    """sensor_msgs/msg/LaserScan or sensor_msgs/msg/Range."""
+    x: Metres = 0.0
+    """Forward of the base's origin [m]."""
+    y: Metres = 0.0
+    """Left of it [m]."""
+    yaw_deg: Degrees = 0.0
+    """Where its middle looks; positive to the left."""
+    upside_down: bool = False
+    range_min: Annotated[float, Field(ge=0)] = 0.0
+    """[m]; 0: as its messages say."""
+    range_max: Annotated[float, Field(ge=0)] = 0.0
+    """[m]; 0: as its messages say."""
+    ignore_deg: Annotated[tuple[Sector, ...], Field(max_length=32)] = ()
+    """Sectors in its own angles in which it sees the robot itself; nothing else is seen there."""
+    fov_deg: Sector | None = None
+    """Sector in its own angles that it must look into; null: the widest that its messages have had so far."""
+    max_gap_deg: Annotated[float, Field(ge=0, le=360)] = 5.0
+    """Widest sector without a reading that is not blindness."""
+    max_step_deg: Annotated[float, Field(gt=0, le=90)] = 2.0
+    """From one ray of a laser to the next at most."""
+    min_rays: Annotated[int, Field(ge=1, le=20_000)] = 10
+    """Of a laser's scan."""
+    no_echo_is_free: bool = False
+    """NaN and zero mean that nothing is there (lasers outdoors); never where all readings are such."""
+    frame_id: Annotated[str, Field(max_length=255)] = ""
+    """Of its messages; others are not used. Empty: that of the first."""
+    stamps: Literal["auto", "required", "order"] = "auto"
+    """What is asked of their stamps: used if the first has one; needed; only their order (simulators)."""
+    max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.3
+    """Age of the newest measurement at which it is stale."""
+    on_unknown: Literal["stop", "slow"] = "stop"
+    """When it is blind, silent or makes no sense."""
+    on_empty: Literal["stop", "slow", "free"] = "slow"
+    """When a laser reports nothing within reach in any direction."""
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> SensorConfig:
+        fixed = self.kind == "sonar" and self.range_min == self.range_max
+        if self.range_min and self.range_max and not (self.range_min < self.range_max or fixed):
+            raise ValueError(f"range_min {self.range_min} must be below range_max {self.range_max}")
+        if self.fov_deg is not None and self.fov_deg[0] == self.fov_deg[1]:
+            raise ValueError("fov_deg must be a sector: two angles that differ")
+        return self
+
+    def message(self) -> type[Message]:
+        """Type of its messages."""
+        return LaserScan if self.kind == "laser" else Range
+
+    def sensor(self) -> RangeSensor:
+        """The sensor as the rules take it."""
+        mount = Mount(
+            x=self.x,
+            y=self.y,
+            yaw=radians(self.yaw_deg),
+            upside_down=self.upside_down,
+            range_min=self.range_min,
+            range_max=self.range_max,
+            ignore=tuple((radians(first), radians(last)) for first, last in self.ignore_deg),
+            fov=None if self.fov_deg is None else (radians(self.fov_deg[0]), radians(self.fov_deg[1])),
+            max_gap=radians(self.max_gap_deg),
+            max_step=radians(self.max_step_deg),
+            min_rays=self.min_rays,
+            no_echo_is_free=self.no_echo_is_free,
+        )
+        return RangeSensor(
+            mount,
+            self.max_age_s,
+            Action(self.on_unknown),
+            Action(self.on_empty),
+            self.frame_id,
+            StampRule(self.stamps),
+        )
+
+
+class UnseenConfig(Numbers):
+    """Moving where no sensor looks: backwards without eyes there, with a corner that swings out in a turn."""
+
+    action: Literal["stop", "slow", "free"] = "slow"
+    """``slow``: no part of the outline moves there faster than ``zones.slow_speed``."""
+    near_m: Annotated[float, Field(ge=0.01, le=2)] = 0.05
+    """So near to the outline nothing needs to be looked at: what stands there was seen before it came there."""
+
+    def params(self) -> UnseenParams:
+        """As the rules take it."""
+        return UnseenParams(Action(self.action), self.near_m)
