@@ -78,6 +78,8 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     print(f"stopped   {answer['stopped'] or 'no'}")
     for source, why in answer["waiting"].items():
         print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
+    for sentence in answer["beyond"]:
+        print(f"beyond    {sentence}")
     for sentence in answer["troubles"]:
         print(f"trouble   {sentence}")
 

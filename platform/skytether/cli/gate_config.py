@@ -27,14 +27,17 @@ class _GateFile(BaseModel):
 def inherit(document: Any) -> Any:
     """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
 
-    These are ``limits``, and of ``ros1`` or ``ros2``, unless the wheels are behind ``sockets``, where the graph and its
-    wheels are.
+    These are ``limits`` with their reasons in ``beyond``, and of ``ros1`` or ``ros2``, unless the wheels are behind
+    ``sockets``, where the graph and its wheels are.
     """
     if not isinstance(document, dict) or not isinstance(document.get("safety"), dict):
         return document
     safety = dict(document["safety"])
-    if isinstance(document.get("limits"), dict):
-        safety.setdefault("limits", document["limits"])
+    if isinstance(document.get("limits"), dict) and "limits" not in safety:
+        safety["limits"] = document["limits"]
+        reasons, own = document.get("beyond"), safety.get("beyond", {})
+        if isinstance(reasons, dict) and isinstance(own, dict):
+            safety["beyond"] = reasons | own
     for way, model in (("ros1", Ros1Way), ("ros2", Ros2Way)):
         graph, own = document.get(way), safety.get(way) or {}
         if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:

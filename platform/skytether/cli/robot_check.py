@@ -59,9 +59,17 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         findings += forbidden(graph.permissions(), specs, names, settings.command_topic)
         if settings.safety is None:
             findings.append(_wheels(graph.cmd_vel or "", graph, node))
+    findings += plausible(settings)
     if settings.safety is not None:
         findings.append(look_at_gate(settings.safety))
     return findings
+
+
+def plausible(settings: RobotConfig) -> list[Finding]:
+    """The numbers that the file says are meant to be beyond what is plausible; they will do."""
+    notes = list(settings.notes())
+    notes += [f"safety.{note}" for note in (settings.safety.notes() if settings.safety else ())]
+    return [Finding("beyond", "robot.yaml", "", note) for note in notes]
 
 
 def check_robot(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> bool:

@@ -15,6 +15,7 @@ from skytether.api.plain import oddity
 from skytether.messages import type_of
 from skytether.robot.arbiter import Needs
 from skytether.robot.graph_base import protected_names as graph_names
+from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.robot.status import DEFAULT_PORT
@@ -216,6 +217,8 @@ class RobotConfig(Strict):
     """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
     fallback: FallbackConfig = FallbackConfig()
     limits: dict[str, float] = {}
+    beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
+    """Limits that are meant to be beyond what is plausible: ``limits.NAME`` to reason."""
     """What the wheels may do: fields of ``skytether.robot.supervisor.Limits``."""
     needs: LinkNeeds = LinkNeeds()
     """What the link must be like at least."""
@@ -256,6 +259,15 @@ class RobotConfig(Strict):
         except ValueError as error:
             raise ValueError(str(error).removeprefix("limits: ")) from None
         return limits
+
+    @model_validator(mode="after")
+    def _is_plausible(self) -> RobotConfig:
+        self.notes()
+        return self
+
+    def notes(self) -> tuple[str, ...]:
+        """A sentence for each of the limits that is beyond its bounds."""
+        return check_plausible({"limits": self.limits}, self.beyond, "beyond")
 
     @model_validator(mode="after")
     def _has_a_graph(self) -> RobotConfig:

@@ -15,7 +15,7 @@ from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.node import Ros2Node
 from skytether.ros.ros2.qos import row_settings
 
-from .robot_check import Finding, forbidden, look_at_gate, look_at_orchestrator, show, unknown
+from .robot_check import Finding, forbidden, look_at_gate, look_at_orchestrator, plausible, show, unknown
 from .robot_config import RobotConfig, Ros2Config
 from .ros2_config import join_graph
 
@@ -92,6 +92,7 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
             findings += forbidden(config.permissions(), specs, names, settings.command_topic)
             if settings.safety is None:
                 findings.append(_wheels(config, node))
+    findings += plausible(settings)
     if settings.safety is not None:
         findings.append(look_at_gate(settings.safety))
     return findings

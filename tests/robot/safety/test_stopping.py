@@ -67,7 +67,7 @@ def test_a_gate_that_dies_on_the_way_to_a_wall_is_no_worse(rate):
 def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
     """A robot of any kind, among things of any kind, with an agent that wants anything."""
     rate = draw(st.sampled_from(rates))
-    acceleration, turning = draw(st.floats(0.3, 3.0)), draw(st.floats(0.5, 4.0))
+    acceleration, turning = draw(st.floats(0.3, 2.5)), draw(st.floats(0.5, 4.0))
     front, back, side = draw(st.floats(0.1, 0.6)), draw(st.floats(0.1, 0.6)), draw(st.floats(0.1, 0.4))
     robot = SafetyConfig.model_validate(
         {
@@ -87,7 +87,7 @@ def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
                 "sensing_s": draw(st.floats(0.001, 0.15)),
                 "reaction_s": draw(st.floats(0.01, 0.3)),
             },
-            "sensors": {"scan": {"range_max": 50.0, "max_gap_deg": 360}},
+            "sensors": {"scan": {"range_max": 50.0}},
             "rate_hz": rate,
             "guard_s": draw(st.floats(max(0.02, 2 / rate), 0.25)),
             "sockets": {},

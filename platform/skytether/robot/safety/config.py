@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
@@ -15,13 +16,14 @@ from skytether.messages import Message
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name
 
+from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
 from .protocol import default_folder, default_record
 from .rules import Rules
 from .sensor_config import SensorConfig, UnseenConfig
 from .source_config import SourcesConfig
-from .stopping import Stages
+from .stopping import Stages, shortfall
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"
@@ -132,6 +134,16 @@ class SafetyConfig(SourcesConfig):
     ros2: Ros2Way | None = None
     """Sensors and wheels are topics."""
 
+    beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
+    """Numbers that are meant to be beyond what is plausible: key below ``safety`` to reason."""
+
+    @model_validator(mode="after")
+    def _is_plausible(self) -> SafetyConfig:
+        self.notes()
+        if self.footprint.footprint().outside(np.zeros((1, 2)))[0] > 0:
+            raise ValueError("footprint: the origin of the base frame (0, 0) must be inside of it")
+        return self
+
     @model_validator(mode="after")
     def _fits_together(self) -> SafetyConfig:
         ways = [name for name in ("sockets", "ros1", "ros2") if getattr(self, name) is not None]
@@ -150,6 +162,23 @@ class SafetyConfig(SourcesConfig):
             raise ValueError(f"limits.max_gap_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
         return self
 
+    @model_validator(mode="after")
+    def _can_stop(self) -> SafetyConfig:
+        """The inequality of `stopping`, for what is known before anything is seen."""
+        limits, stages, outline = self.limits or Limits(), self.stages(), self.footprint.footprint()
+        braking = min(limits.linear_braking, limits.angular_braking * outline.radius)
+        wrong = shortfall(stages, self.zones.slow_speed, braking, 0.0, self.zones.slow_m)
+        if wrong:
+            raise ValueError(f"zones.slow_speed, zones.slow_m: {wrong}")
+        if self.sensors and all(sensor.range_max for sensor in self.sensors.values()):
+            name, eye = max(self.sensors.items(), key=lambda item: item[1].x + item[1].range_max)
+            front = float(outline.vertices[:, 0].max()) + self.zones.stop_m
+            way = eye.x + eye.range_max - front
+            wrong = shortfall(stages, limits.linear_max, limits.linear_braking, eye.max_age_s, way)
+            if wrong:
+                raise ValueError(f"limits.linear_max, sensors.{name}.range_max: {wrong}")
+        return self
+
     def rules(self) -> Rules:
         """The rules that follow."""
         stages = self.stages()
@@ -163,6 +192,10 @@ class SafetyConfig(SourcesConfig):
             stages=stages,
             sources=self.source_rules(),
         )
+
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know of this configuration: a sentence for each number beyond its bounds."""
+        return check_plausible(self.model_dump(exclude={"beyond", "ros1", "ros2", "sockets"}), self.beyond)
 
     def stages(self) -> Stages:
         """The latencies from the light to the brakes."""

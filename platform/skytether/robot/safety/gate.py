@@ -182,6 +182,7 @@ class GateLoop:
             "linear_m_s": told.linear,
             "angular_rad_s": told.angular,
             "troubles": list(last.troubles.values()) if last else [],
+            "beyond": list(self._config.notes()),
             "counts": dict(self._gate.counts),
             "turns": self._turns,
             "overruns": self._overruns,

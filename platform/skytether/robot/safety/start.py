@@ -37,6 +37,7 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
     sockets = config.sockets or SocketsConfig()
     wheels = str(config.place() / WHEELS_SOCKET) if sockets.wheels is None else address(sockets.wheels)
     say = [f"guards the wheels; its sockets are in {config.place()}"]
+    say += [f"safety.{note}" for note in config.notes()]
     if not config.sensors:
         say.append("safety.sensors is empty: the robot does not see what it drives into")
     return Settings(

@@ -85,3 +85,31 @@ def fastest(way: float, braking: float, reaction: float) -> float:
     if way <= 0:
         return 0.0
     return braking * (sqrt(reaction**2 + 2 * way / braking) - reaction)
+
+
+def shortfall(stages: Stages, speed: float, braking: float, age: float, way: float) -> str:
+    """What is missing to stop on a way; empty: nothing.
+
+    Args:
+        stages: All latencies.
+        speed: The fastest [m/s].
+        braking: [m/s^2].
+        age: The oldest message that is used [s].
+        way: Until the stop zone [m].
+    """
+    reaction = stages.reaction_s(age)
+    needed = stopping_way(speed, braking, reaction)
+    if needed <= way:
+        return ""
+    # Of a speed, the time that is left for everything before the brakes is way / v - v / (2 a).
+    left = way / speed - speed / (2 * braking)
+    harder = speed**2 / (2 * (way - speed * reaction)) if way > speed * reaction else 0.0
+    held = [f"{fastest(way, braking, reaction):.2f} m/s"]
+    if harder:
+        held.append(f"a braking of {harder:.2f} m/s^2")
+    if left > 0:
+        held.append(f"{left:.2f} s until the brakes")
+    return (
+        f"at {speed:g} m/s the robot needs {needed:.2f} m to stop ({reaction:.2f} s until the brakes, then {braking:g} "
+        f"m/s^2), and has {way:.2f} m; {' or '.join(held)} would hold"
+    )
