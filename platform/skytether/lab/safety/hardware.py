@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from itertools import cycle
 
 import numpy as np
 
-from skytether.messages import Joy, LaserScan
+from skytether.messages import Header, Joy, LaserScan, Time
 
 from .attacks import Attacks
 from .robot import RAYS, scan_of
 from .stage import Stage
 
 _BLIND_S = 1.5
-_HELD = np.array([1], dtype=np.int32)
-_RELEASED = np.zeros(1, dtype=np.int32)
+_UP_S = 0.4
+"""The button is up for so long before it is pressed."""
 _SECOND_SCAN_S = 0.3
 
 Scan = Callable[[], LaserScan | None]
@@ -44,6 +45,7 @@ def enter(attacks: Attacks) -> None:
     ):
         attacks.add(f"laser-{name}", f"the laser sends {what}", _blind(what, scan), seconds=3.5)
     attacks.add("joystick-lost", "the joystick falls silent with its button held, and comes back so", _lost, seconds=4)
+    attacks.add("joystick-repeated", "the joystick's driver repeats the last state for ever", _still, seconds=5)
 
 
 def _wheels_gone(seconds: float) -> Callable[[Stage], None]:
@@ -91,16 +93,59 @@ def _two_old(stage: Stage) -> Scan:
     return cycle((first, stage.robot.clear())).__next__
 
 
-def _lost(stage: Stage) -> None:
+class _Pad:
+    """A joystick in a hand that is never quite still, until the radio is lost."""
+
+    def __init__(self) -> None:
+        self.held = False
+        self.lost = False
+        """Its driver goes on with the last that it had."""
+        self._shakes = cycle((0.80, 0.81))
+        self._axis = 0.0
+
+    def __call__(self) -> Joy:
+        if not self.lost:
+            self._axis = next(self._shakes) if self.held else 0.0
+        wall = time.time_ns()
+        return Joy(
+            header=Header(stamp=Time(wall // 10**9, wall % 10**9)),
+            axes=np.array([self._axis, 0.0], dtype=np.float32),
+            buttons=np.array([int(self.held)], dtype=np.int32),
+        )
+
+
+def _take_over(stage: Stage) -> _Pad:
+    """A person takes the joystick, holds its button and drives."""
     robot = stage.robot
-    axes = np.array([0.8, 0.0], dtype=np.float32)
-    robot.pad = lambda: Joy(axes=axes, buttons=_HELD)
+    pad = robot.pad = _Pad()
+    stage.sleep(_UP_S)
+    pad.held = True
     robot.wait(lambda: robot.velocity.linear > 0 and robot.velocity.angular == 0, "the joystick drives the robot")
+    stage.sleep(_UP_S)
+    return pad
+
+
+def _leave(stage: Stage, pad: _Pad) -> None:
+    """The button is released, and the joystick put away."""
+    pad.lost = pad.held = False
+    stage.robot.pad = pad
+    stage.sleep(_UP_S)
+    stage.robot.pad = None
+
+
+def _lost(stage: Stage) -> None:
+    pad = _take_over(stage)
     with stage.stands(stage.promised.joystick, "the joystick was lost with its button held"):
-        robot.pad = None
+        stage.robot.pad = None
         stage.sleep(1.0)
-        robot.pad = lambda: Joy(axes=axes, buttons=_HELD)  # it is heard again, the button never released
+        stage.robot.pad = pad  # it is heard again, the button never released
         stage.sleep(1.0)
-    robot.pad = lambda: Joy(axes=np.zeros(2, dtype=np.float32), buttons=_RELEASED)
-    stage.sleep(0.3)
-    robot.pad = None
+    _leave(stage, pad)
+
+
+def _still(stage: Stage) -> None:
+    pad = _take_over(stage)
+    with stage.stands(stage.promised.still, "the joystick's driver repeats its last state without end"):
+        pad.lost = True
+        stage.sleep(stage.promised.still + 0.5)
+    _leave(stage, pad)

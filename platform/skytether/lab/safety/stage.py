@@ -29,6 +29,7 @@ class Promised:
         sensor: After a laser's last reading.
         button: After the last word of the button.
         joystick: After the joystick's last word.
+        still: After the joystick's last change.
         stop: After a stop, by a person or a button.
         silence: After the last word of whoever could speak to the wheels; they then stop by themselves.
         jitter: What each of these has in addition, for how well times are known.
@@ -39,6 +40,7 @@ class Promised:
     sensor: float
     button: float
     joystick: float
+    still: float
     stop: float
     silence: float
     jitter: float
@@ -56,6 +58,7 @@ class Promised:
             sensor=max((sensor.max_age_s for sensor in config.sensors.values()), default=0.0) + rest,
             button=((config.estop and config.estop.max_age_s) or 0.0) + rest,
             joystick=(config.joystick.max_age_s if config.joystick else 0.0) + rest,
+            still=((config.joystick and config.joystick.max_still_s) or 0.0) + rest,
             stop=rest,
             silence=config.guard_s + _TURNS * period,
             jitter=period,
