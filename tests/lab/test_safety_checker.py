@@ -88,6 +88,8 @@ def test_after_silence_the_robot_stands():
     assert kinds([*record, *drive((0.5, 1.0), start=1.08, last=0.5)]) == []
     assert kinds([*record, *drive((0.5, 1.0), start=1.08)]) == []
     assert kinds([*record, Told(1.08, Velocity(0.25, 0.0))]) == ["acceleration"]
+    # Somebody else took over just before they stopped, and brakes: right all the way down.
+    assert kinds([*record, *drive((0.0, 1.0), start=1.085, last=0.3)]) == []
 
 
 def test_standstill_that_is_late_or_never_comes():

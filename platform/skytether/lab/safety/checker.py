@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
 
-from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.robot.supervisor import Limits
 
 _STRETCH_S = 0.5
@@ -168,55 +168,58 @@ def _speeds(record: Sequence[Told], wheels: Wheels) -> list[Violation]:
 
 def _changes(record: Sequence[Told], wheels: Wheels) -> tuple[list[Violation], float]:
     """Every pair within a stretch: whether the later velocity could be reached from the earlier one."""
-    limits, jitter = wheels.limits, wheels.jitter_s
     found: list[tuple[float, str]] = []
     most = 0.0
     for i, after in enumerate(record):
-        worst = 0.0
-        for before in _before(record, i, wheels):
-            dt = max(0.0, after.at - before.at) + jitter
-            linear, angular = before.velocity.linear, before.velocity.angular
-            most = max(most, abs(after.velocity.linear - linear) / dt)
-            needed = max(
-                _needed(linear, after.velocity.linear, limits.linear_acceleration, limits.linear_braking),
-                _needed(angular, after.velocity.angular, limits.angular_acceleration, limits.angular_braking),
-            )
-            if needed - dt > worst:
-                worst = needed - dt
-                text = (
-                    f"from {_words(before.velocity)} to {_words(after.velocity)} in {1e3 * (dt - jitter):.0f} ms, which"
-                    f" takes {1e3 * needed:.0f} ms"
-                )
-        if worst > _ROUNDING:
+        # Where nobody knows whether the wheels had stopped by themselves, either is right.
+        excess, text, acceleration = min(_excess(before, after, wheels) for before in _before(record, i, wheels))
+        most = max(most, acceleration)
+        if excess > _ROUNDING:
             found.append((after.at, text))
     return _merge(found, "acceleration", wheels), most
 
 
-def _before(record: Sequence[Told], i: int, wheels: Wheels) -> list[Told]:
-    """What the velocity at ``i`` is compared with: what was told before, back to a standstill by silence."""
-    now = record[i].at
+def _excess(before: Sequence[Told], after: Told, wheels: Wheels) -> tuple[float, str, float]:
+    """By how much time [s] a velocity comes too early, after which one, and the largest change by its time [m/s^2]."""
+    limits, jitter = wheels.limits, wheels.jitter_s
+    worst, text, most = 0.0, "", 0.0
+    for told in before:
+        dt = max(0.0, after.at - told.at) + jitter
+        linear, angular = told.velocity
+        most = max(most, abs(after.velocity.linear - linear) / dt)
+        needed = max(
+            _needed(linear, after.velocity.linear, limits.linear_acceleration, limits.linear_braking),
+            _needed(angular, after.velocity.angular, limits.angular_acceleration, limits.angular_braking),
+        )
+        if needed - dt > worst:
+            worst = needed - dt
+            text = (
+                f"from {_words(told.velocity)} to {_words(after.velocity)} in {1e3 * (dt - jitter):.0f} ms, which takes"
+                f" {1e3 * needed:.0f} ms"
+            )
+    return worst, text, most
+
+
+def _before(record: Sequence[Told], i: int, wheels: Wheels) -> list[list[Told]]:
+    """What the velocity at ``i`` is compared with: what was told before, back to a standstill by silence.
+
+    A gap on the edge of silence leaves two possibilities: the wheels had stopped, or just not yet.
+    """
+    now = later = record[i].at
+    possible: list[list[Told]] = []
     found: list[Told] = []
-    later = now
     for told in (record[j] for j in range(i - 1, -1, -1)):
         gap = later - told.at
+        stopped = [*found, Told(later, STANDSTILL)]
         if gap > wheels.silence_s + wheels.jitter_s:
-            return [*found, Told(later, STANDSTILL)]
+            return [*possible, stopped]
         if gap > wheels.silence_s - wheels.jitter_s:
-            # On the edge: the wheels had stopped by themselves, or just not yet. Either is right, and only together
-            # they say whether the change was too large; what lies before is looked at from the message before this gap.
-            nearer = min(
-                (told, Told(later, STANDSTILL)), key=lambda start: _distance(start.velocity, record[i].velocity)
-            )
-            return [*found, nearer]
+            possible.append(stopped)
         if now - told.at > _STRETCH_S:
-            return found
+            break
         found.append(told)
         later = told.at
-    return found
-
-
-def _distance(a: Velocity, b: Velocity) -> float:
-    return max(abs(a.linear - b.linear), abs(a.angular - b.angular))
+    return [*possible, found]
 
 
 def _needed(before: float, after: float, acceleration: float, braking: float) -> float:

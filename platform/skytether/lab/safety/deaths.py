@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from itertools import permutations
 
 from .attacks import Attacks
@@ -78,8 +79,9 @@ def _two(first: str, second: str) -> Callable[[Promised], float]:
 def _killed(role: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
         until = _WATCH_S if role != "gate" else _GATE_STARTS_S
+        victim = stage.robot.pid(role)
         with stage.stands(_alone(role)(stage.promised), f"the {role} was killed"):
-            stage.robot.signal(role, signal.SIGKILL)
+            stage.robot.kill(victim)
             stage.sleep(until)
         if role == "guard":
             stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends without its guard")
@@ -89,12 +91,12 @@ def _killed(role: str) -> Callable[[Stage], None]:
 
 def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
-        if seconds > 0.5:
-            with stage.stands(_alone(role)(stage.promised), f"the {role} was frozen"):
-                pid = stage.robot.signal(role, signal.SIGSTOP)
-                stage.sleep(seconds)
-        else:
-            pid = stage.robot.signal(role, signal.SIGSTOP)
+        pid = stage.robot.pid(role)
+        demand = (
+            stage.stands(_alone(role)(stage.promised), f"the {role} was frozen") if seconds > 0.5 else nullcontext()
+        )
+        with demand:
+            stage.robot.kill(pid, signal.SIGSTOP)
             stage.sleep(seconds)
         stage.robot.kill(pid, signal.SIGCONT)
         stage.drives_on(f"the robot drives on after the {role} was frozen for {seconds:g} s")
@@ -104,9 +106,9 @@ def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
 
 def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
-        victim = stage.robot.pid(second)
+        one, victim = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were killed"):
-            stage.robot.signal(first, signal.SIGKILL)
+            stage.robot.kill(one)
             stage.sleep(_NEXT_S)
             stage.robot.kill(victim)
             stage.sleep(_WATCH_S)
@@ -116,10 +118,11 @@ def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
 
 def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
+        one, other = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were frozen"):
-            one = stage.robot.signal(first, signal.SIGSTOP)
+            stage.robot.kill(one, signal.SIGSTOP)
             stage.sleep(_NEXT_S)
-            other = stage.robot.signal(second, signal.SIGSTOP)
+            stage.robot.kill(other, signal.SIGSTOP)
             stage.sleep(1.0 - _NEXT_S)
         stage.robot.kill(one, signal.SIGCONT)
         stage.sleep(_NEXT_S)
@@ -131,9 +134,9 @@ def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
 
 def _frozen_and_killed(first: str, second: str) -> Callable[[Stage], None]:
     def run(stage: Stage) -> None:
+        frozen, victim = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"the {first} was frozen and the {second} killed"):
-            victim = stage.robot.pid(second)
-            frozen = stage.robot.signal(first, signal.SIGSTOP)
+            stage.robot.kill(frozen, signal.SIGSTOP)
             stage.sleep(_NEXT_S)
             stage.robot.kill(victim)
             stage.sleep(1.0 - _NEXT_S)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skytether.control.admittance import Velocity
+from skytether.guard.velocity import Velocity
 from skytether.messages import encode
 from skytether.robot.safety.client import GateLink
 

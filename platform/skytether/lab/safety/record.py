@@ -11,7 +11,8 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.clock import now
+from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import DecodeError, Twist, decode
 
 from .checker import Told
@@ -23,11 +24,6 @@ _CREDENTIALS = struct.Struct("iII")
 _LONGEST = 200_000
 """Velocities that are kept: an hour at 50 Hz. Of a flood the oldest go."""
 _LOOK_S = 0.05
-
-
-def now() -> float:
-    """Seconds since the machine started, sleep included: the clock of every record."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class WheelRecord:

@@ -26,12 +26,13 @@ import numpy as np
 import psutil
 import yaml
 
-from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.clock import now
+from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Message, Time, encode
 from skytether.robot.safety.client import GateError, ask
 from skytether.robot.safety.config import SafetyConfig
 
-from .record import WheelRecord, now
+from .record import WheelRecord
 
 LIMITS: Mapping[str, float] = {"linear_max": 0.5, "linear_min": -0.1, "angular_max": 0.8}
 """Of the wheels and of the agent."""

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from skytether.guard.clock import now
 from skytether.robot.safety.client import GateError
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.supervisor import Limits
 
 from .checker import Demand, Finding, Violation, Wheels, check
-from .record import now
 from .robot import PlayedRobot, StagingError
 
 _TURNS = 2
