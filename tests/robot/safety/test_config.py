@@ -174,6 +174,18 @@ def test_sources_and_locks_become_rules(load):
     assert kinds["p"] == "std_msgs/msg/Bool"
 
 
+def test_the_window_of_odometry_follows_from_the_rest_of_the_configuration(load):
+    section = {"footprint": {"radius": 0.3}, "sensors": {}, "rate_hz": 20, "zones": {"reaction_s": 0.2}}
+    settings = load(section | {"odometry": {"latency_s": 0.1, "lag_s": 0.2, "type": "geometry_msgs/msg/TwistStamped"}})
+    odometry = settings.rules().odometry
+    # Two periods of 0.05 s and the wheels' 0.2 s; then 0.1 s of latency and four lags.
+    assert odometry.params.dead_s == pytest.approx(0.3)
+    assert odometry.params.window_s == pytest.approx(1.2)
+    assert settings.kinds()["odom"].TYPE == "geometry_msgs/msg/TwistStamped"
+    with pytest.raises(ConfigError, match="'odom' cannot be two things"):
+        load(section | {"odometry": {}, "joystick": {"topic": "odom"}})
+
+
 def test_the_example_of_the_documentation_is_a_configuration(load):
     text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
     example = yaml.safe_load(text.split("```yaml")[1].split("```")[0])

@@ -19,6 +19,7 @@ from skytether.ros.names import check_name
 from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
+from .odometry_config import OdometryConfig, odometry_kind
 from .protocol import default_folder, default_record
 from .rules import Rules
 from .sensor_config import SensorConfig, UnseenConfig
@@ -118,6 +119,8 @@ class SafetyConfig(SourcesConfig):
     """By topic. Without any (``{}``) the robot is blind, and all that it does is moving where no sensor looks."""
     unseen: UnseenConfig = UnseenConfig()
     """Moving where no sensor looks."""
+    odometry: OdometryConfig | None = None
+    """What the wheels really do; null: nobody looks."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
@@ -151,7 +154,7 @@ class SafetyConfig(SourcesConfig):
             raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
         for name in self.kinds() if self.ros1 or self.ros2 else ():
             check_name(name, 1 if self.ros1 else 2)
-        topics = [*self.sensors, *(topic for topic, _ in self.source_kinds())]
+        topics = [*self.sensors, *(topic for topic, _ in self._other_kinds())]
         for topic in topics:
             if topics.count(topic) > 1:
                 raise ValueError(f"the topic '{topic}' cannot be two things")
@@ -191,6 +194,7 @@ class SafetyConfig(SourcesConfig):
             unseen=self.unseen.params(),
             stages=stages,
             sources=self.source_rules(),
+            odometry=None if self.odometry is None else self.odometry.rules(stages),
         )
 
     def notes(self) -> tuple[str, ...]:
@@ -232,7 +236,12 @@ class SafetyConfig(SourcesConfig):
     def kinds(self) -> dict[str, type[Message]]:
         """Message type of each topic that the gate listens to."""
         kinds = {name: sensor.message() for name, sensor in self.sensors.items()}
-        return kinds | dict(self.source_kinds())
+        return kinds | dict(self._other_kinds())
+
+    def _other_kinds(self) -> list[tuple[str, type[Message]]]:
+        """All but range sensors; a topic that is there twice is a mistake."""
+        odometry = self.odometry
+        return self.source_kinds() + ([] if odometry is None else [(odometry.topic, odometry_kind(odometry))])
 
 
 def address(text: str) -> str | tuple[str, int]:

@@ -21,6 +21,7 @@ from . import kinematics as reach
 from .coverage import Action, Unseen, UnseenParams
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
+from .real_motion import OdometryRules, RealMotion
 from .sensing import RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
 from .stopping import Stages
@@ -52,6 +53,7 @@ class Rules:
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
     unseen: UnseenParams = field(default_factory=UnseenParams)
     sources: SourceRules = field(default_factory=SourceRules)
+    odometry: OdometryRules | None = None
     stages: Stages = field(default_factory=Stages)
 
 
@@ -95,6 +97,8 @@ class Gate:
         self._unseen = Unseen(rules.unseen, rules.footprint, rules.zones.slow_speed)
         oldest = max((sensor.max_age_s for sensor in rules.sensors.values()), default=0.0)
         self._reckoning = DeadReckoning(oldest + rules.stages.reaction_s(0.0))
+        odometry = rules.odometry
+        self._motion = None if odometry is None else RealMotion(odometry, rules.limits, rules.stages.guard_s)
         self._zone = Zone.CLEAR
         self._events: dict[str, str] = {}
 
@@ -115,6 +119,9 @@ class Gate:
                 self._event(*wrong)
         elif self._sources.expects(topic, message):
             self._hear(topic, message, now)
+        elif self._motion is not None and self._rules.odometry is not None and topic == self._rules.odometry.topic:
+            if wrong_reading := self._motion.measure(message, now):
+                self._event("odometry:message", f"{topic}: {wrong_reading}")
         else:
             self._event(f"topic:{topic[:64]}", f"{topic[:64]}: a {message.TYPE} is not expected there and not used")
 
@@ -169,14 +176,22 @@ class Gate:
             decision = Decision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
             self._supervised = Supervised(held=self._supervised.held)
         self._reckoning.tell(decision.velocity, now)
+        if self._motion is not None:
+            self._motion.told(decision.velocity, now)
         self.counts.update(troubles.keys())
         return decision
 
     def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
         before, dt = self._supervised.velocity, supervisor.elapsed(self._rules.limits, self._supervised, now)
+        broken = self._motion.look(now, troubles) if self._motion is not None else ""
+        if broken:
+            self.engage(broken)
         hand = self._sources.look(now, troubles)
         wanted = self._supervise(hand, now, troubles)
         allowed = self._see(wanted, now, troubles)
+        if self._motion is not None:
+            share = min(self._motion.share(hand, before, wanted, now), self._most(self._motion.action, wanted))
+            allowed = replace(allowed, share=min(allowed.share, share))
         velocity = Velocity(wanted.linear * allowed.share, wanted.angular * allowed.share)
         if not reach.within_reach(self._rules.limits, before, velocity, dt):
             velocity = reach.brake_on_curve(self._rules.limits, before, dt)
@@ -207,10 +222,14 @@ class Gate:
         if unseen < 1:
             verb = "does not go there" if unseen == 0 else "goes there slowly"
             troubles["unseen"] = f"no sensor looks where the robot is to move (safety.unseen); it {verb}"
-        most = {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[scene.action]
+        most = self._most(scene.action, wanted)
         unknown = allowed.zone is not Zone.STOP and (scene.unknown or unseen < 1)
         zone = Zone.UNKNOWN if unknown else allowed.zone
         return replace(allowed, share=min(allowed.share, most, unseen), zone=zone)
+
+    def _most(self, action: Action, wanted: Velocity) -> float:
+        """What share of a velocity an action leaves."""
+        return {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[action]
 
     def _hear(self, topic: str, message: Message, now: float) -> None:
         command, wrong = self._sources.hear(topic, message, now)
