@@ -11,6 +11,7 @@ import pytest
 
 from skytether.api.client import ApiError, NotRunning
 from skytether.api.rest import (
+    Instance,
     InstanceCreate,
     Measurement,
     Renew,
@@ -167,6 +168,20 @@ def test_renewing_keeps_the_lease_and_does_not_revive(served: Any) -> None:
 
 
 @pytest.mark.slow
+def test_of_sites_that_are_not_there_nothing_is_kept(served: Any) -> None:
+    served.site("lab")
+    robot = served.robot()
+    names = {f"s{n}": Measurement(rtt_ms=n) for n in range(200)}
+    asked = ASK.model_copy(update={"measurements": {**names, "lab": Measurement(rtt_ms=7)}})
+    made = robot.create_instance(asked)
+    record = served.core.store.get(made.id)
+    assert record.measurements == {"lab": {"rtt_ms": 7, "preferred": False}}
+    robot.renew_instance(made.id, Renew(measurements={**names, "lab": Measurement(rtt_ms=8)}))
+    assert served.core.store.get(made.id).measurements == {"lab": {"rtt_ms": 8, "preferred": False}}
+    many = {f"s{n}": {"rtt_ms": 1} for n in range(257)}
+    assert refused(robot._one, Instance, "POST", f"/instances/{made.id}/renew", {"measurements": many})[0] == 422
+
+
 def test_an_instance_that_is_not_renewed_ends(served: Any) -> None:
     served.site()
     robot = served.robot()

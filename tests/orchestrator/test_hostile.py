@@ -12,11 +12,15 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx
+import psutil
 import pytest
 from orchestrator_program import Program, until, with_toy
 
@@ -58,6 +62,7 @@ class Honest:
     def __init__(self, program: Program, operator: Client, name: str = "walker") -> None:
         token = operator.create_robot(RobotCreate(name=name)).token
         self._program = program
+        self._token = token
         self.client = Client((program.folder / "address").read_text().strip(), token)
         made = self.client.create_instance(InstanceCreate(robot=name, service="toy", lease_s=LEASE))
         self.instance = self.client.wait_running(made.id).id
@@ -66,10 +71,12 @@ class Honest:
         self.refused: list[str] = []
 
     def renew_for(self, seconds: float, every: float = LEASE / 4) -> None:
+        """Each time over a connection of its own, as after a time without radio: one that is open is in already."""
         end = time.monotonic() + seconds
         while (began := time.monotonic()) < end:
             try:
-                renewed = self.client.renew_instance(self.instance)
+                with Client((self._program.folder / "address").read_text().strip(), self._token) as client:
+                    renewed = client.renew_instance(self.instance)
                 assert renewed.state is State.RUNNING, f"{renewed.state}: {renewed.reason}\n{self._program.log}"
                 self.took.append(time.monotonic() - began)
             except (ApiError, Unreachable) as error:
@@ -88,12 +95,54 @@ def honest(program: Program, manifest: Any) -> Iterator[Honest]:
             yield robot
 
 
+class Hostile:
+    """A robot that was registered like any other, and does what it likes with its token."""
+
+    def __init__(self, program: Program, operator: Client, name: str = "hostile") -> None:
+        self.token = operator.create_robot(RobotCreate(name=name)).token
+        self.url = (program.folder / "address").read_text().strip()
+        self.name = name
+        self.statuses: Counter[int] = Counter()
+        with Client(self.url, self.token) as client:
+            made = client.create_instance(InstanceCreate(robot=name, service="toy", lease_s=60))
+            self.instance = client.wait_running(made.id).id
+
+    @contextlib.contextmanager
+    def again_and_again(self, threads: int, path: str, body: Callable[[int], Any]) -> Iterator[None]:
+        """Post to an address from several threads at once, each time something else, as fast as it is answered."""
+        over = threading.Event()
+        numbers = count()
+
+        def ask() -> None:
+            headers = {"Authorization": f"Bearer {self.token}"}
+            with httpx.Client(base_url=self.url, headers=headers, trust_env=False, timeout=60) as http:
+                while not over.is_set():
+                    with contextlib.suppress(httpx.HTTPError):
+                        self.statuses[http.post(path, json=body(next(numbers))).status_code] += 1
+
+        running = [threading.Thread(target=ask) for _ in range(threads)]
+        for one in running:
+            one.start()
+        try:
+            yield
+        finally:
+            over.set()
+            for one in running:
+                one.join()
+
+
+def operator_of(program: Program) -> Client:
+    return Client(
+        (program.folder / "address").read_text().strip(), (program.folder / "operator.token").read_text().strip()
+    )
+
+
 @contextlib.contextmanager
-def many(address: tuple[str, int], count: int, first: bytes = b"") -> Iterator[list[socket.socket]]:
+def many(address: tuple[str, int], number: int, first: bytes = b"") -> Iterator[list[socket.socket]]:
     """Connections that were opened, and perhaps began to say something; who is refused stays refused."""
     held: list[socket.socket] = []
     try:
-        for _ in range(count):
+        for _ in range(number):
             with contextlib.suppress(OSError):
                 held.append(socket.create_connection(address, timeout=2.0))
                 held[-1].sendall(first)
@@ -135,14 +184,36 @@ def test_who_says_nothing_more_costs_nobody_anything(program: Program, honest: H
 
 
 def test_a_robots_own_slow_bodies_cost_only_itself(program: Program, honest: Honest, manifest: Any) -> None:
-    operator = Client(
-        (program.folder / "address").read_text().strip(), (program.folder / "operator.token").read_text().strip()
-    )
+    operator = operator_of(program)
     hostile = operator.create_robot(RobotCreate(name="hostile")).token
     with operator, many(address_of(program), 300, SLOW_BODY + f"Authorization: Bearer {hostile}\r\n\r\n".encode()):
         honest.renew_for(ATTACK)
         assert honest.refused == []
         assert honest.still_has_it()
+
+
+@pytest.fixture
+def hostile(program: Program, honest: Honest) -> Hostile:
+    with operator_of(program) as operator:
+        return Hostile(program, operator)
+
+
+@pytest.mark.parametrize("names", [12, 3000, 8000])
+def test_names_that_a_robot_makes_up_cost_only_itself(
+    program: Program, honest: Honest, hostile: Hostile, names: int
+) -> None:
+    def invented(number: int) -> Any:
+        return {"measurements": {f"s{number}-{n}": {"rtt_ms": 1} for n in range(names)}}
+
+    assert program.process is not None
+    memory = psutil.Process(program.process.pid).memory_info
+    before = memory().rss
+    with hostile.again_and_again(12, f"/api/v1/instances/{hostile.instance}/renew", invented):
+        honest.renew_for(2 * ATTACK)
+    assert honest.refused == []
+    assert honest.still_has_it()
+    assert max(honest.took) < 2.0
+    assert memory().rss - before < 100 << 20
 
 
 @pytest.mark.parametrize("head", [SLOW_BODY + b"\r\n", b"GET /hea", b""], ids=["body", "head", "nothing"])

@@ -27,6 +27,9 @@ class Knows:
     def recent(self, token: str | None) -> Principal | None:
         return None
 
+    def charge(self, caller: Principal, length: int) -> None:
+        pass
+
 
 class Scene:
     """A reception before an app that answers when it is told to."""

@@ -14,6 +14,7 @@ from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.store import Store
+from skytether.orchestrator.strain import HOLD
 from skytether.testing.runtimes import (
     BlockedRuntime,
     CrashingRuntime,
@@ -459,3 +460,27 @@ def test_what_was_placed_while_its_site_was_deleted_is_given_up(
         b.store.change(b.record(), b.clock(), state=state)
     b.step()
     assert (b.record().state, b.record().reason) == (after, "site 'deleted' was deleted: ask again")
+
+
+@pytest.mark.parametrize("spare", [False, True], ids=["at a site", "waiting for one"])
+def test_while_robots_are_refused_no_lease_runs_out_and_then_all_count_anew(
+    bench: Any, new_record: NewRecord, spare: bool
+) -> None:
+    b = bench()
+    add(b, new_record("i0", pinned="nowhere" if spare else None))
+    b.step(2)
+    state = b.record("i0").state
+    for _ in range(60):  # four leases long
+        b.strain.note()
+        b.clock.forward(1)
+        b.step()
+        assert b.record("i0").state is state
+    b.clock.forward(HOLD)
+    b.step(3)
+    assert b.record("i0").state is state
+    b.clock.forward(14)
+    b.step(3)
+    assert b.record("i0").state is state
+    b.clock.forward(1.5)
+    b.step(6)
+    assert b.record("i0").state is State.STOPPED

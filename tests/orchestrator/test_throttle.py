@@ -35,6 +35,20 @@ def test_a_clock_that_jumps_back_gives_nothing() -> None:
     assert throttle.wait("a") > 0
 
 
+def test_a_large_request_counts_as_several_and_looking_takes_nothing() -> None:
+    clock = Clock()
+    throttle = Throttle(rate=10, burst=4, clock=clock)
+    assert [throttle.empty("a") for _ in range(9)] == [0.0] * 9
+    assert throttle.wait("a") == 0
+    throttle.charge("a", 5)  # 3 were left
+    assert throttle.empty("a") == throttle.wait("a") == 0.3
+    throttle.charge("a", 1000)
+    assert throttle.empty("a") == 0.5  # at most a burst late
+    clock.advance(0.5)
+    assert throttle.empty("a") == throttle.wait("a") == 0
+    assert throttle.wait("b") == 0
+
+
 def test_callers_are_bounded_in_number() -> None:
     clock = Clock()
     throttle = Throttle(rate=0.001, burst=1, clock=clock)

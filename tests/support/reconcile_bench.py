@@ -15,6 +15,7 @@ from skytether.orchestrator.security import Secrets
 from skytether.orchestrator.settings import Limits, Timing, Weights
 from skytether.orchestrator.sites import Site
 from skytether.orchestrator.store import Store
+from skytether.orchestrator.strain import Strain
 from skytether.testing.runtimes import FakeOptions, FakeRuntime
 
 
@@ -41,6 +42,7 @@ class Bench:
         self.store, self.clock = store, clock
         self.woken = 0
         self.metrics = Metrics(list, 64)
+        self.strain = Strain(clock.steady)
         self.reconciler = self._reconciler(folder)
         self.runtime = kind("lab", folder, FakeOptions(**options))
         self.site = self._site()
@@ -56,6 +58,7 @@ class Bench:
             self.clock,
             self._wake,
             steady=self.clock.steady,
+            strain=self.strain,
         )
 
     def _site(self) -> Site:
@@ -85,6 +88,7 @@ class Bench:
     def restart(self, folder: Path) -> None:
         """The orchestrator is killed and comes back; what runs runs on."""
         self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
+        self.strain = Strain(self.clock.steady)
         self.reconciler = self._reconciler(folder)
         self.site = self._site()
 

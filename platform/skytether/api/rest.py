@@ -51,14 +51,18 @@ class Measurement(Strict):
     """The robot has weighed all that it knows and wants this site: it goes before others that fit."""
 
 
+Measurements = Annotated[dict[Name, Measurement], Field(max_length=256)]
+"""By site; more sites than a robot could measure within its period."""
+
+
 class InstanceCreate(Strict):
     """A robot asks for a service."""
 
     robot: Name
     service: Name
     params: dict[str, Any] = {}
-    measurements: dict[Name, Measurement] = {}
-    """By site; sites not named are taken as unmeasured."""
+    measurements: Measurements = {}
+    """Sites not named are taken as unmeasured; of a site that is not there nothing is kept."""
     lease_s: Annotated[float, Field(ge=1, le=86_400)] = 15
     """The instance is stopped when it is not renewed for this long."""
 
@@ -153,6 +157,8 @@ class InstanceEvent(Strict):
 MOST_COUNTED = 2**53
 """A counter's largest value: what a double holds exactly, as Prometheus' samples are."""
 _Count = Annotated[int, Field(ge=0, le=MOST_COUNTED)]
+_Counts = Annotated[dict[Annotated[str, Field(max_length=64)], _Count], Field(max_length=64)]
+"""By reasons, of which there are few."""
 
 
 class TopicReport(Strict):
@@ -188,12 +194,12 @@ class Report(Strict):
     """Which counting it is of: another one begins at zero, and adds to what was counted before. Made up anew at each
     start of the robot's program; under the same one counters go on over all its sessions with a service."""
     rtt_s: float | None = None
-    topics: tuple[TopicReport, ...] = ()
-    control_source: str | None = None
+    topics: Annotated[tuple[TopicReport, ...], Field(max_length=1024)] = ()
+    control_source: Annotated[str, Field(max_length=16)] | None = None
     """Who drives: ``cloud``, ``fallback`` or ``stop``."""
-    fallback_transitions: dict[str, _Count] = {}
+    fallback_transitions: _Counts = {}
     """Counted by bounded reason."""
-    objections: dict[str, _Count] = {}
+    objections: _Counts = {}
     """What the velocity supervisor found wrong with commands, counted by bounded kind."""
     load: float | None = None
     """Share of the robot's processors that is busy."""
@@ -213,8 +219,8 @@ class Migrate(Strict):
 class Renew(Strict):
     """Keep the lease; optionally report."""
 
-    measurements: dict[Name, Measurement] = {}
-    """By site; what was measured since, instead of what was told before."""
+    measurements: Measurements = {}
+    """What was measured since, instead of what was told before."""
 
     lease_s: Annotated[float, Field(ge=1, le=86_400)] | None = None
     report: Report | None = None

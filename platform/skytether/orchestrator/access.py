@@ -40,6 +40,8 @@ _SEEN_EVERY = 10.0
 _RECENT = 10.0
 """Seconds for which a token that was good is good enough to measure a round trip."""
 _MOST_RECENT = 4096
+_PER_REQUEST = 8192
+"""Bytes of a body that count as another request: a renewal with a report on twenty topics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,17 +131,22 @@ class Access:
         return principal
 
     def recent(self, token: str | None) -> Principal | None:
-        """Who showed this token in the last seconds; at once, and only for what tells nothing that matters.
+        """Who showed this token in the last seconds, at once: for what tells nothing that matters, takes no request.
 
         Raises:
-            TooManyError: They asked too often.
+            TooManyError: They asked too often; those who do are to cost as little as can be.
         """
         principal, at = self._recent.get(_digest(token or ""), (None, 0.0))
         if principal is None or time.monotonic() - at > _RECENT:
             return None
-        if principal.robot is not None:
-            self._spend(principal.owner)
+        if principal.robot is not None and (wait := self._throttle.empty(principal.owner)):
+            raise TooManyError(wait)
         return principal
+
+    def charge(self, principal: Principal, length: int) -> None:
+        """Reckon a body's length [bytes]: a robot's large request is as much work as several small ones."""
+        if principal.robot is not None:
+            self._throttle.charge(principal.owner, length / _PER_REQUEST)
 
     def _spend(self, caller: str) -> None:
         wait = self._throttle.wait(caller)

@@ -144,6 +144,10 @@ class Orchestrator:
         """Who showed this token in the last seconds: see ``Access.recent``. Does not wait."""
         return None if self.refuses else self.access.recent(token)
 
+    def charge(self, caller: Principal, length: int) -> None:
+        """Reckon what a body of this length costs whoever sent it."""
+        self.access.charge(caller, length)
+
     def start(self) -> None:
         """Bring the database up to date, load the catalogue, adopt what runs, begin to reconcile.
 

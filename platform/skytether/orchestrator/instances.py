@@ -5,13 +5,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from typing import Any
 
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import (
     Instance,
     InstanceCreate,
+    Measurement,
     Migrate,
     Placement,
     Refusal,
@@ -109,12 +111,16 @@ class Instances:
             lease_s=asked.lease_s,
             lease_expires_at=now + asked.lease_s,
             params=asked.params,
-            measurements={site: m.model_dump(exclude_none=True) for site, m in asked.measurements.items()},
+            measurements=self._of_known_sites(asked.measurements),
         )
         decision = self._reconciler.weigh(record, ())  # whether it could ever run does not depend on what is there
         if decision.hopeless:
             raise self._no_site(record, decision)
         return record
+
+    def _of_known_sites(self, measured: Mapping[str, Measurement]) -> dict[str, Any]:
+        """As JSON; of sites that are not there nothing is kept, for a robot could make up thousands."""
+        return {site: m.model_dump(exclude_none=True) for site, m in measured.items() if self._sites.find(site)}
 
     def _no_site(self, record: Record, decision: Decision) -> NoSiteError:
         self._metrics.refused(record.service, decision.refused)
@@ -189,8 +195,9 @@ class Instances:
         """
         measurements = None
         if renew.measurements:
-            measured = {site: m.model_dump(exclude_none=True) for site, m in renew.measurements.items()}
-            measurements = {**self.get(principal, instance).measurements, **measured}
+            before = self.get(principal, instance).measurements
+            there = {site: seen for site, seen in before.items() if self._sites.find(site)}
+            measurements = {**there, **self._of_known_sites(renew.measurements)}
         now = self._clock()
         renewed = self._store.renew(instance, now, renew.lease_s, robot=principal.robot, measurements=measurements)
         if renewed is None:

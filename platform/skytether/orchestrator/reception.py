@@ -55,6 +55,9 @@ class Doorman(Protocol):
     def recent(self, token: str | None) -> Principal | None:
         """The same at once, if it was known a moment ago. Raises as ``authenticate``."""
 
+    def charge(self, caller: Principal, length: int) -> None:
+        """Reckon what a body of this length costs whoever sent it."""
+
 
 class Reception:
     """ASGI middleware: authenticates, reads the body, and bounds the requests under way."""
@@ -97,7 +100,8 @@ class Reception:
         address = scope["client"][0] if scope.get("client") else ""
         run: Callable[..., Awaitable[Principal]] = self._for_renewals if renewal else to_thread.run_sync
         # What measures a round trip is not to measure a database too.
-        probe = self._doorman.recent(given) if _PROBE.fullmatch(scope["path"]) else None
+        recent = self._doorman.recent(given)
+        probe = recent if _PROBE.fullmatch(scope["path"]) else None
         caller = probe or await run(self._doorman.authenticate, given, address)
         scope.setdefault("state", {}).update({PRINCIPAL: caller, "who": caller.owner, RUN: run})
         if (guest := scope.get(GUEST)) is not None:
@@ -138,6 +142,7 @@ class Reception:
             except _LeftError:
                 return
             whole = bytes(body.data)
+            self._doorman.charge(caller, len(whole))
         await self._place(scope, whole, send, renewal=renewal, receive=receive)
 
     def hold(self, count: int) -> bool:

@@ -83,10 +83,10 @@ class Limits(Group):
     """Largest request."""
     robot_body_bytes: Count = 1 << 18
     """Largest request of a robot: its parameters, or all that it reports with a renewal."""
-    connections: Count = 4096
+    connections: Count = 8192
     """Open connections of all, at most half of the files that the system lets the program have. Of more, one that has
     shown no good token gives way, the oldest first."""
-    connections_per_address: Count = 512
+    connections_per_address: Count = 2048
     """The same of one address (IPv6: one /64 network), as of all robots behind one router; not of `proxies`."""
     connections_per_robot: Count = 32
     """Of more, the one that was quiet for the longest is closed."""
@@ -97,7 +97,8 @@ class Limits(Group):
     idle_s: Seconds = 30.0
     """How long a connection is kept for another request."""
     requests_per_s: Annotated[float, Field(gt=0, le=1e6)] = 100.0
-    """Requests that one robot's token may make, and one address without a valid token; an operator's are free."""
+    """Requests that one robot's token may make, and one address without a valid token; an operator's are free. Each
+    8 KiB of a robot's request count as another one."""
     requests_burst: Count = 200
     """Requests at once above which that rate holds."""
     requests_at_once: Count = 256

@@ -26,12 +26,30 @@ class Throttle:
         with self._lock:
             return self._take(caller, self._clock())
 
-    def _take(self, caller: str, now: float) -> float:
+    def empty(self, caller: str) -> float:
+        """Seconds until there is one request in a caller's bucket; nothing is taken."""
+        with self._lock:
+            level = self._level(caller, self._clock())
+            return 0.0 if level >= 1.0 else (1.0 - level) / self._rate
+
+    def charge(self, caller: str, requests: float) -> None:
+        """A request was as much work as several: the next one is due so much later, at most a burst."""
+        with self._lock:
+            now = self._clock()
+            self._keep(caller, max(-self._burst, self._level(caller, now) - requests), now)
+
+    def _level(self, caller: str, now: float) -> float:
         level, at = self._buckets.get(caller, (self._burst, now))
-        level = min(self._burst, level + max(0.0, now - at) * self._rate)
+        return min(self._burst, level + max(0.0, now - at) * self._rate)
+
+    def _take(self, caller: str, now: float) -> float:
+        level = self._level(caller, now)
         allowed = level >= 1.0
-        self._buckets[caller] = (level - 1.0 if allowed else level, now)
+        self._keep(caller, level - 1.0 if allowed else level, now)
+        return 0.0 if allowed else (1.0 - level) / self._rate
+
+    def _keep(self, caller: str, level: float, now: float) -> None:
+        self._buckets[caller] = (level, now)
         self._buckets.move_to_end(caller)
         while len(self._buckets) > _BUCKETS:
             self._buckets.popitem(last=False)
-        return 0.0 if allowed else (1.0 - level) / self._rate
