@@ -87,12 +87,25 @@ class Reception:
             caller = await self._who(scope, renewal)
         except Exception as error:  # whatever it is, there is one place that knows what to say of it
             return await (await answer_to(Request(scope), error))(scope, receive, send)
-        with self._one_of(caller) as allowed:
-            if not allowed:
+        with contextlib.ExitStack() as until_answered:
+            if not until_answered.enter_context(self._one_of(caller)):
                 most = self._limits.robot_requests_at_once
                 text = f"{most} requests of this robot are under way: wait for their answers"
                 return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
-            return await self._serve(scope, receive, send, caller, renewal)
+            with _Body(
+                self, self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
+            ) as body:
+                try:
+                    await body.read(scope, receive)
+                except _RefusedError as why:
+                    return await why.answer(Request(scope))(scope, receive, send)
+                except _LeftError:
+                    return None
+                whole = bytes(body.data)
+            self._doorman.charge(caller, len(whole))
+            return await self._place(
+                scope, whole, send, renewal=renewal, receive=receive, until_answered=until_answered
+            )
 
     async def _who(self, scope: Scope, renewal: bool) -> Principal:
         kind, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
@@ -131,20 +144,6 @@ class Reception:
             if not self._of[caller.owner]:
                 del self._of[caller.owner]
 
-    async def _serve(self, scope: Scope, receive: Receive, send: Send, caller: Principal, renewal: bool) -> None:
-        limit = self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
-        with _Body(self, limit) as body:
-            try:
-                await body.read(scope, receive)
-            except _RefusedError as why:
-                await why.answer(Request(scope))(scope, receive, send)
-                return
-            except _LeftError:
-                return
-            whole = bytes(body.data)
-            self._doorman.charge(caller, len(whole))
-        await self._place(scope, whole, send, renewal=renewal, receive=receive)
-
     def hold(self, count: int) -> bool:
         """Whether there is room for more bytes of bodies that have not arrived whole; a negative count gives back."""
         if count > 0 and self._held + count > _MOST_HELD:
@@ -153,9 +152,19 @@ class Reception:
         return True
 
     async def _place(
-        self, scope: Scope, body: bytes, send: Send, *, renewal: bool, receive: Receive | None = None
+        self,
+        scope: Scope,
+        body: bytes,
+        send: Send,
+        *,
+        renewal: bool,
+        receive: Receive | None = None,
+        until_answered: contextlib.ExitStack | None = None,
     ) -> None:
-        """Serve it where there is a place; without ``receive`` the caller has shown no token."""
+        """Serve it where there is a place; without ``receive`` the caller has shown no token.
+
+        What ``until_answered`` holds is let go when an answer begins: a stream is no request under way.
+        """
         counts, most = (self._places, self._most(renewal)) if receive is not None else (self._strangers, _STRANGERS)
         if counts.taken >= most:
             if renewal:
@@ -164,14 +173,14 @@ class Reception:
             refusal = answer(Request(scope), 503, "Too busy", text, headers={"Retry-After": "1"})
             await refusal(scope, _nothing, send)
             return
-        with contextlib.ExitStack() as until_answered:
-            until_answered.enter_context(counts.one())
+        with until_answered or contextlib.ExitStack() as held:
+            held.enter_context(counts.one())
             if renewal:
-                until_answered.enter_context(self._strain.renewing())
+                held.enter_context(self._strain.renewing())
 
             async def noting(message: Message) -> None:
                 if message["type"] == "http.response.start":
-                    until_answered.close()
+                    held.close()
                 await send(message)
 
             await self._app(scope, _replaying(body, receive), noting)
