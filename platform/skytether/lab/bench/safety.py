@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from skytether.lab.safety import deaths, hardware, starve, stops
+from skytether.lab.safety import deaths, hardware, starve, stops, suspend
 from skytether.lab.safety.attacks import Attack, Attacks
 from skytether.lab.safety.checker import Finding, tightest
 from skytether.lab.safety.cores import busy_cores
@@ -65,6 +65,7 @@ def attacks() -> list[Attack]:
     stops.enter(known)
     hardware.enter(known)
     starve.enter(known)
+    suspend.enter(known)
     return known.all
 
 
@@ -142,10 +143,13 @@ class _Robots:
 
 def _stage(attack: Attack, robots: _Robots) -> Finding:
     """Stage an attack once: a robot that drives, the attack, and a robot that drives again."""
+    if attack.rehearse is not None:
+        return attack.rehearse()
     stage = Stage(robots.get(attack))
     try:
         stage.robot.go()
-        attack.run(stage)
+        if attack.run is not None:
+            attack.run(stage)
         if not attack.spoils:
             stage.robot.go()
     except (StagingError, GateError, OSError) as error:

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
+from .checker import Finding
 from .robot import PlayedRobot
 from .stage import Stage
 
@@ -21,6 +22,7 @@ class Attack:
         name: On the command line and in the table.
         what: In words.
         run: Stages it once, with a robot that drives.
+        rehearse: Instead of that: stages it without processes.
         spoils: The robot is of no use for another attack.
         seconds: About how long it takes, for the estimate.
         robot: Makes a robot of its own for it, in a folder; None: any will do.
@@ -28,10 +30,14 @@ class Attack:
 
     name: str
     what: str
-    run: Callable[[Stage], None]
+    run: Callable[[Stage], None] | None
     spoils: bool
     seconds: float
-    robot: MakeRobot | None
+    robot: MakeRobot | None = None
+    rehearse: Callable[[], Finding] | None = None
+
+
+_REHEARSAL_S = 0.5
 
 
 class Attacks:
@@ -52,3 +58,7 @@ class Attacks:
     ) -> None:
         """Enter one."""
         self.all.append(Attack(name, what, run, spoils or robot is not None, seconds, robot))
+
+    def add_rehearsal(self, name: str, what: str, rehearse: Callable[[], Finding]) -> None:
+        """Enter one that needs no processes."""
+        self.all.append(Attack(name, what, None, False, _REHEARSAL_S, rehearse=rehearse))

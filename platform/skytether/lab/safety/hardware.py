@@ -9,6 +9,7 @@ from itertools import cycle
 
 import numpy as np
 
+from skytether.guard.clock import now
 from skytether.messages import Header, Joy, LaserScan, Time
 
 from .attacks import Attacks
@@ -39,9 +40,9 @@ def enter(attacks: Attacks) -> None:
         ("nan", "all rays NaN", _all(math.nan)),
         ("one-ray", "one ray, backward", _few(1)),
         ("four-rays", "four rays, 90 degrees apart", _few(4)),
-        ("silent", "nothing any more", lambda: None),
-        ("two-old", "two old scans in turn", None),
-        ("old-stamps", "scans that are 10 s old", _old),
+        ("silent", "nothing any more", lambda _: lambda: None),
+        ("two-old", "two old scans in turn", _two_old),
+        ("late", "scans that come later and later", _late),
     ):
         attacks.add(f"laser-{name}", f"the laser sends {what}", _blind(what, scan), seconds=3.5)
     attacks.add("joystick-lost", "the joystick falls silent with its button held, and comes back so", _lost, seconds=4)
@@ -58,33 +59,33 @@ def _wheels_gone(seconds: float) -> Callable[[Stage], None]:
     return run
 
 
-def _blind(what: str, scan: Scan | None) -> Callable[[Stage], None]:
+def _blind(what: str, shown: Callable[[Stage], Scan]) -> Callable[[Stage], None]:
     """Whoever does not see stands, or is as slow as the slow zone has it."""
 
     def run(stage: Stage) -> None:
-        shown = scan
-        if shown is None:
-            shown = _two_old(stage)
+        scan = shown(stage)
         speed = stage.robot.config.zones.slow_speed
         with stage.slows(speed, stage.promised.sensor, f"the laser sends {what}"):
-            stage.robot.scan = shown
+            stage.robot.scan = scan
             stage.sleep(_BLIND_S)
         stage.robot.scan = stage.robot.clear
 
     return run
 
 
-def _all(value: float) -> Scan:
-    return lambda: scan_of(np.full(RAYS, value, dtype=np.float32))
+def _all(value: float) -> Callable[[Stage], Scan]:
+    return lambda _: lambda: scan_of(np.full(RAYS, value, dtype=np.float32))
 
 
-def _few(rays: int) -> Scan:
+def _few(rays: int) -> Callable[[Stage], Scan]:
     """The first one looks backward; nothing is near any of them."""
-    return lambda: scan_of(np.full(rays, 5.0, dtype=np.float32), step=2 * math.pi / rays)
+    return lambda _: lambda: scan_of(np.full(rays, 5.0, dtype=np.float32), step=2 * math.pi / rays)
 
 
-def _old() -> LaserScan:
-    return scan_of(np.full(RAYS, 5.0, dtype=np.float32), age_s=10.0)
+def _late(_: Stage) -> Scan:
+    """What a driver sends that does not keep up: each second of scans takes ten."""
+    began = now()
+    return lambda: scan_of(np.full(RAYS, 5.0, dtype=np.float32), age_s=0.9 * (now() - began))
 
 
 def _two_old(stage: Stage) -> Scan:

@@ -339,15 +339,18 @@ class PlayedRobot:
                 own.wait()
 
 
-def scan_of(ranges: np.ndarray[Any, np.dtype[np.float32]], step: float = 0.0, age_s: float = 0.0) -> LaserScan:
+def scan_of(
+    ranges: np.ndarray[Any, np.dtype[np.float32]], step: float = 0.0, age_s: float = 0.0, wall_s: float | None = None
+) -> LaserScan:
     """A laser's message; its first ray looks backward.
 
     Args:
         ranges: [m].
         step: From one ray to the next [rad]; 0: one degree.
         age_s: How long ago it was taken [s].
+        wall_s: The time now [s]; None: of this machine.
     """
-    wall = time.time_ns() - int(age_s * 1e9)
+    wall = (time.time_ns() if wall_s is None else int(wall_s * 1e9)) - int(age_s * 1e9)
     return LaserScan(
         header=Header(stamp=Time(wall // 10**9, wall % 10**9), frame_id="laser"),
         angle_min=-math.pi,
