@@ -29,6 +29,8 @@ from skytether.robot.safety.sources import Hand
 _RAYS = 7200
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""
+_SOON_S = 1e-6
+"""Least time to the guard's next turn: rounding must not put it at this very moment, again and again."""
 _NEUTRAL_S = 0.5
 """An agent wants a standstill first; the times of a drive count from the end of it."""
 
@@ -195,7 +197,7 @@ class Drive:
             self._look()
             self._at(self.now + self._period(), "guard")
         else:
-            self._at(self._looked + self._period(), "guard")
+            self._at(max(self._looked + self._period(), self.now + _SOON_S), "guard")
 
     def _look(self) -> None:
         self._looked = self.now
