@@ -26,7 +26,6 @@ from skytether.robot.safety.heartbeat import differs
 from skytether.robot.safety.rules import Gate
 from skytether.robot.safety.sources import Hand
 
-_RAYS = 7200
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""
 _SOON_S = 1e-6
@@ -92,6 +91,7 @@ class Drive:
     faults: Faults = field(default_factory=Faults)
     seed: int = 0
     see_m: float = 50.0
+    rays: int = 720
     pose: Pose = field(default_factory=Pose)
     moving: Velocity = STANDSTILL
     fastest: float = 0.0
@@ -149,15 +149,15 @@ class Drive:
         return self.rules.stages.period_s * (1 + self.faults.jitter * self.random.uniform(-1, 1))
 
     def _do_measure(self, _: None) -> None:
-        ranges = np.full(_RAYS, math.inf)
+        ranges = np.full(self.rays, math.inf)
         near = self.pose.sees(self.world)
         if len(near):
-            rays = np.round(np.arctan2(near[:, 1], near[:, 0]) / math.tau * _RAYS).astype(int) % _RAYS
+            rays = np.round(np.arctan2(near[:, 1], near[:, 0]) / math.tau * self.rays).astype(int) % self.rays
             np.minimum.at(ranges, rays, np.hypot(near[:, 0], near[:, 1]))
         ranges[ranges > self.see_m] = math.inf
         scan = LaserScan(
             header=Header(stamp=Time(sec=int(self.now), nanosec=int(self.now % 1 * 1e9)), frame_id="laser"),
-            angle_increment=math.tau / _RAYS,
+            angle_increment=math.tau / self.rays,
             range_min=0.01,
             range_max=self.see_m,
             ranges=ranges.astype(np.float32),

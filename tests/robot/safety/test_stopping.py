@@ -23,7 +23,7 @@ def config(rate_hz: float = 50.0, guard_s: float | None = None, **limits: float)
         {
             "footprint": {"polygon": [[0.35, 0.25], [0.35, -0.25], [-0.3, -0.25], [-0.3, 0.25]]},
             "limits": {"linear_max": 1.5, "linear_min": -0.5, "angular_max": 1.0, "max_gap_s": 1.0} | limits,
-            "sensors": {"scan": {"range_max": 50.0}},
+            "sensors": {"scan": {"on_empty": "free"}},
             "rate_hz": rate_hz,
             "guard_s": guard_s or max(0.1, 2 / rate_hz),
             "sockets": {},
@@ -63,6 +63,17 @@ def test_a_gate_that_dies_on_the_way_to_a_wall_is_no_worse(rate):
         assert deepest(drive, dies + 2.0) <= TOLERANCE
 
 
+@pytest.mark.parametrize("see_m", [2.0, *(pytest.param(far, marks=pytest.mark.slow) for far in (1.0, 4.0))])
+def test_the_robot_is_only_as_fast_as_it_can_stop_within_what_its_laser_sees(see_m):
+    drive = Drive(config(), WALL, lambda _: (1.5, 0.0), see_m=see_m)
+    assert deepest(drive, 4.0 + 6.0 / see_m) <= TOLERANCE
+    # 0.45 m of what it sees is the footprint and the stop zone; the oldest scan is 0.15 s old.
+    stages = drive.rules.stages
+    assert drive.fastest <= fastest(see_m - 0.45, 2.0, stages.reaction_s(0.0)) + 0.01
+    assert drive.fastest >= min(1.5, 0.9 * fastest(see_m - 0.45, 2.0, stages.reaction_s(0.15)))
+    assert drive.pose.x > 5.3
+
+
 @st.composite
 def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
     """A robot of any kind, among things of any kind, with an agent that wants anything."""
@@ -87,7 +98,7 @@ def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
                 "sensing_s": draw(st.floats(0.001, 0.15)),
                 "reaction_s": draw(st.floats(0.01, 0.3)),
             },
-            "sensors": {"scan": {"range_max": 50.0}},
+            "sensors": {"scan": {"on_empty": "free"}},
             "rate_hz": rate,
             "guard_s": draw(st.floats(max(0.02, 2 / rate), 0.25)),
             "sockets": {},
@@ -106,6 +117,8 @@ def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
     )
     seconds = 1.2 * len(legs)
     drive = Drive(robot, np.array(found), lambda at: legs[min(int(at / 1.2), len(legs) - 1)], faults, draw(seeds))
+    drive.rays = 7200
+    drive.see_m = draw(st.sampled_from([50.0, draw(st.floats(0.5, 4.0))]))
     return drive, seconds
 
 

@@ -84,3 +84,11 @@ def test_whoever_stands_still_says_nothing_about_the_zones():
 def test_zones_that_would_not_stop_are_refused(name, value):
     with pytest.raises(ValueError, match=f"zones: {name} must be above 0"):
         ZoneParams(**{name: value})
+
+
+def test_the_end_of_what_is_seen_counts_as_something_that_stands_there():
+    # 0.6 m to the end of sight: as for a wall there, but without a zone.
+    share = ZONES.within_sight(Velocity(2.0, 0.0), ahead(0.6), STEADY)
+    assert 2.0 * share == pytest.approx(-0.2 + math.sqrt(2.44))
+    assert ZONES.within_sight(Velocity(2.0, 0.0), ahead(5.0), STEADY) == 1.0
+    assert ZONES.within_sight(STANDSTILL, ahead(0.1), STEADY) == 1.0

@@ -163,6 +163,8 @@ class Gate:
             velocity: What they were told.
             at: When [s]; before the time of the next step.
         """
+        before = self._supervised.now
+        self._reckoning.tell(velocity, at if before is None else max(at, before))
         self._supervised = replace(self._supervised, velocity=velocity, now=at)
 
     def step(self, now: float) -> Decision:
@@ -222,10 +224,13 @@ class Gate:
         if unseen < 1:
             verb = "does not go there" if unseen == 0 else "goes there slowly"
             troubles["unseen"] = f"no sensor looks where the robot is to move (safety.unseen); it {verb}"
+        sight = self._zones.within_sight(wanted, scene.edge, varied)
+        if sight < 1:
+            troubles["sight"] = "the sensors do not see far enough to stop from a higher speed (their range_max)"
         most = self._most(scene.action, wanted)
         unknown = allowed.zone is not Zone.STOP and (scene.unknown or unseen < 1)
         zone = Zone.UNKNOWN if unknown else allowed.zone
-        return replace(allowed, share=min(allowed.share, most, unseen), zone=zone)
+        return replace(allowed, share=min(allowed.share, most, unseen, sight), zone=zone)
 
     def _most(self, action: Action, wanted: Velocity) -> float:
         """What share of a velocity an action leaves."""

@@ -59,12 +59,14 @@ class Part:
         edge: Where its sight ends on rays that saw nothing, the same way.
         age: Of the measurement [s].
         cover: Where it looks.
+        far: How far it measures [m]; 0: not known, as nothing was beyond.
     """
 
     points: Points
     edge: Points
     age: float
     cover: Cover
+    far: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +89,22 @@ class Scene:
     def points(self) -> Points:
         """Everything that is seen, base frame, shape (n, 2) [m]."""
         return np.concatenate([_NOTHING, *(part.points for part in self.parts)])
+
+    @property
+    def edge(self) -> Points:
+        """Where the sight of all together ends on rays that saw nothing, base frame, shape (n, 2) [m].
+
+        Where one sensor's sight ends and another's, who looks there too, goes on, there is no end.
+        """
+        ends = [_NOTHING]
+        for part in self.parts:
+            edge = part.edge
+            for other in self.parts:
+                if other.far > part.far and len(edge):
+                    away = np.hypot(edge[:, 0] - other.cover.x, edge[:, 1] - other.cover.y)
+                    edge = edge[~(other.cover.looks_at(edge) & (away < other.far))]
+            ends.append(edge)
+        return np.concatenate(ends)
 
     @property
     def age(self) -> float:
@@ -186,7 +204,8 @@ class Sensing:
 def _part(mount: Mount, seen: View, age: float, now: float, reckoning: DeadReckoning) -> Part:
     points, edge = (reckoning.now_at(these, now - age, now) for these in (seen.points, seen.edge))
     reach = np.where(seen.looks, inf, 0.0)
-    return Part(points, edge, age, Cover(mount.x, mount.y, mount.yaw, mount.sense, reach))
+    far = float(np.hypot(seen.edge[0, 0] - mount.x, seen.edge[0, 1] - mount.y)) if len(seen.edge) else 0.0
+    return Part(points, edge, age, Cover(mount.x, mount.y, mount.yaw, mount.sense, reach), far)
 
 
 def _action(sensor: RangeSensor, sight: Sight) -> Action:

@@ -135,22 +135,42 @@ class Zones:
         speed = self.speed(velocity)
         if speed == 0:
             return Allowed(1.0, before, inf)
-        p = self._params
-        reaction = self._stages.reaction_s(0.0)
         slowdown = kinematics.slowdown(self._limits, velocity)
-        horizon = max(p.slow_m + p.hysteresis_m, speed * (reaction + 0.5 / slowdown))
-        reach = self.stop.radius + horizon
-        unsure = self._stages.late_s * (varied.linear + varied.angular * reach)
-        near = points[np.hypot(points[:, 0], points[:, 1]) <= reach + unsure]
-        contact = self._outlines(unsure).time_to_contact(near, velocity.linear, velocity.angular)
+        contact = self._contact(velocity, points, varied)
         way = contact * speed
         zone = self._zone(way, before)
         if zone is Zone.STOP:
             return Allowed(0.0, zone, way)
-        share = 1.0 if isinf(contact) else min(1.0, fastest(contact, slowdown, reaction))
+        share = self._share(contact, slowdown)
         if zone is Zone.SLOW:
             share = min(share, self.slow(velocity))
         return Allowed(share, zone, way)
+
+    def within_sight(self, velocity: Velocity, edge: Points, varied: Variation) -> float:
+        """The share of a velocity from which the robot stands before it gets to where it has seen nothing yet.
+
+        Args:
+            velocity: What is wanted.
+            edge: Where the sensors' sight ends, shape (n, 2), base frame [m].
+            varied: As for `allow`.
+        """
+        if self.speed(velocity) == 0:
+            return 1.0
+        return self._share(self._contact(velocity, edge, varied), kinematics.slowdown(self._limits, velocity))
+
+    def _contact(self, velocity: Velocity, points: Points, varied: Variation) -> float:
+        """Time until the first of the points gets into the stop zone [s]; inf: none within all that could matter."""
+        p, speed = self._params, self.speed(velocity)
+        slowdown = kinematics.slowdown(self._limits, velocity)
+        horizon = max(p.slow_m + p.hysteresis_m, speed * (self._stages.reaction_s(0.0) + 0.5 / slowdown))
+        reach = self.stop.radius + horizon
+        unsure = self._stages.late_s * (varied.linear + varied.angular * reach)
+        near = points[np.hypot(points[:, 0], points[:, 1]) <= reach + unsure]
+        return self._outlines(unsure).time_to_contact(near, velocity.linear, velocity.angular)
+
+    def _share(self, contact: float, slowdown: float) -> float:
+        """Of the velocity that touches after this time, so that the robot stands before."""
+        return 1.0 if isinf(contact) else min(1.0, fastest(contact, slowdown, self._stages.reaction_s(0.0)))
 
     def _zone(self, way: float, before: Zone) -> Zone:
         p = self._params
