@@ -19,6 +19,9 @@ def safety(
     ] = None,
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="How often each is staged.")] = 1,
     busy: Annotated[bool, typer.Option("--busy", help="Other programs take all cores meanwhile.")] = False,
+    ros1: Annotated[
+        bool, typer.Option("--ros1", help="Attacks on a robot that is a ROS 1 graph, too; needs rosmaster.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each attack.")] = False,
 ) -> None:
     """Attack the robot's gate on real processes, and hold what the wheels received against what is promised.
@@ -26,9 +29,12 @@ def safety(
     Guard, gate and agent are real; sensors and wheels are played. Ends with exit status 1 if a promise was broken.
     """
     from skytether.lab.bench.safety import bench_safety, estimate, select
+    from skytether.lab.safety.ros1_hardware import available
 
+    if ros1 and not available():
+        fail("there is no program 'rosmaster': install ros-core, or leave out --ros1", 2)
     try:
-        chosen = select(attack or ())
+        chosen = select(attack or (), ros1)
     except ValueError as error:
         fail(str(error), 2)
     console.print(f"{len(chosen)} attacks, about {estimate(chosen, n) / 60:.1f} minutes", style="dim", markup=False)

@@ -13,8 +13,8 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from skytether.lab.safety import deaths, hardware, starve, stops, suspend
-from skytether.lab.safety.attacks import Attack, Attacks
+from skytether.lab.safety import deaths, hardware, ros1, starve, stops, suspend
+from skytether.lab.safety.attacks import Attack, Attacks, MakeRobot
 from skytether.lab.safety.checker import Finding, tightest
 from skytether.lab.safety.cores import busy_cores
 from skytether.lab.safety.robot import PlayedRobot, StagingError
@@ -58,24 +58,34 @@ class SafetyRow:
         return asdict(self)
 
 
-def attacks() -> list[Attack]:
-    """All that there are, in the order in which they are staged."""
+def attacks(with_ros1: bool = False) -> list[Attack]:
+    """All that there are, in the order in which they are staged.
+
+    Args:
+        with_ros1: Those that need a ROS 1 master, too.
+    """
     known = Attacks()
     deaths.enter(known)
     stops.enter(known)
     hardware.enter(known)
     starve.enter(known)
     suspend.enter(known)
+    if with_ros1:
+        ros1.enter(known)
     return known.all
 
 
-def select(names: Sequence[str]) -> list[Attack]:
+def select(names: Sequence[str], with_ros1: bool = False) -> list[Attack]:
     """Those of that name, or whose name begins with it and a hyphen; without a name all of them.
+
+    Args:
+        names: Of attacks.
+        with_ros1: See `attacks`.
 
     Raises:
         ValueError: There is none.
     """
-    known = attacks()
+    known = attacks(with_ros1)
     chosen = []
     for name in names:
         found = [attack for attack in known if attack.name == name or attack.name.startswith(f"{name}-")]
@@ -119,6 +129,7 @@ class _Robots:
     def __init__(self) -> None:
         self._undo = ExitStack()
         self._robot: PlayedRobot | None = None
+        self._made_by: MakeRobot | None = None
 
     def __enter__(self) -> _Robots:
         return self
@@ -128,11 +139,12 @@ class _Robots:
 
     def get(self, attack: Attack) -> PlayedRobot:
         """One that drives, or will."""
-        if attack.robot is not None:
+        if self._made_by is not attack.robot:
             self.end()
         if self._robot is None:
             folder = Path(self._undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-")))
             self._robot = self._undo.enter_context((attack.robot or PlayedRobot)(folder))
+            self._made_by = attack.robot
         return self._robot
 
     def end(self) -> None:

@@ -25,7 +25,7 @@ class Attack:
         rehearse: Instead of that: stages it without processes.
         spoils: The robot is of no use for another attack.
         seconds: About how long it takes, for the estimate.
-        robot: Makes a robot of its own for it, in a folder; None: any will do.
+        robot: Makes the robot that it needs, in a folder; None: the usual one.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Attacks:
         robot: MakeRobot | None = None,
     ) -> None:
         """Enter one."""
-        self.all.append(Attack(name, what, run, spoils or robot is not None, seconds, robot))
+        self.all.append(Attack(name, what, run, spoils, seconds, robot))
 
     def add_rehearsal(self, name: str, what: str, rehearse: Callable[[], Finding]) -> None:
         """Enter one that needs no processes."""

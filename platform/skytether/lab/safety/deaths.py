@@ -10,32 +10,33 @@ from itertools import permutations
 from .attacks import Attacks
 from .stage import Promised, Stage
 
+Run = Callable[[Stage], None]
 ROLES = ("agent", "gate", "guard")
 _FREEZES_S = (0.2, 1.0, 2.0)
 _NEXT_S = 0.05
 """From the first death to the second: less than it takes to notice the first."""
 _WATCH_S = 1.0
 """For so long the robot has to stay where it stands."""
-_GATE_STARTS_S = 0.5
-"""No new gate drives on sooner than this."""
+_STARTS_AGAIN_S = 0.5
+"""The guard starts gate and writer again; none drives on sooner than this."""
 
 
 def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
     """Add them, for the processes that there are."""
     for role in roles:
-        attacks.add(f"{role}-killed", f"the {role} is killed", _killed(role), seconds=3)
+        attacks.add(f"{role}-killed", f"the {role} is killed", killed(role), seconds=3)
         for seconds in _FREEZES_S:
             attacks.add(
                 f"{role}-frozen-{seconds:g}",
                 f"the {role} is frozen for {seconds:g} s, and goes on",
-                _frozen(role, seconds),
+                frozen(role, seconds),
                 seconds=seconds + 1.5,
             )
     for first, second in permutations(roles, 2):
         attacks.add(
             f"{first}-{second}-killed",
             f"the {first} is killed, {1e3 * _NEXT_S:.0f} ms later the {second}",
-            _both_killed(first, second),
+            both_killed(first, second),
             seconds=3.5,
         )
     for first, second in permutations(("gate", "guard")):
@@ -55,13 +56,13 @@ def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
         attacks.add(
             f"guard-{name}",
             f"the guard is told to end ({number.name})",
-            _ended(number, everybody=False),
+            ended(number, everybody=False),
             seconds=4,
         )
         attacks.add(
             f"all-{name}",
             f"guard, gate and agent are told to end at once ({number.name})",
-            _ended(number, everybody=True),
+            ended(number, everybody=True),
             seconds=4,
         )
 
@@ -71,14 +72,16 @@ def _alone(role: str) -> Callable[[Promised], float]:
 
 
 def _two(first: str, second: str) -> Callable[[Promised], float]:
-    if "agent" in (first, second):
+    if {first, second} & {"agent", "writer"}:  # somebody is left who can speak to the wheels
         return lambda promised: _NEXT_S + promised.partner
     return lambda promised: _NEXT_S + promised.silence
 
 
-def _killed(role: str) -> Callable[[Stage], None]:
+def killed(role: str) -> Run:
+    """One is killed."""
+
     def run(stage: Stage) -> None:
-        until = _WATCH_S if role != "gate" else _GATE_STARTS_S
+        until = _WATCH_S if role not in ("gate", "writer") else _STARTS_AGAIN_S
         victim = stage.robot.pid(role)
         with stage.stands(_alone(role)(stage.promised), f"the {role} was killed"):
             stage.robot.kill(victim)
@@ -89,7 +92,9 @@ def _killed(role: str) -> Callable[[Stage], None]:
     return run
 
 
-def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
+def frozen(role: str, seconds: float) -> Run:
+    """One is frozen for a while, and goes on."""
+
     def run(stage: Stage) -> None:
         pid = stage.robot.pid(role)
         demand = (
@@ -104,7 +109,9 @@ def _frozen(role: str, seconds: float) -> Callable[[Stage], None]:
     return run
 
 
-def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
+def both_killed(first: str, second: str) -> Run:
+    """One is killed, and then another."""
+
     def run(stage: Stage) -> None:
         one, victim = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were killed"):
@@ -116,7 +123,7 @@ def _both_killed(first: str, second: str) -> Callable[[Stage], None]:
     return run
 
 
-def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
+def _both_frozen(first: str, second: str) -> Run:
     def run(stage: Stage) -> None:
         one, other = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were frozen"):
@@ -132,7 +139,7 @@ def _both_frozen(first: str, second: str) -> Callable[[Stage], None]:
     return run
 
 
-def _frozen_and_killed(first: str, second: str) -> Callable[[Stage], None]:
+def _frozen_and_killed(first: str, second: str) -> Run:
     def run(stage: Stage) -> None:
         frozen, victim = stage.robot.pid(first), stage.robot.pid(second)
         with stage.stands(_two(first, second)(stage.promised), f"the {first} was frozen and the {second} killed"):
@@ -146,7 +153,9 @@ def _frozen_and_killed(first: str, second: str) -> Callable[[Stage], None]:
     return run
 
 
-def _ended(number: signal.Signals, everybody: bool) -> Callable[[Stage], None]:
+def ended(number: signal.Signals, everybody: bool) -> Run:
+    """The guard is told to end; or all are, as systemd does."""
+
     def run(stage: Stage) -> None:
         promised = stage.promised.partner if everybody else stage.promised.stop
         roles = ROLES if everybody else ("guard",)

@@ -30,7 +30,7 @@ def enter(attacks: Attacks) -> None:
         attacks.add(
             f"wheels-gone-{seconds:g}",
             f"the wheels' driver is gone for {seconds:g} s",
-            _wheels_gone(seconds),
+            wheels_gone(seconds),
             seconds=seconds + 1.5,
         )
     for name, what, scan in (
@@ -44,22 +44,24 @@ def enter(attacks: Attacks) -> None:
         ("two-old", "two old scans in turn", _two_old),
         ("late", "scans that come later and later", _late),
     ):
-        attacks.add(f"laser-{name}", f"the laser sends {what}", _blind(what, scan), seconds=3.5)
+        attacks.add(f"laser-{name}", f"the laser sends {what}", blind(what, scan), seconds=3.5)
     attacks.add("joystick-lost", "the joystick falls silent with its button held, and comes back so", _lost, seconds=4)
     attacks.add("joystick-repeated", "the joystick's driver repeats the last state for ever", _still, seconds=5)
 
 
-def _wheels_gone(seconds: float) -> Callable[[Stage], None]:
+def wheels_gone(seconds: float) -> Callable[[Stage], None]:
+    """Nobody listens to the velocities for a while [s]."""
+
     def run(stage: Stage) -> None:
-        stage.robot.record.vanish()
+        stage.robot.hardware.vanish()
         stage.sleep(seconds)
-        stage.robot.record.appear()
+        stage.robot.hardware.appear()
         stage.drives_on(f"the robot drives on after the wheels' driver was gone for {seconds:g} s")
 
     return run
 
 
-def _blind(what: str, shown: Callable[[Stage], Scan]) -> Callable[[Stage], None]:
+def blind(what: str, shown: Callable[[Stage], Scan]) -> Callable[[Stage], None]:
     """Whoever does not see stands, or is as slow as the slow zone has it."""
 
     def run(stage: Stage) -> None:

@@ -10,7 +10,6 @@ import json
 import math
 import os
 import secrets
-import socket
 import subprocess
 import sys
 import threading
@@ -28,11 +27,11 @@ import yaml
 
 from skytether.guard.clock import now
 from skytether.guard.velocity import STANDSTILL, Velocity
-from skytether.messages import Bool, Header, Joy, LaserScan, Message, Time, encode
+from skytether.messages import Bool, Header, Joy, LaserScan, Time
 from skytether.robot.safety.client import GateError, ask
 from skytether.robot.safety.config import SafetyConfig
 
-from .record import WheelRecord
+from .socket_hardware import Hardware, SocketHardware
 
 LIMITS: Mapping[str, float] = {"linear_max": 0.5, "linear_min": -0.1, "angular_max": 0.8}
 """Of the wheels and of the agent."""
@@ -76,6 +75,7 @@ class PlayedRobot:
         output: Descriptor for what the processes print; None: the file ``log`` in the folder.
         before: Run in each process before its program; for limits of its own.
         drive: False: there is no agent.
+        hardware: Makes wheels and sensors, given the folder of the gate's sockets.
     """
 
     def __init__(
@@ -86,6 +86,7 @@ class PlayedRobot:
         output: int | None = None,
         before: Callable[[], None] | None = None,
         drive: bool = True,
+        hardware: Callable[[Path], Hardware] = SocketHardware,
     ) -> None:
         self.folder = folder / "run"
         self.folder.mkdir(exist_ok=True)
@@ -96,19 +97,20 @@ class PlayedRobot:
         """The button; None: it is silent."""
         self.pad: Callable[[], Joy] | None = None
         """What the joystick sends; None: nothing."""
-        section = {**SAFETY, **(safety or {}), "folder": str(self.folder)}
-        self.config = SafetyConfig.model_validate(section)
+        self._undo = ExitStack()
         self._file = folder / "robot.yaml"
-        self._file.write_text(yaml.safe_dump({"safety": _plain(section)}))
         self._output = output
         self._before = before
         self._mark = secrets.token_hex(8)
         self._ended = threading.Event()
-        self._undo = ExitStack()
-        self._undo.callback(self._end_processes)
         try:
-            self.record = WheelRecord(self.folder / "wheels.sock")
-            self._undo.callback(self.record.close)
+            self.hardware = hardware(self.folder)
+            self._undo.callback(self.hardware.close)
+            self.record = self.hardware.record
+            section = {**SAFETY, **self.hardware.section, **(safety or {}), "folder": str(self.folder)}
+            self.config = SafetyConfig.model_validate(section)
+            self._file.write_text(yaml.safe_dump({"safety": _plain(section)}))
+            self._undo.callback(self._end_processes)
             self._sensing = threading.Thread(target=self._sense, name="sensors")
             self._sensing.start()
             self._undo.callback(self._sensing.join)
@@ -287,28 +289,15 @@ class PlayedRobot:
         """Nothing within 5 m, all around."""
         return scan_of(np.full(RAYS, 5.0, dtype=np.float32))
 
-    def send(self, topic: str, message: Message) -> None:
-        """A reading of the hardware, once."""
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
-            link.setblocking(False)
-            self._send(link, topic, message)
-
     def _sense(self) -> None:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
-            link.setblocking(False)
-            while not self._ended.wait(_SENSE_S):
-                scan, pressed, pad = self.scan, self.pressed, self.pad
-                if scan is not None and (seen := scan()) is not None:
-                    self._send(link, "scan", seen)
-                if pressed is not None:
-                    self._send(link, "estop", Bool(pressed))
-                if pad is not None:
-                    self._send(link, "joy", pad())
-
-    def _send(self, link: socket.socket, topic: str, message: Message) -> None:
-        with suppress(OSError):  # the gate is not there, or does not take it: so much the worse for it
-            name = "estop.sock" if topic == "estop" and (self.folder / "estop.sock").exists() else "sensors.sock"
-            link.sendto(topic.encode() + b"\0" + encode(message), str(self.folder / name))
+        while not self._ended.wait(_SENSE_S):
+            scan, pressed, pad = self.scan, self.pressed, self.pad
+            if scan is not None and (seen := scan()) is not None:
+                self.hardware.send("scan", seen)
+            if pressed is not None:
+                self.hardware.send("estop", Bool(pressed))
+            if pad is not None:
+                self.hardware.send("joy", pad())
 
     def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
         with self.log.open("ab") as log:

@@ -31,7 +31,7 @@ class Promised:
         joystick: After the joystick's last word.
         still: After the joystick's last change.
         stop: After a stop, by a person or a button.
-        silence: After the last word of whoever could speak to the wheels; they then stop by themselves.
+        silence: After the last word of gate and guard; the wheels then stop by themselves, on a graph the writer brakes.
         jitter: What each of these has in addition, for how well times are known.
     """
 
@@ -51,7 +51,8 @@ class Promised:
         limits = config.limits or Limits()
         period = 1 / config.rate_hz
         brakes = max(limits.linear_max / limits.linear_braking, limits.angular_max / limits.angular_braking)
-        rest = _TURNS * period + brakes + period
+        turns = _TURNS if config.ros1 is None else _TURNS + 1  # the writer's
+        rest = turns * period + brakes + period
         return cls(
             agent=limits.max_gap_s + rest,
             partner=config.guard_s + rest,
@@ -60,7 +61,7 @@ class Promised:
             joystick=(config.joystick.max_age_s if config.joystick else 0.0) + rest,
             still=((config.joystick and config.joystick.max_still_s) or 0.0) + rest,
             stop=rest,
-            silence=config.guard_s + _TURNS * period,
+            silence=config.guard_s + (_TURNS * period if config.ros1 is None else rest),
             jitter=period,
         )
 

@@ -59,9 +59,16 @@ def enter(attacks: Attacks) -> None:
         spoils=True,
     )
     attacks.add(
-        "pipe-full", "nobody reads the log; gate and agent are killed, a stop", _mute, seconds=12, robot=_unread
+        "pipe-full",
+        "nobody reads the log; gate and agent are killed, a stop",
+        _mute,
+        seconds=12,
+        robot=_unread,
+        spoils=True,
     )
-    attacks.add("disk-full", "the disk is full; a stop, the gate is killed", _full, seconds=9, robot=_small_disk)
+    attacks.add(
+        "disk-full", "the disk is full; a stop, the gate is killed", _full, seconds=9, robot=_small_disk, spoils=True
+    )
 
 
 @contextmanager

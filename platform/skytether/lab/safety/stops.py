@@ -31,7 +31,7 @@ def enter(attacks: Attacks) -> None:
         attacks.add(
             f"stop-{role}-killed",
             f"a stop is acknowledged, and the {role} killed at once",
-            _then_killed(role),
+            stop_and_kill(role),
             seconds=5,
         )
     attacks.add("stop-both-killed", "a stop is acknowledged, guard and gate are killed", _both, seconds=6)
@@ -49,7 +49,9 @@ def _named(reason: str) -> str:
     return shown if len(shown) < 30 else f"{len(reason)} letters"
 
 
-def _then_killed(role: str) -> Callable[[Stage], None]:
+def stop_and_kill(role: str) -> Callable[[Stage], None]:
+    """A stop, and then one is killed."""
+
     def run(stage: Stage) -> None:
         victim = stage.robot.pid(role)
         with stage.stands(stage.promised.stop, f"a stop was acknowledged, and the {role} killed"):
