@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from skytether.lab.bench.safety import attacks, estimate, select
+from skytether.lab.bench.safety import attacks, bench_safety, estimate, select
+from skytether.lab.safety import robot
+from skytether.lab.safety.robot import LIMITS
 
 
 def test_each_attack_has_a_name_of_its_own_and_can_be_chosen():
@@ -21,3 +23,31 @@ def test_each_attack_has_a_name_of_its_own_and_can_be_chosen():
 
 def test_all_attacks_fit_into_some_minutes():
     assert estimate(attacks(), 1) < 300
+
+
+FEW = ("agent-killed", "gate-killed", "gate-frozen-1", "guard-frozen-1", "guard-gate-killed", "stop-gate-killed")
+UNHURRIED = {"rate_hz": 20, "guard_s": 0.4, "limits": {**LIMITS, "max_gap_s": 0.4}}
+"""What is promised, and what may be late, follows from these: a machine that others use too is no violation."""
+
+
+@pytest.mark.slow
+def test_some_attacks_on_real_processes():
+    rows = list(bench_safety(select([*FEW, "suspend"]), 1, safety=UNHURRIED))
+    assert [what for row in rows for what in row.what] == []
+    assert len(rows) == len(FEW) + 3
+    for row in rows:
+        assert row.velocity_max_m_s > 0.4  # it did drive
+        assert row.standstill_max_s is not None
+        assert row.promised_s is not None
+        assert 0 < row.standstill_max_s <= row.promised_s
+    assert all(0.5 < row.acceleration_max_m_s2 <= 2.0 for row in rows)
+
+
+@pytest.mark.slow
+def test_what_is_not_staged_is_no_success(monkeypatch):
+    """A robot that does not drive keeps every promise of standing; that is told as a violation."""
+    monkeypatch.setattr(robot, "PATIENCE_S", 1.0)
+    blind = {"sensors": {"another": {}}}
+    (row,) = bench_safety(select(["agent-killed"]), 1, safety=blind)
+    assert row.violations == 1
+    assert row.what[0].startswith("stuck: not within 1 s: the robot drives")

@@ -7,11 +7,13 @@ begins with a robot that drives, and ends with one that drives again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from skytether.lab.safety import deaths, hardware, ros1, starve, stops, suspend
 from skytether.lab.safety.attacks import Attack, Attacks, MakeRobot
@@ -100,7 +102,13 @@ def estimate(chosen: Sequence[Attack], n: int) -> float:
     return _START_S + n * sum(attack.seconds + (_START_S if attack.spoils else 0) for attack in chosen)
 
 
-def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lambda _: None) -> Iterator[SafetyRow]:
+def bench_safety(
+    chosen: Sequence[Attack],
+    n: int,
+    busy: bool = False,
+    tell: Tell = lambda _: None,
+    safety: Mapping[str, Any] | None = None,
+) -> Iterator[SafetyRow]:
     """Stage attacks, one after the other.
 
     Args:
@@ -108,12 +116,12 @@ def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lamb
         n: How often each.
         busy: Other programs take all cores meanwhile.
         tell: Told what goes on.
-
+        safety: Keys of the section ``safety`` that are to be others, where the attack has no robot of its own.
     """
     with ExitStack() as undo:
         if busy:
             undo.enter_context(busy_cores())
-        robots = undo.enter_context(_Robots())
+        robots = undo.enter_context(_Robots(safety or {}))
         for attack in chosen:
             found = []
             for i in range(n):
@@ -126,7 +134,8 @@ def bench_safety(chosen: Sequence[Attack], n: int, busy: bool, tell: Tell = lamb
 class _Robots:
     """The robot that is attacked; another one when it is of no use any more."""
 
-    def __init__(self) -> None:
+    def __init__(self, safety: Mapping[str, Any]) -> None:
+        self._safety = safety
         self._undo = ExitStack()
         self._robot: PlayedRobot | None = None
         self._made_by: MakeRobot | None = None
@@ -143,7 +152,8 @@ class _Robots:
             self.end()
         if self._robot is None:
             folder = Path(self._undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-")))
-            self._robot = self._undo.enter_context((attack.robot or PlayedRobot)(folder))
+            make = attack.robot or partial(PlayedRobot, safety=self._safety)
+            self._robot = self._undo.enter_context(make(folder))
             self._made_by = attack.robot
         return self._robot
 

@@ -31,7 +31,7 @@ class Promised:
         joystick: After the joystick's last word.
         still: After the joystick's last change.
         stop: After a stop, by a person or a button.
-        silence: After the last word of gate and guard; the wheels then stop by themselves, on a graph the writer brakes.
+        silence: After the last word of gate and guard: the wheels stop by themselves; on a graph the writer brakes.
         jitter: What each of these has in addition, for how well times are known.
     """
 
