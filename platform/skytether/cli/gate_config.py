@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
-from skytether.robot.safety.config import Ros1Way, Ros2Way, SafetyConfig
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
 from skytether.ros.names import namespace_of
 
 from .config_file import read_config
@@ -17,6 +17,13 @@ from .ros2_config import need_extra
 class _GateFile(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
     safety: SafetyConfig
+
+    @field_validator("safety", mode="before")
+    @classmethod
+    def _is_wanted(cls, section: Any) -> Any:
+        if section == NO_GATE:
+            raise ValueError("is none: this robot is to have no gate; take the key away for a gate without sensors")
+        return section
 
     @model_validator(mode="before")
     @classmethod
@@ -28,9 +35,14 @@ def inherit(document: Any) -> Any:
     """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
 
     These are ``limits`` with their reasons in ``beyond``, and of ``ros1`` or ``ros2``, unless the wheels are behind
-    ``sockets``, where the graph and its wheels are.
+    ``sockets``, where the graph and its wheels are. A robot that is a graph and has no such section gets
+    `WITHOUT_SECTION`.
     """
-    if not isinstance(document, dict) or not isinstance(document.get("safety"), dict):
+    if not isinstance(document, dict):
+        return document
+    if "safety" not in document and any(isinstance(document.get(way), dict) for way in ("ros1", "ros2")):
+        document = document | {"safety": WITHOUT_SECTION}
+    if not isinstance(document.get("safety"), dict):
         return document
     safety = dict(document["safety"])
     if isinstance(document.get("limits"), dict) and "limits" not in safety:

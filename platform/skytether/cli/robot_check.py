@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from rich.console import Console
@@ -13,8 +13,8 @@ from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
 from skytether.messages import hash_of
 from skytether.robot.ros1 import Ros1RobotConfig
-from skytether.robot.safety.client import GateError, ask
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.client import GateError, ask, listens
+from skytether.robot.wheels_watch import sentence, strangers
 from skytether.ros.names import Names, resolve
 from skytether.ros.permissions import Permissions, refused
 from skytether.ros.ros1.master import MasterError
@@ -24,6 +24,7 @@ from skytether.ros.ros1.subscription import Listener
 
 from .output import console
 from .robot_config import RobotConfig
+from .robot_gate import ASSUMED, NO_GATE
 
 _LOOK_S = 3.0
 """For publishers to say what they publish."""
@@ -57,12 +58,12 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         names = graph.names(specs)
         findings += _topics(settings, names, node, specs)
         findings += forbidden(graph.permissions(), specs, names, settings.command_topic)
-        if settings.safety is None:
-            findings.append(_wheels(graph.cmd_vel or "", graph, node))
-    findings += plausible(settings)
-    if settings.safety is not None:
-        findings.append(look_at_gate(settings.safety))
-    return findings
+        if graph.cmd_vel is not None:
+            findings.append(_wheels(graph.cmd_vel, graph, node))
+        if graph.wheels is not None:
+            own = graph.drivers or [resolve(settings.ros1.node if settings.ros1 else "", "/")]
+            findings += other_publishers(graph.wheels, node.master.publishers(graph.wheels), own)
+    return [*findings, *plausible(settings), look_at_gate(settings)]
 
 
 def plausible(settings: RobotConfig) -> list[Finding]:
@@ -154,14 +155,21 @@ def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
     return Finding(spec.name, name, spec.type, says)
 
 
-def look_at_gate(safety: SafetyConfig) -> Finding:
-    """Whether the gate before the wheels is there, and not stopped."""
+def look_at_gate(settings: RobotConfig) -> Finding:
+    """Whether there is a gate before the wheels, or will be, and whether it is stopped."""
+    safety = settings.safety
+    if safety is None:
+        return Finding("gate", "", "", f"warning: {NO_GATE}")
+    assumed = f"; {ASSUMED}" if settings.gate_is_assumed else ""
+    where = str(safety.place())
+    if not listens(safety.place()):
+        return Finding("gate", where, "", f"does not run yet; `skytether robot run` starts it{assumed}")
     try:
         stopped = ask(safety.place(), {"do": "status"})["stopped"]
     except GateError as error:
-        return Finding("gate", str(safety.place()), "", str(error), good=False)
+        return Finding("gate", where, "", str(error), good=False)
     says = f"has the wheels, and is stopped: {stopped}" if stopped else "has the wheels"
-    return Finding("gate", str(safety.place()), "", says, good=not stopped)
+    return Finding("gate", where, "", f"{says}{assumed}", good=not stopped)
 
 
 def _wheels(cmd_vel: str, graph: Ros1RobotConfig, node: Node) -> Finding:
@@ -171,6 +179,14 @@ def _wheels(cmd_vel: str, graph: Ros1RobotConfig, node: Node) -> Finding:
         return Finding("wheels", name, "geometry_msgs/Twist", f"is a {kind}", good=False)
     says = "is known to the master" if kind != "*" else "nobody listens to it yet; is cmd_vel right?"
     return Finding("wheels", name, "geometry_msgs/Twist", says)
+
+
+def other_publishers(topic: str | None, found: Collection[str], own: Collection[str]) -> list[Finding]:
+    """Who else tells the wheels what to do."""
+    names = strangers(found, own)
+    if topic is None or not names:
+        return []
+    return [Finding("wheels", topic, "", sentence(topic, names), good=False)]
 
 
 def forbidden(permissions: Permissions, specs: Sequence[TopicSpec], names: Names, command_topic: str) -> list[Finding]:

@@ -16,7 +16,7 @@ from skytether.messages import type_of
 from skytether.robot.arbiter import Needs
 from skytether.robot.graph_base import protected_names as graph_names
 from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
 from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.robot.status import DEFAULT_PORT
 from skytether.robot.supervisor import Limits
@@ -232,8 +232,10 @@ class RobotConfig(Strict):
     task: TaskConfig = TaskConfig()
     status_port: Annotated[int, Field(ge=0, le=65_535)] | None = DEFAULT_PORT
     """Of ``/status`` and ``/metrics`` on loopback; 0: any free one; null: there are none."""
-    safety: SafetyConfig | None = None
-    """The gate's part (``skytether robot gate``); with it, velocities go to the gate and not to the wheels."""
+    safety: SafetyConfig | None = Field(default_factory=lambda: SafetyConfig.model_validate(WITHOUT_SECTION))
+    """The gate's part (``skytether robot gate``): velocities go to the gate and not to the wheels.
+
+    Without the key, a gate that knows limits and silence only; ``none``: no gate."""
     ros1: Ros1Config | None = None
     ros2: Ros2Config | None = None
     """The robot's graph: one of the two."""
@@ -244,6 +246,18 @@ class RobotConfig(Strict):
     @classmethod
     def _name_alone(cls, value: Any) -> Any:
         return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("safety", mode="before")
+    @classmethod
+    def _section_or_none(cls, value: Any) -> Any:
+        if value is None:
+            raise ValueError("is empty: write the gate's section, or none for no gate, or leave the key away")
+        return None if value == NO_GATE else value
+
+    @property
+    def gate_is_assumed(self) -> bool:
+        """Whether there is to be a gate that nobody has configured."""
+        return "safety" not in self.model_fields_set
 
     @field_validator("limits")
     @classmethod
@@ -300,6 +314,35 @@ class RobotConfig(Strict):
         graph = self.ros1 or self.ros2
         given = graph.namespace if graph is not None else None
         return namespace_of(self.robot) if given is None else resolve(given, "/")
+
+    @property
+    def wheels(self) -> str | None:
+        """Absolute name of what the wheels listen to; None: it is no topic of the robot's graph."""
+        graph, way = self.ros1 or self.ros2, self._way
+        if graph is None or (self.safety is not None and self.safety.sockets is not None):
+            return None
+        namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
+        own = way.cmd_vel if way is not None and "cmd_vel" in way.model_fields_set else graph.cmd_vel
+        if self.safety is None and self.ros2 is not None:
+            return Names((), self.home, "/", graph.remap, ros=2).own(own)
+        return resolve(own, namespace)
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """Names of the gate's nodes that publish it; empty: there is no gate."""
+        graph, way = self.ros1 or self.ros2, self._way
+        if graph is None or self.safety is None:
+            return ()
+        node = way.node if way is not None and "node" in way.model_fields_set else graph.node
+        namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
+        where = "/" if self.ros1 is not None else namespace
+        return tuple(resolve(f"{node}_{role}", where) for role in ("guard", "gate"))
+
+    @property
+    def _way(self) -> Ros1Way | Ros2Way | None:
+        if self.safety is None:
+            return None
+        return self.safety.ros1 if self.ros1 is not None else self.safety.ros2
 
     @property
     def allowed(self) -> Allowed:

@@ -15,7 +15,16 @@ from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.node import Ros2Node
 from skytether.ros.ros2.qos import row_settings
 
-from .robot_check import Finding, forbidden, look_at_gate, look_at_orchestrator, plausible, show, unknown
+from .robot_check import (
+    Finding,
+    forbidden,
+    look_at_gate,
+    look_at_orchestrator,
+    other_publishers,
+    plausible,
+    show,
+    unknown,
+)
 from .robot_config import RobotConfig, Ros2Config
 from .ros2_config import join_graph
 
@@ -30,7 +39,7 @@ def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
         service=settings.service,
         namespace=ros2.namespace,
         remap=ros2.remap,
-        cmd_vel=ros2.cmd_vel,
+        cmd_vel=ros2.cmd_vel if settings.safety is None else None,
         cmd_vel_type=ros2.cmd_vel_type,
         frame=ros2.frame,
         idle_s=ros2.idle_s,
@@ -38,6 +47,8 @@ def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
         topics=ros2.topics,
         allowed=settings.allowed,
         protected=settings.protected,
+        wheels=settings.wheels,
+        drivers=settings.drivers,
     )
 
 
@@ -86,16 +97,15 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
         if manifest is not None and joined:
             specs = manifest.spec.topics
             names = config.names(specs)
-            findings += [unknown(name) for name in names.unused((*config.readings, config.cmd_vel))]
+            findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
             findings += [_row(settings, part, names, node) for part in rows]
             findings += forbidden(config.permissions(), specs, names, settings.command_topic)
-            if settings.safety is None:
-                findings.append(_wheels(config, node))
-    findings += plausible(settings)
-    if settings.safety is not None:
-        findings.append(look_at_gate(settings.safety))
-    return findings
+            if config.cmd_vel is not None:
+                findings.append(_wheels(config, config.cmd_vel, node))
+            found = [endpoint.node for endpoint in node.endpoints(config.wheels, Kind.PUBLISHER)]
+            findings += other_publishers(config.wheels, found, config.drivers)
+    return [*findings, *plausible(settings), look_at_gate(settings)]
 
 
 def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) -> Finding:
@@ -127,8 +137,8 @@ def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) ->
     return Finding(row.name, name, row.type, says)
 
 
-def _wheels(config: Ros2RobotConfig, node: Ros2Node) -> Finding:
-    name = config.names(()).own(config.cmd_vel)
+def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: Ros2Node) -> Finding:
+    name = config.names(()).own(cmd_vel)
     ours = Endpoint(Kind.PUBLISHER, name, config.cmd_vel_type, hash_of(config.cmd_vel_type, "cdr"))
     others = node.endpoints(name, Kind.SUBSCRIPTION)
     wrong = mismatches(ours, others)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from skytether.ros.ros1.node import Node
 
     from .robot_config import RobotConfig, Ros1Config, Ros2Config
+    from .robot_gate import OwnGate
 
 _STATUS_S = 0.5
 """Between looks at the agent, to say what changed."""
@@ -55,7 +56,7 @@ def run(
         fail(str(error), 2)
     if settings.ros2 is not None:
         try:
-            _run_ros2(settings, settings.ros2, config.parent, token, seconds, check=check)
+            _run_ros2(settings, settings.ros2, config, token, seconds, check=check)
         except ConfigError as error:
             fail(str(error), 2)
         return
@@ -64,23 +65,30 @@ def run(
     if check:
         from .robot_check import check_robot
 
-        with _node(settings, settings.ros1, threading.Event()) as node:
+        # With the agent's own name the master would end the agent that runs.
+        checks = settings.ros1.model_copy(update={"node": f"{settings.ros1.node}_check"})
+        with _node(settings, checks, threading.Event()) as node:
             raise typer.Exit(0 if check_robot(settings, ros1_config(settings, settings.ros1), node, token) else 1)
-    agent = agent_config(settings, config.parent, token)
-    _run(settings, settings.ros1, agent, seconds)
+    _run(settings, settings.ros1, config, token, seconds)
 
 
-def _run(settings: RobotConfig, ros1: Ros1Config, config: AgentConfig, seconds: float | None) -> None:
+def _run(settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, seconds: float | None) -> None:
     from skytether.robot.agent import Agent
     from skytether.robot.fallback import FallbackError
     from skytether.robot.ros1 import Ros1Robot
 
+    from .robot_gate import gate
+
     ended = threading.Event()
-    with _node(settings, ros1, ended) as node:
+    config = agent_config(settings, path.parent, token)
+    with (
+        gate(path, settings.safety, assumed=settings.gate_is_assumed) as own,
+        _node(settings, ros1, ended) as node,
+    ):
         robot = Ros1Robot(ros1_config(settings, ros1), node)
         try:
             with Agent(config, _base(settings, robot.base), graph=robot) as agent:
-                _watch(agent.status, ended, seconds)
+                _watch(agent.status, ended, seconds, own)
         except FallbackError as error:
             fail(str(error), 2)
         finally:
@@ -88,7 +96,7 @@ def _run(settings: RobotConfig, ros1: Ros1Config, config: AgentConfig, seconds: 
 
 
 def _run_ros2(
-    settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str, seconds: float | None, *, check: bool
+    settings: RobotConfig, ros2: Ros2Config, path: Path, token: str, seconds: float | None, *, check: bool
 ) -> None:
     """A robot that is a ROS 2 graph.
 
@@ -98,17 +106,22 @@ def _run_ros2(
     from skytether.robot.agent import Agent
     from skytether.robot.fallback import FallbackError
 
+    from .robot_gate import gate
     from .ros2_config import need_extra
 
     need_extra()
     from .robot_ros2 import check_ros2, join_ros2
 
+    folder = path.parent
     if check:
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
-    with join_ros2(settings, ros2, folder) as robot:
+    with (
+        gate(path, settings.safety, assumed=settings.gate_is_assumed) as own,
+        join_ros2(settings, ros2, folder) as robot,
+    ):
         try:
             with Agent(agent_config(settings, folder, token), _base(settings, robot.base), graph=robot) as agent:
-                _watch(agent.status, threading.Event(), seconds)
+                _watch(agent.status, threading.Event(), seconds, own)
         except FallbackError as error:
             fail(str(error), 2)
 
@@ -143,7 +156,9 @@ def _node(settings: RobotConfig, ros1: Ros1Config, ended: threading.Event) -> It
         node.close()
 
 
-def _watch(status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None) -> None:
+def _watch(
+    status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None, gate: OwnGate | None
+) -> None:
     """Say what changes, until the end."""
     gc.freeze()  # all that is loaded by now stays: looking through it for garbage takes ticks of the control loop
     begin = time.monotonic()
@@ -155,6 +170,9 @@ def _watch(status: Callable[[], AgentStatus], ended: threading.Event, seconds: f
             before = now
         if ended.wait(_STATUS_S):
             return
+        trouble = gate.look() if gate is not None else ""
+        if trouble:
+            console.print(f"error: {trouble}", markup=False, soft_wrap=True)
 
 
 def _sentence(status: AgentStatus) -> str:
@@ -226,4 +244,6 @@ def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
         use_sim_time=ros1.use_sim_time,
         allowed=settings.allowed,
         protected=settings.protected,
+        wheels=settings.wheels,
+        drivers=settings.drivers,
     )

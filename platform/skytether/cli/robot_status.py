@@ -57,6 +57,9 @@ def _tables(found: dict[str, Any]) -> list[Table]:
         ("battery", _share(found["battery"])),
         ("trouble", found["trouble"] or "none"),
     ]
+    others = found["other_publishers"]["names"]
+    if others:
+        rows.append(("wheels", f"others publish their topic too: {', '.join(others)}"))
     for name, value in rows:
         about.add_row(name, value)
     tables = [about]

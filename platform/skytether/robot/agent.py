@@ -48,6 +48,7 @@ from .table import Offer, robot_table
 from .tally import Tally
 from .task_manager import PathQuality, RobotView
 from .tasks import TaskConfig, Tasks
+from .wheels_watch import NOBODY, WatchesWheels
 
 _log = logging.getLogger(__name__)
 
@@ -297,6 +298,7 @@ class Agent:
             decision=self._tasks.decision if self._tasks else None,
             load=self._tasks.robot.load if self._tasks else nan,
             battery=self._tasks.robot.battery if self._tasks else None,
+            others=self._graph.others if isinstance(self._graph, WatchesWheels) else NOBODY,
         )
 
     def report(self) -> rest.Report:

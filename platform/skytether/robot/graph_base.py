@@ -111,6 +111,10 @@ class GraphBase:
 _STANDSTILL = Twist()
 
 
+def nowhere(_: bytes) -> None:
+    """Where velocities go that are not this graph's."""
+
+
 def protected_names(names: Names, home: str, wheels: Iterable[str], readings: Iterable[str]) -> dict[str, str]:
     """What no service may publish in a robot's graph, gate or not: why, by absolute name.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
@@ -18,8 +19,9 @@ from skytether.ros.ros1.port import CLOCK, SIM_TIME, Ros1Port
 from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import Role, Topic
 
-from .graph_base import IDLE_S, GraphBase, protected_names
+from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
 from .table import Offer, robot_table
+from .wheels_watch import NOBODY, Others, WheelsWatch
 
 _log = logging.getLogger(__name__)
 
@@ -41,6 +43,8 @@ class Ros1RobotConfig:
         use_sim_time: Whether /clock tells the time; None: as the master says.
         allowed: What the service may publish, call and offer beyond its own namespace.
         protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
+        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
+        drivers: Names of the nodes that publish it for us; empty: this one.
     """
 
     robot: str
@@ -55,6 +59,8 @@ class Ros1RobotConfig:
     use_sim_time: bool | None = None
     allowed: Allowed = NOTHING_MORE
     protected: Mapping[str, str] = field(default_factory=dict)
+    wheels: str | None = None
+    drivers: Collection[str] = ()
 
     @property
     def home(self) -> str:
@@ -93,7 +99,7 @@ class Ros1Robot:
         self._config = config
         self._node = node
         self._port: Ros1Port | None = None
-        send: Callable[[bytes], object] = _nowhere
+        send: Callable[[bytes], object] = nowhere
         if config.cmd_vel is not None:
             topic = resolve(config.cmd_vel, config.home)
             send = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1).publish
@@ -104,9 +110,18 @@ class Ros1Robot:
             node.subscribe(own.own(name), cls.TYPE, hash_of(cls.TYPE, "ros1"), self._reader(name))
             for name, cls in readings.items()
         ]
+        self._watch: WheelsWatch | None = None
+        if config.wheels is not None:
+            find = partial(node.master.publishers, config.wheels)
+            self._watch = WheelsWatch(config.wheels, config.drivers or (node.name,), find)
 
     def _reader(self, name: str) -> Listener:
         return Listener(lambda data, _: self.base.put(name, data))
+
+    @property
+    def others(self) -> Others:
+        """Who else publishes what the wheels listen to."""
+        return self._watch.others if self._watch is not None else NOBODY
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         names = self._config.names(specs)
@@ -166,11 +181,9 @@ class Ros1Robot:
 
     def close(self) -> None:
         """Leave the graph; the node stays."""
+        if self._watch is not None:
+            self._watch.close()
         if self._port is not None:
             self._port.close()
         for end in self._ends:
             end()
-
-
-def _nowhere(_: bytes) -> None:
-    """Where velocities go that are not this graph's."""

@@ -21,8 +21,9 @@ from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
 from skytether.wire.topic import Role, Topic
 
-from .graph_base import IDLE_S, GraphBase, protected_names
+from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
 from .table import Offer, robot_table
+from .wheels_watch import NOBODY, Others, WheelsWatch
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class Ros2RobotConfig:
         service: The service's: what it sends is found below that name.
         namespace: Of the robot's topics; None: its name.
         remap: Names in the graph, by topic, call, action or reading.
-        cmd_vel: What the wheels listen to.
+        cmd_vel: What the wheels listen to; None: others have the wheels.
         cmd_vel_type: One of `WHEELS`.
         frame: Coordinate frame of stamped velocities.
         idle_s: See `skytether.robot.graph_base.IDLE_S`.
@@ -47,13 +48,15 @@ class Ros2RobotConfig:
         topics: Sent to a service that takes any.
         allowed: What the service may publish, call and offer beyond its own namespace.
         protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
+        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
+        drivers: Names of the nodes that publish it for us; empty: this one.
     """
 
     robot: str
     service: str
     namespace: str | None = None
     remap: Mapping[str, str] = field(default_factory=dict)
-    cmd_vel: str = "cmd_vel"
+    cmd_vel: str | None = "cmd_vel"
     cmd_vel_type: str = Twist.TYPE
     frame: str = "base_link"
     idle_s: float | None = IDLE_S
@@ -61,6 +64,8 @@ class Ros2RobotConfig:
     topics: Collection[str] = ()
     allowed: Allowed = NOTHING_MORE
     protected: Mapping[str, str] = field(default_factory=dict)
+    wheels: str | None = None
+    drivers: Collection[str] = ()
 
     @property
     def home(self) -> str:
@@ -77,7 +82,8 @@ class Ros2RobotConfig:
 
     def permissions(self) -> Permissions:
         """What the service may do in the robot's graph."""
-        kept = protected_names(self.names(()), self.home, [self.cmd_vel], self.readings)
+        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
+        kept = protected_names(self.names(()), self.home, wheels, self.readings)
         return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
 
 
@@ -102,20 +108,35 @@ class Ros2Robot:
         self._port: Ros2Port | None = None
         self._handles: list[Handle] = []
         own = config.names(())
-        wheels = node.publish(self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type))
+        send: Callable[[bytes], object] = nowhere
+        if config.cmd_vel is not None:
+            wheels = node.publish(self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type))
+            self._handles.append(wheels)
+            send = wheels.put
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
         make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is
-        self.base = GraphBase(readings, self.encoding, wheels.put, make=make, idle_s=config.idle_s)
-        self._handles.append(wheels)
+        self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s)
         for name, cls in readings.items():
             endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
             self._handles.append(node.subscribe(endpoint, partial(self.base.put, name)))
+        self._watch: WheelsWatch | None = None
+        if config.wheels is not None:
+            self._watch = WheelsWatch(config.wheels, config.drivers, partial(self._publishers, config.wheels))
+
+    def _publishers(self, topic: str) -> list[str]:
+        """Names of the nodes of others that publish a topic; this one's is not among them."""
+        return [endpoint.node for endpoint in self._node.endpoints(topic, Kind.PUBLISHER)]
+
+    @property
+    def others(self) -> Others:
+        """Who else publishes what the wheels listen to."""
+        return self._watch.others if self._watch is not None else NOBODY
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         names = self._config.names(specs)
         may = self._config.permissions()
         permissions.check(may, specs, names, command_topic)
-        for unused in names.unused((*self._config.readings, self._config.cmd_vel)):
+        for unused in names.unused((*self._config.readings, self._config.cmd_vel or "")):
             _log.warning("remap.%s has no effect: the service has no such topic", unused)
         topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
         if self._port is not None:
@@ -125,6 +146,8 @@ class Ros2Robot:
 
     def close(self) -> None:
         """Leave the graph; the node stays."""
+        if self._watch is not None:
+            self._watch.close()
         if self._port is not None:
             self._port.close()
         for handle in self._handles:

@@ -11,6 +11,7 @@ from skytether.wire.stats import SessionStats
 from .driver import DriverStatus
 from .tally import COUNTERS, Tally
 from .task_manager import Decision
+from .wheels_watch import NOBODY, Others
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,7 @@ class AgentStatus:
         decision: The task manager's; None: there is none.
         load: Share of the robot's processors that is busy; NaN: not known.
         battery: Charge, 0 to 1; None: not known.
+        others: Who else publishes what the wheels listen to.
     """
 
     driver: DriverStatus
@@ -48,6 +50,7 @@ class AgentStatus:
     decision: Decision | None = None
     load: float = nan
     battery: float | None = None
+    others: Others = NOBODY
 
 
 def report(

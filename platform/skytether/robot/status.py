@@ -69,6 +69,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
                 for path in (status.session.paths if status.session else ())
             ],
         },
+        "other_publishers": {"names": list(status.others.names), "noticed": status.others.noticed},
         "velocity": {"linear_m_s": driver.velocity.linear, "angular_rad_s": driver.velocity.angular},
         "robot_load": _known(status.load),
         "battery": status.battery,
@@ -159,16 +160,18 @@ def _families(robot: str, service: str, status: AgentStatus, report: rest.Report
     instance = status.instance
     site = instance.placement.site if instance and instance.placement else ""
     yield from of_report((robot, service, site), report)
-    seconds, connected, errors, cost = Sums(), Sums(), Sums(), Sums()
+    seconds, connected, errors, cost, noticed = Sums(), Sums(), Sums(), Sums(), Sums()
     for source, spent in status.driver.seconds.items():
         seconds.add((robot, service, source), spent)
     connected.put((robot, service), float(status.connected))
+    noticed.put((robot,), float(status.others.noticed))
     for part, count in status.driver.errors.items():
         errors.add((robot, part), count)
     for option in status.decision.options if status.decision else ():
         cost.put((robot, service, option.name), option.cost)
     yield counter("control_seconds", "Time under each source", ("robot", "service", "source"), seconds.items())
     yield gauge("session_connected", "1 while the bridge has a session", ("robot", "service"), connected)
+    yield counter("wheels_other_publishers", "Others found to publish the wheels' topic", ("robot",), noticed.items())
     yield counter("control_errors", "Exceptions caught in the control loop", ("robot", "part"), errors.items())
     stalls = Sums()
     stalls.add((robot, service), status.driver.stalls)

@@ -88,7 +88,8 @@ def config(graph, orchestrator, tmp_path):
         "orchestrator": orchestrator.url,
         "token_file": "walker.token",
         "service": "wall-stop",
-        "limits": {"max_gap_s": 2.0},
+        "limits": {"max_gap_s": 1.0},
+        "safety": "none",
         "ros1": {"master": graph.uri, "namespace": "/"},
     }
     path.write_text(yaml.safe_dump(document))

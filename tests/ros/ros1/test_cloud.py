@@ -79,7 +79,7 @@ def robot(graph, cloud, tmp_path):
             "orchestrator": cloud.url,
             "token_file": "walker.token",
             "service": "attack",
-            "limits": {"max_gap_s": 2.0},
+            "limits": {"max_gap_s": 1.0},
             "status_port": None,
             "ros1": {"master": graph.uri, "namespace": "/", "cmd_vel": "/cmd_vel_safe"},
             "safety": {
@@ -153,7 +153,7 @@ def test_a_service_that_wants_the_joystick_or_the_wheels_gets_no_session(graph, 
 def test_without_a_gate_the_wheels_and_the_readings_are_kept_too(graph, robot, cloud, wheels, tmp_path):
     cloud.client.put_service("attack", manifest(row("/cmd_vel_safe"), row("/joy", Joy.TYPE)))
     graph_section = {"master": graph.uri, "namespace": "/", "cmd_vel": "/cmd_vel_safe", "readings": {"joy": Joy.TYPE}}
-    agent, log = start(graph, tmp_path, "robot", "run", str(robot(safety=None, ros1=graph_section)))
+    agent, log = start(graph, tmp_path, "robot", "run", str(robot(safety="none", ros1=graph_section)))
     wait_for(lambda: "the service's '/joy'" in log.read_text(), "the refusal")
     assert "/cmd_vel_safe is never published" in log.read_text()
     wait_for(lambda: wheels["/cmd_vel_safe"], "the agent's standstill")

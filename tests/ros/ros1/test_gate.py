@@ -21,7 +21,7 @@ def gated(config, tmp_path):
     document["safety"] = {
         "footprint": {"radius": 0.3},
         "sensors": {"/scan": {"max_age_s": 1.0}},
-        "joystick": {"topic": "/joy", "deadman": 0, "max_age_s": 2.0},
+        "joystick": {"topic": "/joy", "deadman": 0, "max_age_s": 1.0},
         "estop": {"topic": "/estop", "max_age_s": None},
         "guard_s": 0.5,
         "folder": str(tmp_path / "gate"),
@@ -105,5 +105,5 @@ def test_the_check_says_whether_the_gate_is_there(graph, gated, walker):
         return said.returncode, found + told
 
     status, text = check()
-    assert status == 1
-    assert "no gate listens" in text.replace("\n", " ")
+    assert status == 0, text
+    assert "does not run yet" in " ".join(text.split())

@@ -40,7 +40,7 @@ def robot_yaml(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(
         "robot: walker\norchestrator: http://127.0.0.1:9\ntoken_file: walker.token\nservice: virtual-trail\n"
-        "status_port: null\nros1: {namespace: /}\n"
+        "safety: none\nstatus_port: null\nros1: {namespace: /}\n"
     )
     return path
 

@@ -89,7 +89,7 @@ def test_without_master_and_orchestrator_it_waits_and_says_so_once_and_the_check
     token.write_text("secret")
     path = tmp_path / "robot.yaml"
     path.write_text(
-        f"robot: walker\norchestrator: http://127.0.0.1:9\ntoken_file: walker.token\nservice: wall-stop\n"
+        f"robot: walker\norchestrator: http://127.0.0.1:9\ntoken_file: walker.token\nservice: wall-stop\nsafety: none\n"
         f"ros1: {{master: '{graph.uri}'}}\n"
     )
     process = graph.skytether("robot", "run", str(path), "--seconds", "6", stderr=subprocess.PIPE)

@@ -162,6 +162,7 @@ def test_topic_tools_image_proc_and_robot_state_publisher_run_as_a_service(graph
         "params": {"rate": 2},
         "ros1": {"master": graph.uri, "params": ["/robot_description"]},
         "cloud": {"publish": ["/tf", "/tf_static"]},
+        "safety": "none",
     }
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(config))

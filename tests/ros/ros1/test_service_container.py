@@ -94,6 +94,7 @@ def test_a_graph_in_a_container_serves_a_robot(graph, orchestrator, docker_site,
         "service": "states",
         "ros1": {"master": graph.uri, "params": ["/robot_description"]},
         "cloud": {"publish": ["/tf", "/tf_static"]},
+        "safety": "none",
     }
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(config))

@@ -61,7 +61,8 @@ def config(stage, orchestrator, tmp_path):
         "orchestrator": orchestrator.url,
         "token_file": "walker.token",
         "service": "wall-stop",
-        "limits": {"max_gap_s": 2.0},
+        "limits": {"max_gap_s": 1.0},
+        "safety": "none",
         "ros2": ros2,
     }
     path.write_text(yaml.safe_dump(document))

@@ -73,6 +73,21 @@ class GateLink:
         self._socket.close()
 
 
+def listens(folder: Path) -> bool:
+    """Whether somebody has the folder's control socket: a gate, even if it hangs. Does not wait."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+        link.setblocking(False)
+        try:
+            link.connect(str(folder / CONTROL_SOCKET))
+        except BlockingIOError:  # its queue is full
+            return True
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+    return True
+
+
 def ask(folder: Path, request: dict[str, Any], timeout: float = 3.0) -> dict[str, Any]:
     """Put a request to the gate: ``{"do": "status"}``, ``"reset"``, ``"start"``, or ``"stop"`` with a ``"reason"``.
 

@@ -6,7 +6,7 @@ import os
 import socket
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -242,6 +242,12 @@ class SafetyConfig(SourcesConfig):
         """All but range sensors; a topic that is there twice is a mistake."""
         odometry = self.odometry
         return self.source_kinds() + ([] if odometry is None else [(odometry.topic, odometry_kind(odometry))])
+
+
+NO_GATE = "none"
+"""What is written instead of the section where there is to be no gate."""
+WITHOUT_SECTION: dict[str, Any] = {"footprint": {"radius": 0.3}, "sensors": {}, "unseen": {"action": "free"}}
+"""The gate of a robot.yaml that has no such section: limits and silence only. Without sensors no outline counts."""
 
 
 def address(text: str) -> str | tuple[str, int]:

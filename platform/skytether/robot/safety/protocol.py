@@ -80,7 +80,10 @@ def unpack_command(data: bytes, source: StrEnum, now: float) -> Command | None:
 
 
 def default_folder() -> Path:
-    """Where the sockets of a gate are unless it is told otherwise."""
+    """Where the sockets of a gate are unless it is told otherwise; ``SKYTETHER_GATE_FOLDER`` tells everybody."""
+    named = os.environ.get("SKYTETHER_GATE_FOLDER")
+    if named:
+        return Path(named)
     if os.geteuid() == 0:
         return Path("/run/skytether")
     return Path(os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/skytether-{os.geteuid()}") / "skytether"  # noqa: S108

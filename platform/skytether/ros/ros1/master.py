@@ -121,6 +121,11 @@ class Master:
         """Types by topic, of all that somebody offers now."""
         return {str(name): str(kind) for name, kind in self._call("getPublishedTopics", "")}
 
+    def publishers(self, topic: str) -> list[str]:
+        """Names of the nodes that offer a topic now."""
+        offered, _, _ = self._call("getSystemState")
+        return [str(node) for name, nodes in offered if name == topic for node in nodes]
+
     def get_param(self, name: str) -> Any:
         """A parameter, or a namespace of them as a mapping.
 

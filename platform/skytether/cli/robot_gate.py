@@ -1,0 +1,139 @@
+"""The gate of ``skytether robot run``: the one that runs already, or one of its own that ends with it.
+
+A gate of its own is a process that no signal of the terminal reaches: the agent ends first, then the gate is told to.
+If the agent dies, the kernel tells it (``own_gate``). Either way it brakes before it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from skytether.guard.latch import FIRST_ACT
+from skytether.robot.safety.client import GateError, ask, listens
+from skytether.robot.safety.config import SafetyConfig
+
+from .output import console, fail
+
+_START_S = 20.0
+"""For a gate to listen: it reads the configuration, and becomes another program."""
+_END_S = 10.0
+"""For it to brake and end."""
+_AGAIN_S = 1.0
+"""Between two starts of one that ended by itself."""
+_POLL_S = 0.05
+_ASK_S = 3.0
+
+NO_GATE = (
+    "there is no gate (safety: none): nothing limits what else is told to the wheels, and if this program is killed, "
+    "the last velocity is the last thing that the wheels hear"
+)
+ASSUMED = (
+    "robot.yaml has no section safety: the gate knows limits and silence only, no sensors, joystick or emergency stop "
+    "button; docs/safety.md says what to write"
+)
+
+
+class OwnGate:
+    """A gate that was started here.
+
+    Args:
+        config: The robot.yaml.
+        safety: Its section.
+        assumed: There is none: whoever starts the robot has reset and started it, as far as there is something to.
+    """
+
+    def __init__(self, config: Path, safety: SafetyConfig, *, assumed: bool) -> None:
+        self._config = config
+        self._folder = safety.place()
+        self._assumed = assumed
+        self._started_at = time.monotonic()
+        self._process = self._start()
+
+    def wait(self) -> None:
+        """Until it listens.
+
+        Raises:
+            GateError: It does not; the text says why.
+        """
+        end = time.monotonic() + _START_S
+        while not listens(self._folder):
+            status = self._process.poll()
+            if status is not None:
+                raise GateError(f"the gate ended with status {status}; what it said is above")
+            if time.monotonic() > end:
+                raise GateError(f"the gate does not listen in {self._folder} after {_START_S:.0f} s")
+            time.sleep(_POLL_S)
+        if self._assumed:
+            self._let_go(start=False)
+
+    def look(self) -> str:
+        """Start it again if it has ended by itself. Returns a sentence about that; empty: it runs."""
+        if self._assumed:
+            self._let_go(start=True)
+            self._assumed = False  # that was for this start; from now on a person is asked
+        status = self._process.poll()
+        now = time.monotonic()
+        if status is None or now - self._started_at < _AGAIN_S:
+            return ""
+        self._started_at = now
+        self._process = self._start()
+        return f"the gate ended with status {status}; it is started again"
+
+    def close(self) -> None:
+        """Have it brake and end; one that does not is left alone, for it may hold the wheels."""
+        self._process.terminate()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            console.print(f"the gate (process {self._process.pid}) does not end; it is left as it is", markup=False)
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "skytether.cli.own_gate", str(os.getpid()), str(self._config)]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+
+    def _let_go(self, *, start: bool) -> None:
+        """Do what a person who starts the robot does; a stop that somebody asked for stays."""
+        with contextlib.suppress(GateError):
+            stopped = ask(self._folder, {"do": "status"}, _ASK_S)["stopped"]
+            if stopped == FIRST_ACT:
+                ask(self._folder, {"do": "reset"}, _ASK_S)
+            if start and stopped in ("", FIRST_ACT):
+                ask(self._folder, {"do": "start"}, _ASK_S)
+
+
+@contextmanager
+def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterator[OwnGate | None]:
+    """See that there is a gate for as long as the context lasts; None: it is not ours, or there is to be none.
+
+    Args:
+        config: The robot.yaml.
+        safety: Its section; None: there is to be no gate.
+        assumed: The section is not written.
+    """
+    if safety is None:
+        console.print(f"warning: {NO_GATE}", style="yellow", markup=False, soft_wrap=True)
+        yield None
+        return
+    if listens(safety.place()):
+        console.print(f"gate: uses the one that runs in {safety.place()}", markup=False, soft_wrap=True)
+        yield None
+        return
+    if assumed:
+        console.print(f"warning: {ASSUMED}", style="yellow", markup=False, soft_wrap=True)
+    own = OwnGate(config, safety, assumed=assumed)
+    try:
+        try:
+            own.wait()
+        except GateError as error:
+            if not listens(safety.place()):  # else another one was faster
+                fail(str(error))
+        yield own
+    finally:
+        own.close()
