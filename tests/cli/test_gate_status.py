@@ -12,7 +12,13 @@ STATUS = {
     "way_m": None,
     "linear_m_s": 0.1,
     "angular_rad_s": 0.0,
-    "troubles": [],
+    "waiting": {},
+    "beyond": [],
+    "troubles": ["scan: is stale"],
+    "kept": True,
+    "not_permitted": ["locking memory is not permitted"],
+    "pid": 8,
+    "guard": {"pid": 7, "gate_restarts": 2, "troubles": ["the wheels cannot be told anything"], "not_permitted": []},
 }
 
 
@@ -29,3 +35,23 @@ def test_what_is_not_seen_is_called_unknown(monkeypatch, changes, ahead):
     assert ahead in CliRunner().invoke(app, ["robot", "gate-status"]).stdout.splitlines()
     shown = CliRunner().invoke(app, ["robot", "gate-status", "--json"]).stdout
     assert json.loads(shown)["zone"] == (STATUS | changes)["zone"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({}, "guard     process 7, gate 8, after 2 deaths of the gate"),
+        ({}, "trouble   the wheels cannot be told anything"),
+        ({}, "note      locking memory is not permitted"),
+        ({"guard": None}, "guard     does not answer; the gate stops the wheels itself"),
+        (
+            {"stopped": "x", "kept": False},
+            "trouble   the emergency stop is not on disk: it would not outlive the guard",
+        ),
+    ],
+)
+def test_the_guards_part_is_shown(monkeypatch, changes, says):
+    monkeypatch.setattr("skytether.robot.safety.client.ask", lambda *_: STATUS | changes)
+    shown = CliRunner().invoke(app, ["robot", "gate-status"])
+    assert shown.exit_code == 0
+    assert says in shown.stdout.splitlines()

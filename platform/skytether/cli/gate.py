@@ -1,7 +1,8 @@
-"""``skytether robot gate, stop, reset, start, gate-status``: the last gate before the wheels; what people say to it."""
+"""``skytether robot gate, stop, reset, start, gate-status, safety-log``: the last gate before the wheels."""
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -80,8 +81,56 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
         print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["beyond"]:
         print(f"beyond    {sentence}")
-    for sentence in answer["troubles"]:
+    guard = answer["guard"]
+    if guard is None:
+        print("guard     does not answer; the gate stops the wheels itself")
+    else:
+        restarts = f", after {guard['gate_restarts']} deaths of the gate" if guard["gate_restarts"] else ""
+        print(f"guard     process {guard['pid']}, gate {answer['pid']}{restarts}")
+    if answer["stopped"] and answer["kept"] is False:
+        print("trouble   the emergency stop is not on disk: it would not outlive the guard")
+    troubles = [*answer["troubles"], *(guard["troubles"] if guard else [])]
+    for sentence in dict.fromkeys(troubles):
         print(f"trouble   {sentence}")
+    for sentence in dict.fromkeys([*answer["not_permitted"], *(guard["not_permitted"] if guard else [])]):
+        print(f"note      {sentence}")
+
+
+def safety_log(
+    config: Annotated[
+        Path | None, typer.Argument(metavar="[ROBOT.YAML]", help="Whose record; without it the usual one.")
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="The file (safety.record in robot.yaml).")] = None,
+    last: Annotated[int, typer.Option(min=1, help="So many events, the newest.")] = 50,
+    json: Json = False,
+) -> None:
+    """Show the safety event record: what stopped the robot, who reset it, what died.
+
+    It survives reboots, and has its full size from the start; the oldest events go first.
+    """
+    from skytether.guard.record import decode
+    from skytether.robot.safety.protocol import default_record
+
+    from .config_file import ConfigError
+    from .gate_config import load_safety
+
+    try:
+        path = record or (default_record() if config is None else load_safety(config).record_file())
+        events = decode(path.read_bytes())[-last:]
+    except ConfigError as error:
+        fail(str(error), 2)
+    except OSError as error:
+        fail(f"cannot read the event record {path}: {error.strerror}; name another with --record, or give robot.yaml")
+    if json:
+        print_json(events)
+        return
+    for event in events:
+        when = datetime.fromtimestamp(float(str(event.get("wall", 0))), UTC).astimezone()
+        print(
+            f"{when:%Y-%m-%d %H:%M:%S}  {event.get('who', ''):<7} {event.get('what', ''):<8} {event.get('detail', '')}"
+        )
+        if lost := event.get("lost_before"):
+            print(f"{'':21}before this, {lost} events were lost")
 
 
 def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:

@@ -74,7 +74,15 @@ class Watch:
             return brake(self._bounds, self.told.velocity, self._period_s), wrong or "has a clock that went back"
         if wrong or stopped or self._beat is None:
             return brake(self._bounds, base, step), wrong
-        return toward(self._bounds, base, self._beat.velocity, step), ""
+        return toward(self._bounds, base, self._clipped(self._beat.velocity), step), ""
+
+    def _clipped(self, velocity: Velocity) -> Velocity:
+        """Without what rounding has put beyond the limits."""
+        bounds = self._bounds
+        return Velocity(
+            min(max(velocity.linear, bounds.linear_min), bounds.linear_max),
+            min(max(velocity.angular, -bounds.angular_max), bounds.angular_max),
+        )
 
     def _wrong(self, now: float) -> str:
         beat, bounds = self._beat, self._bounds

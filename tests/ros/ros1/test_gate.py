@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 import yaml
+from gate_robot import release
 from ros1_graph import wait_for
 
 from skytether.messages import Joy, LaserScan, encode, type_hash
@@ -45,6 +46,7 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     said.close()
     agent = graph.skytether("robot", "run", str(gated))
     button = graph.start("rostopic", "pub", "-r", "5", "/estop", "std_msgs/Bool", "data: false")
+    release(folder)
     drives(walker)
     assert set(graph.publishers("/cmd_vel")) == {"/skytether_guard", "/skytether_gate"}
     # The agent, and with it its bridge, is killed at full speed.

@@ -10,6 +10,7 @@ import threading
 import numpy as np
 import pytest
 import yaml
+from gate_robot import release
 
 from skytether.control.admittance import Velocity
 from skytether.messages import LaserScan, TwistStamped, decode, encode, type_hash
@@ -84,6 +85,7 @@ def test_the_wheels_of_a_ros_2_robot_are_behind_the_gate(stage, folder):
     agent = threading.Thread(target=play)
     agent.start()
     try:
+        release(folder)
         stage.until(start, "the gate does not let the agent drive")
         stage.until(lambda: speed() is not None and speed() > 0.15, "the agent does not drive")
         assert decode(TwistStamped, wheels.payloads[-1]).header.frame_id == "base_link"

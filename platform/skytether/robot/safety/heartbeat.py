@@ -52,8 +52,9 @@ class Heartbeat:
         self._watch = Watch(bounds, period_s, patience_s)
         self._period_s = period_s
         self._patience_s = patience_s
-        # The gate begins so early that the wheels are never without a word for longer than the patience.
-        self._silence_s = max(patience_s - 2 * period_s, period_s)
+        # The gate begins so early that the wheels are not without a word until they stop by themselves: they are
+        # without one since the beat before the first that was not answered, and a turn may come late.
+        self._silence_s = max(patience_s - 3.5 * period_s, period_s)
         self._trouble = trouble
         self._wrote = Told()
         self._unanswered: float | None = None
