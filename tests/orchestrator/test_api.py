@@ -17,6 +17,7 @@ from skytether.api.rest import (
     Renew,
     Report,
     RobotCreate,
+    SessionKey,
     SiteCreate,
     State,
     TopicReport,
@@ -44,8 +45,10 @@ def test_the_whole_life_of_an_instance(served: Any) -> None:
     assert len(session.id) == 16
     assert (session.host, session.port) == ("127.0.0.1", 40_000)
     grant = fake.world[made.id].launch.grant
-    assert (grant.session_id, grant.session_key) == (session.id, session.key)
-    assert session.key not in repr(running)
+    assert session.key is None
+    key = robot.claim_session(made.id, "c" * 16)
+    assert (grant.session_id, grant.session_key) == (session.id, key)
+    assert key not in repr(SessionKey(key=key))
     assert "run 1 of toy" in robot.logs(made.id)
     assert "run 1 of toy" in "".join(robot.follow_logs(made.id))  # fakes cannot be followed: what there is
     robot.delete_instance(made.id)

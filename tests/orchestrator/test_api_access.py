@@ -47,6 +47,7 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("POST", f"{API}/instances", {"robot": "walker", "service": "toy"}, (401, 401, 201, 403, 201)),
     ("GET", f"{API}/instances/ID", None, (401, 401, 200, 404, 200)),
     ("POST", f"{API}/instances/ID/renew", {}, (401, 401, 200, 404, 200)),
+    ("POST", f"{API}/instances/ID/session", {"claim": "c" * 16}, (401, 401, 200, 404, 200)),
     ("POST", f"{API}/instances/ID/migrate", {"site": "lab"}, (401, 401, 409, 404, 409)),
     ("GET", f"{API}/instances/ID/logs", None, (401, 401, 200, 404, 200)),
     ("GET", f"{API}/instances/ENDED/events", None, (401, 401, 200, 404, 200)),

@@ -25,7 +25,7 @@ import pytest
 from orchestrator_program import Program, until, with_toy
 
 from skytether.api.client import ApiError, Client, Unreachable
-from skytether.api.rest import InstanceCreate, RobotCreate, State
+from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, State, TokenCreate
 
 pytestmark = pytest.mark.slow
 
@@ -62,8 +62,9 @@ class Honest:
     def __init__(self, program: Program, operator: Client, name: str = "walker") -> None:
         token = operator.create_robot(RobotCreate(name=name)).token
         self._program = program
-        self._token = token
-        self.client = Client((program.folder / "address").read_text().strip(), token)
+        self.token = token
+        self.url = (program.folder / "address").read_text().strip()
+        self.client = Client(self.url, token)
         made = self.client.create_instance(InstanceCreate(robot=name, service="toy", lease_s=LEASE))
         self.instance = self.client.wait_running(made.id).id
         self.took: list[float] = []
@@ -75,7 +76,7 @@ class Honest:
         end = time.monotonic() + seconds
         while (began := time.monotonic()) < end:
             try:
-                with Client((self._program.folder / "address").read_text().strip(), self._token) as client:
+                with Client(self.url, self.token) as client:
                     renewed = client.renew_instance(self.instance)
                 assert renewed.state is State.RUNNING, f"{renewed.state}: {renewed.reason}\n{self._program.log}"
                 self.took.append(time.monotonic() - began)
@@ -214,6 +215,34 @@ def test_names_that_a_robot_makes_up_cost_only_itself(
     assert honest.still_has_it()
     assert max(honest.took) < 2.0
     assert memory().rss - before < 100 << 20
+
+
+def test_the_key_of_a_session_is_its_robots_alone_and_handed_out_once(program: Program, honest: Honest) -> None:
+    with operator_of(program) as operator:
+        everything_else = [scope for scope in SCOPES if scope != "sessions"]
+        for_keys = operator.create_token(TokenCreate(name="keys", scopes=("sessions",))).token
+        curious = operator.create_token(TokenCreate(name="curious", scopes=tuple(everything_else))).token
+    with Client(honest.url, curious) as client:
+        seen = client.get_instance(honest.instance).session
+        assert seen is not None
+        assert seen.key is None
+        assert seen.port is not None
+        renewed = client.renew_instance(honest.instance).session
+        assert renewed is not None
+        assert renewed.key is None
+        with pytest.raises(ApiError, match="needs the scope 'sessions'"):
+            client.claim_session(honest.instance, "c" * 16)
+    key = honest.client.claim_session(honest.instance, "my own secret claim")
+    thief = Client(honest.url, honest.token)  # a token that leaked
+    with thief, pytest.raises(ApiError, match="handed out already, and not to you"):
+        thief.claim_session(honest.instance, "another claim, of mine")
+    assert honest.client.claim_session(honest.instance, "my own secret claim") == key  # the answer was lost
+    program.end(signal.SIGKILL)
+    with program.start(), Client((program.folder / "address").read_text().strip(), honest.token) as again:
+        with pytest.raises(ApiError, match="handed out already, and not to you"):
+            again.claim_session(honest.instance, "another claim, of mine")
+        with Client((program.folder / "address").read_text().strip(), for_keys) as client:
+            assert client.claim_session(honest.instance, "any claim will do") == key
 
 
 @pytest.mark.parametrize("head", [SLOW_BODY + b"\r\n", b"GET /hea", b""], ids=["body", "head", "nothing"])

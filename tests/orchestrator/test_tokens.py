@@ -16,9 +16,21 @@ from skytether.orchestrator.store import Store
 from skytether.orchestrator.throttle import Throttle
 
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
+
+
+def _allowed(client: Client) -> None:
+    """It gets as far as that there is no such instance."""
+    try:
+        client.claim_session("none", "c" * 16)
+    except ApiError as error:
+        if error.problem.status != 404:
+            raise
+
+
 DOES: dict[str, Callable[[Client, Any], Any]] = {
     "read": lambda c, _: (c.sites(), c.instances(), c.services(), c.robots(), c.tokens()),
     "instances": lambda c, _: c.create_instance(ASK),
+    "sessions": lambda c, _: _allowed(c),
     "catalog": lambda c, m: c.put_service("other", m),
     "sites": lambda c, _: c.create_site(SiteCreate(name="more", tier="edge", runtime="fake")),
     "robots": lambda c, _: c.create_robot(RobotCreate(name="another")),

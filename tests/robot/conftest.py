@@ -1,10 +1,12 @@
+import base64
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from math import nan
 
 import pytest
 
-from skytether.api.rest import Instance, InstanceCreate, Renew, Session, State
+from skytether.api.client import ApiError
+from skytether.api.rest import Instance, InstanceCreate, Problem, Renew, Session, State
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
@@ -104,6 +106,8 @@ def make_cloud() -> type[Cloud]:
 class ObedientOrchestrator:
     """Gives every robot what it asks for, without a network; fails as it is told."""
 
+    KEY = base64.b64encode(bytes(32)).decode()
+
     def __init__(self) -> None:
         self.calls: list[tuple[str, object]] = []
         self.fail: Exception | None = None
@@ -112,6 +116,7 @@ class ObedientOrchestrator:
         self.reason = ""
         self.session: Session | None = None
         self.successor: str | None = None
+        self.key_taken = False
         self._number = 0
 
     def create_instance(self, request: InstanceCreate, *, idempotency_key: str) -> Instance:
@@ -123,6 +128,13 @@ class ObedientOrchestrator:
 
     def renew_instance(self, instance_id: str, renew: Renew) -> Instance:
         return self._answer("renew", renew, instance_id)
+
+    def claim_session(self, instance_id: str, claim: str) -> str:
+        self.calls.append(("claim", instance_id))
+        if self.key_taken:
+            problem = Problem(title="Not possible now", status=409, detail="was handed out already")
+            raise ApiError(problem)
+        return self.KEY
 
     def delete_instance(self, instance_id: str) -> Instance:
         return self._answer("delete", instance_id)

@@ -4,7 +4,7 @@ from random import Random
 import pytest
 
 from skytether.api.client import ApiError, Unreachable
-from skytether.api.rest import InstanceCreate, Problem, Report, State
+from skytether.api.rest import InstanceCreate, Problem, Report, Session, State
 from skytether.robot.asker import Asker
 
 REQUEST = InstanceCreate(robot="walker", service="virtual-trail")
@@ -274,3 +274,28 @@ def test_a_refused_token_is_looked_for_again_and_a_new_one_tried_soon(orchestrat
 
 def problem(status: int, detail: str) -> ApiError:
     return ApiError(Problem(title="no", status=status, detail=detail))
+
+
+def test_a_key_is_claimed_once_and_given_to_who_opens_the_session(orchestrator):
+    told = []
+    orchestrator.session = Session(id="ab" * 8, host="127.0.0.1", port=4711)
+    asker = Asker(orchestrator, REQUEST, on_instance=told.append)
+    for _ in range(3):
+        asker.step()
+    assert [call for call in orchestrator.calls if call[0] == "claim"] == [("claim", "i1")]
+    assert [instance.session.key for instance in told] == [orchestrator.KEY] * 3
+
+
+def test_a_key_that_somebody_else_has_is_said_and_another_instance_asked_for(orchestrator):
+    told = []
+    orchestrator.session = Session(id="ab" * 8, host="127.0.0.1", port=4711)
+    orchestrator.key_taken = True
+    asker = Asker(orchestrator, REQUEST, on_instance=told.append)
+    asker.step()
+    assert asker.trouble == "was handed out already"
+    orchestrator.key_taken = False
+    asker.step()
+    assert [name for name, _ in orchestrator.calls] == ["create", "claim", "delete", "create", "claim"]
+    keys = [what for name, what in orchestrator.calls if name == "create"]
+    assert keys[0] != keys[1]
+    assert [instance.session.key for instance in told] == [orchestrator.KEY]

@@ -30,6 +30,8 @@ from .rest import (
     Robot,
     RobotCreate,
     RobotCreated,
+    SessionClaim,
+    SessionKey,
     Site,
     SiteCreate,
     State,
@@ -53,7 +55,7 @@ _END_SEEN_S = 1.0
 """By when an orchestrator has seen that a run has ended [s]."""
 _AWAY = (502, 503, 504)
 """Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
-_REPEATABLE = ("/renew", "/migrate")
+_REPEATABLE = ("/renew", "/migrate", "/session")
 """Ends of paths to which a request that comes twice does what it would do once."""
 
 
@@ -158,6 +160,10 @@ class Client:
     def migrate_instance(self, instance_id: str, site: str | None = None) -> Instance:
         """Move it; the answer is the instance that its robot changes to."""
         return self._one(Instance, "POST", f"/instances/{instance_id}/migrate", Migrate(site=site))
+
+    def claim_session(self, instance_id: str, claim: str) -> str:
+        """The key of its session [base64], which one claim gets and no other; may be called again with the same."""
+        return self._one(SessionKey, "POST", f"/instances/{instance_id}/session", SessionClaim(claim=claim)).key
 
     def delete_instance(self, instance_id: str) -> None:
         """End it; may be called again."""

@@ -107,17 +107,31 @@ class Placement(Strict):
 
 
 class Session(Strict):
-    """The robot's half of a bridge session. Only the robot that owns the instance (or an operator) gets it."""
+    """The robot's half of a bridge session."""
 
     id: str
     """16 hexadecimal digits."""
-    key: Annotated[str, Field(repr=False)]
-    """32 bytes, base64."""
+    key: Annotated[str | None, Field(repr=False)] = None
+    """32 bytes, base64. Never in an answer about an instance: whoever claimed it (``SessionClaim``) puts it here."""
     host: str | None = None
     """Where the service's end can be reached (the advertised, not the bound address); None until it is up."""
     port: int | None = None
     topics: tuple[TopicSpec, ...] = ()
     needs: Needs = Needs()
+
+
+class SessionClaim(Strict):
+    """Ask for a session's key, which one claim gets, and no other."""
+
+    claim: Annotated[str, Field(min_length=16, max_length=64, repr=False)]
+    """Made up by whoever asks, and a secret: the same one gets the key again, if the answer was lost."""
+
+
+class SessionKey(Strict):
+    """The key of a session."""
+
+    key: Annotated[str, Field(repr=False)]
+    """32 bytes, base64."""
 
 
 class Instance(Strict):
@@ -291,8 +305,9 @@ class RobotCreated(Robot):
     token: Annotated[str, Field(repr=False)]
 
 
-Scope = Literal["read", "instances", "catalog", "sites", "robots", "tokens", "metrics"]
-"""What an operator's token may: see everything; change instances, catalogue, sites, robots, tokens; read /metrics."""
+Scope = Literal["read", "instances", "sessions", "catalog", "sites", "robots", "tokens", "metrics"]
+"""What an operator's token may: see everything but keys; change instances; get the keys of sessions (and so speak as a
+robot or its service); change catalogue, sites, robots, tokens; read /metrics."""
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 

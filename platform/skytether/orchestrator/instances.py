@@ -20,6 +20,7 @@ from skytether.api.rest import (
     Renew,
     Score,
     Session,
+    SessionKey,
     State,
 )
 
@@ -208,6 +209,25 @@ class Instances:
             self._reports.take(renewed.record, now, report, of_robot(renew.report), counts_of(kept))
         return self._shown(renewed.record, self._session(renewed.record), renewed.successor)
 
+    def claim_session(self, principal: Principal, instance: str, claim: str) -> SessionKey:
+        """The key of an instance's session: for its robot once, for an operator who may see keys always.
+
+        A key is good for whoever has it, so a token that leaked is not enough to take over what is driven already.
+
+        Raises:
+            NotFoundError: As for ``get``.
+            ConflictError: Somebody else with the robot's token has it.
+        """
+        record = self.get(principal, instance)
+        if principal.robot is not None:
+            digest = hashlib.sha256(claim.encode()).hexdigest()
+            if not self._store.hand_out(instance, digest):
+                raise ConflictError(
+                    f"the key of instance '{instance}' was handed out already, and not to you: delete it, and ask for "
+                    "another one; if nobody of yours has it, the robot's token leaked"
+                )
+        return SessionKey(key=base64.b64encode(self._secrets.session_key(record.session_id)).decode())
+
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.
 
@@ -290,7 +310,6 @@ class Instances:
         spec = record.spec
         return Session(
             id=record.session_id,
-            key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
             host=record.host,
             port=record.port,
             topics=spec.topics,

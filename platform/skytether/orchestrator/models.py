@@ -110,6 +110,7 @@ instances = Table(
     Column("replaces", String(32), index=True),
     Column("pinned", String(63)),
     Column("spare", Boolean, nullable=False, server_default=false()),
+    Column("claim", String(64), comment="SHA-256 of the claim that got the session's key; NULL: nobody did"),
     Column("version", Integer, nullable=False),
 )
 

@@ -283,6 +283,13 @@ class Store(Database):
         self.on_change(new.id)
         return new
 
+    def hand_out(self, instance: str, claim_sha256: str) -> bool:
+        """Note who gets the key of an instance's session; False if somebody else has it."""
+        mine = instances.c.claim.is_(None) | (instances.c.claim == claim_sha256)
+        statement = update(instances).where(instances.c.id == instance, mine).values(claim=claim_sha256)
+        with self._writing() as connection:
+            return connection.execute(statement).rowcount == 1
+
     def successor(self, instance: str) -> str | None:
         """The id of the one that replaces an instance and has not ended."""
         with self._reader.connect() as connection:

@@ -438,7 +438,13 @@ class Agent:
         opened = self._open_sessions.get(granted.id) if granted else None
         if opened is None or granted is None or granted.id == self._served:
             self._told(instance)
-        if granted is None or granted.host is None or granted.port is None or granted.id == self._left:
+        if (
+            granted is None
+            or granted.key is None
+            or granted.host is None
+            or granted.port is None
+            or granted.id == self._left
+        ):
             return
         peer = self._config.route(granted.host, granted.port)
         try:
@@ -492,7 +498,7 @@ class Agent:
             topics, port = self._graph.open(granted.topics, command)
             encoding = self._graph.encoding
             session = LiveSession(granted.id, frozenset(), command, self._epochs, encoding=encoding, graph=port)
-        spec = SessionSpec(parse_id(granted.id), parse_key(granted.key), Role.ROBOT, topics)
+        spec = SessionSpec(parse_id(granted.id), parse_key(granted.key or ""), Role.ROBOT, topics)
         session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
         return session
 

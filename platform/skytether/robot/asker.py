@@ -52,9 +52,21 @@ class Orchestrator(Protocol):
         """Keep the lease and report."""
         ...
 
+    def claim_session(self, instance_id: str, claim: str) -> str:
+        """The key of its session; the same claim gives it again."""
+        ...
+
     def delete_instance(self, instance_id: str) -> object:
         """Let go."""
         ...
+
+
+class _KeyTakenError(Exception):
+    """The key of an instance's session was handed out to somebody else."""
+
+    def __init__(self, instance: Instance, text: str) -> None:
+        self.instance = instance
+        super().__init__(text)
 
 
 class Asker:
@@ -113,6 +125,9 @@ class Asker:
         self._backoff = Backoff(0.2, 5.0, random)
         self._looks = Backoff(min(_LOOK_S, renew_s), renew_s, random)
         self._key = str(uuid.uuid4())
+        self._claim = str(uuid.uuid4())
+        self._keys: dict[str, str] = {}
+        """Of the sessions of the instance that is held and the one that is coming, by instance."""
         self._instance: Instance | None = None
         self._renewed_at = -math.inf
         self._trouble = ""
@@ -134,7 +149,10 @@ class Asker:
             self.release()
             return self._say("", _IDLE_S)
         try:
-            instance = self._exchange(request)
+            instance = self._with_key(self._exchange(request))
+        except _KeyTakenError as error:
+            self._let_go(error.instance)
+            return self._lost(str(error))
         except Unreachable as error:
             return self._say(str(error), self._backoff.next())
         except ApiError as error:
@@ -215,8 +233,8 @@ class Asker:
                 self._next = (made, self._clock())
                 return _POLL_S
             (coming, began) = self._next
-            found = self._client.renew_instance(coming.id, Renew())
-        except (ApiError, Unreachable) as error:
+            found = self._with_key(self._client.renew_instance(coming.id, Renew()))
+        except (ApiError, Unreachable, _KeyTakenError) as error:
             return self._stay(held, str(error))
         self._next = (found, began)
         if found.state.final or found.state is State.STOPPING or self._clock() - began > _MOVE_S:
@@ -252,6 +270,27 @@ class Asker:
             self._renewed_at = now
             return self._client.renew_instance(self._instance.id, Renew(report=self._report() if running else None))
         return self._client.get_instance(self._instance.id)
+
+    def _with_key(self, instance: Instance) -> Instance:
+        """The same with its session's key, which is asked for once.
+
+        Raises:
+            _KeyTakenError: Somebody else has it.
+        """
+        session = instance.session
+        if session is None or session.key is not None or instance.state.final or instance.state is State.STOPPING:
+            return instance
+        key = self._keys.get(instance.id)
+        if key is None:
+            try:
+                key = self._client.claim_session(instance.id, self._claim)
+            except ApiError as error:
+                if error.problem.status == 409:
+                    raise _KeyTakenError(instance, str(error)) from error
+                raise
+            held = [one.id for one in (self._instance, self._next[0] if self._next else None) if one is not None]
+            self._keys = {one: known for one, known in self._keys.items() if one in held} | {instance.id: key}
+        return instance.model_copy(update={"session": session.model_copy(update={"key": key})})
 
     def _lost(self, sentence: str) -> float:
         """The instance has ended; one that is coming is followed, otherwise another is asked for."""

@@ -209,7 +209,7 @@ class _Replay:
         session = self._wait_until_running()
         table = self._table(session)
         peer = self._peer = self._config.route(session.host or "", session.port or 0)
-        spec = SessionSpec(parse_id(session.id), parse_key(session.key), Role.ROBOT, table)
+        spec = SessionSpec(parse_id(session.id), parse_key(session.key or ""), Role.ROBOT, table)
         try:
             self._bridge = Bridge(spec, self, bind=self._config.bind, peer=peer)
             self._bridge.start()
@@ -309,7 +309,7 @@ class _Replay:
                         f"the token may not see the session of instance {instance.id}; use the token of robot "
                         f"'{self._config.robot}'"
                     )
-                if instance.session.host and instance.session.port:
+                if instance.session.key and instance.session.host and instance.session.port:
                     return instance.session
                 delay = _POLL_S
             if time.monotonic() > deadline:

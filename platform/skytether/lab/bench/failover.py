@@ -126,6 +126,9 @@ class _Granted:
     def renew_instance(self, *_: object) -> rest.Instance:
         return self._instance
 
+    def claim_session(self, *_: object) -> str:
+        raise AssertionError("the session has its key")
+
     def delete_instance(self, *_: object) -> object:
         return self._instance
 
@@ -246,7 +249,7 @@ def _child(stack: ExitStack, run: Callable[..., None], *arguments: Any) -> tuple
 def _run_service(pipe: Connection, session: rest.Session, rate: float) -> None:
     """The service's end: commands at a steady rate until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    spec = SessionSpec.from_api(Role.SERVICE, session.id, session.key, session.topics)
+    spec = SessionSpec.from_api(Role.SERVICE, session.id, session.key or "", session.topics)
     ended = threading.Event()
     threading.Thread(target=_until_closed, args=(pipe, ended), daemon=True).start()
     with Bridge(spec, GraphPort(LocalGraph(), spec.topics, Role.SERVICE)) as bridge:

@@ -224,6 +224,7 @@ class _Timed:
     def __init__(self, client: Client, answers: list[float], *, odd: bool) -> None:
         self.create_instance = client.create_instance
         self.get_instance = client.get_instance
+        self.claim_session = client.claim_session
         self.delete_instance = client.delete_instance
         self._client = client
         self._answers = answers

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew
+from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew, SessionClaim, SessionKey
 
 from ..core import Orchestrator
 from ..db import GONE
@@ -19,7 +19,7 @@ from ..instances import utc
 from ..records import Record
 from ..runtimes.base import LogStream
 from ..store import EventRow
-from .deps import PREFIX, Actor, Caller, Core, InThread, made, says
+from .deps import PREFIX, Actor, Caller, Core, InThread, KeyHolder, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
 
@@ -72,6 +72,12 @@ async def renew(core: Core, caller: Actor, run: InThread, instance: str, asked: 
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
     renewed: Instance = await run(core.instances.renew, caller, instance, asked)
     return renewed
+
+
+@router.post("/{instance}/session", responses=says(403, 404, 409, 422))
+def claim_session(core: Core, caller: KeyHolder, instance: str, asked: SessionClaim) -> SessionKey:
+    """The key of the instance's session. Its robot gets it once: again with the same claim only."""
+    return core.instances.claim_session(caller, instance, asked.claim)
 
 
 @router.post("/{instance}/migrate", status_code=201, responses=says(403, 404, 409, 422))
