@@ -57,6 +57,9 @@ def token(url: str, folder: Path = SECRETS, operator: Path = OPERATOR) -> None:
         except ApiError as error:
             print(f"the token in {path} is made anew: {error}")
     with Client(url, operator.read_text().strip()) as client:
+        for old in client.tokens():
+            if old.robot is None and old.name == "prometheus":
+                client.delete_token(old.id)
         keep(path, client.create_token(TokenCreate(name="prometheus", scopes=("metrics",))).token)
     print(f"made {path}")
 

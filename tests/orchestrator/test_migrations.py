@@ -103,6 +103,10 @@ ROWS: dict[str, dict[str, Any]] = {
         "created_at": NOW,
         "expires_at": None,
         "last_used_at": None,
+        "family": "t1",
+        "ends_at": None,
+        "successor": None,
+        "handle": "walker/walker",
     },
 }
 

@@ -231,7 +231,7 @@ def test_event_ids_never_come_again(store: Store, new_record: NewRecord) -> None
 
 
 def test_robots_sites_and_services(store: Store) -> None:
-    token = TokenRow("t", "r", "r", (), TokenHash("sky-12345678", "0" * 64), NOW)
+    token = TokenRow("t", "r", "r", (), TokenHash("sky-12345678", "0" * 64), NOW, family="t")
     robot = RobotRow("r", ("a", "b"), NOW)
     assert store.add_robot(robot, token)
     assert not store.add_robot(robot, dataclasses.replace(token, id="u"))
@@ -240,7 +240,7 @@ def test_robots_sites_and_services(store: Store) -> None:
     assert found is not None
     assert (found.services, found.last_seen_at) == (("a", "b"), NOW + 1)
     assert store.holders("sky-12345678") == [(token, found)]
-    other = TokenRow("o", "metrics", None, ("metrics",), TokenHash("sky-87654321", "1" * 64), NOW, NOW + 9)
+    other = TokenRow("o", "metrics", None, ("metrics",), TokenHash("sky-87654321", "1" * 64), NOW, NOW + 9, family="o")
     assert store.add_token(other)
     assert store.holders("sky-87654321") == [(other, None)]
     assert not store.add_token(dataclasses.replace(token, id="v", robot="nobody"))
@@ -250,7 +250,7 @@ def test_robots_sites_and_services(store: Store) -> None:
     store.delete_robot("r")
     assert store.robots() == []
     assert [row.id for row in store.tokens()] == ["o"]
-    store.delete_token("o")
+    store.delete_family("o")
     assert store.tokens() == []
 
     site = SiteCreate(name="lab", tier="cloud", runtime="process", options={"cpu": 1})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -144,3 +145,79 @@ def test_a_token_ends_at_its_time_and_use_is_noted(store: Store, tmp_path: Any) 
     with pytest.raises(UnauthenticatedError, match="expired at 1970-01-01T00:17:40"):
         access.authenticate(token)
     assert store.tokens()[0].last_used_at == 1000.0
+
+
+def refused(call: Callable[[], Any]) -> int:
+    with pytest.raises(ApiError) as caught:
+        call()
+    return caught.value.problem.status
+
+
+def test_a_token_has_one_successor_and_of_a_family_two_are_good(served: Any) -> None:
+    """Self-rotation once made fifty valid tokens out of one, which outlived its revocation and its end."""
+    first = served.operator.create_robot(RobotCreate(name="walker", token_ttl_s=1000)).token
+    tokens = [first]
+    for _ in range(50):
+        for token in (tokens[-1], first):
+            with contextlib.suppress(ApiError):
+                tokens.append(served.client(token).rotate_token(rotate=TokenRotate(grace_s=30 * 86_400)).token)
+    good = [token for token in tokens if _is_good(served.client(token))]
+    assert len(tokens) > 50
+    assert len(good) <= 2
+    listed = served.operator.tokens()
+    assert len(listed) <= 2
+    assert len({token.family for token in listed}) == 1
+    assert all((token.expires_at - listed[0].created_at).total_seconds() <= 1000 for token in listed)
+    served.operator.delete_token(listed[0].id)
+    assert served.operator.tokens() == []
+    assert not any(_is_good(served.client(token)) for token in tokens)
+
+
+def _is_good(client: Client) -> bool:
+    with contextlib.suppress(ApiError):
+        return bool(client.sites()) or True
+    return False
+
+
+def test_an_answer_that_was_lost_costs_no_token_and_one_that_is_used_cannot_be_replaced(served: Any) -> None:
+    robot = served.robot("walker")
+    lost = robot.rotate_token()
+    fresh = robot.rotate_token()
+    assert not _is_good(served.client(lost.token))
+    assert _is_good(served.client(fresh.token))
+    with pytest.raises(ApiError, match="was renewed already, and the new one is in use"):
+        robot.rotate_token()
+    assert _is_good(served.client(fresh.token))
+    assert _is_good(robot)
+    served.client(fresh.token).rotate_token()
+    assert not _is_good(robot)  # the new one's predecessor is fresh now
+
+
+def test_nobody_puts_off_the_end_of_their_own_token_but_who_may_make_such_ones(served: Any) -> None:
+    operator = served.operator
+    made = operator.create_token(TokenCreate(name="on-duty", scopes=("read", "tokens"), ttl_s=100))
+    weak = operator.create_token(TokenCreate(name="watcher", scopes=("read",), ttl_s=100))
+    again = served.client(made.token).rotate_token()
+    assert again.expires_at == made.expires_at
+    longer = TokenRotate(ttl_s=1000)
+    assert refused(lambda: served.client(weak.token).rotate_token(rotate=longer)) == 403
+    assert refused(lambda: served.robot("walker").rotate_token(rotate=longer)) == 403
+    other = operator.rotate_token(weak.id, longer)
+    assert (other.expires_at - other.created_at).total_seconds() == 1000
+    kept = next(token for token in operator.tokens() if token.id == weak.id)
+    assert kept.expires_at <= weak.expires_at  # whatever the grace
+
+
+def test_no_two_have_the_same_name(served: Any) -> None:
+    operator = served.operator
+    served.robot("walker")
+    scoped = TokenCreate(name="walker", scopes=("read",))
+    first = operator.create_token(scoped)
+    for asked in (scoped, TokenCreate(name="walker", robot="walker")):
+        with pytest.raises(ApiError, match="'walker' already: give another name, or delete it first") as caught:
+            operator.create_token(asked)
+        assert caught.value.problem.status == 409
+    operator.rotate_token(first.id)
+    assert refused(lambda: operator.create_token(scoped)) == 409
+    operator.delete_token(first.id)
+    assert operator.create_token(scoped).name == "walker"

@@ -388,7 +388,7 @@ class Client:
         return self._one(TokenCreated, "POST", f"/tokens/{token_id or 'self'}/rotate", rotate or TokenRotate())
 
     def delete_token(self, token_id: str) -> None:
-        """Revoke a token; may be called again."""
+        """Revoke a token, and those that it renewed or was renewed by; may be called again."""
         self._request("DELETE", f"/tokens/{token_id}")
 
     def metrics(self) -> str:

@@ -315,7 +315,7 @@ class TokenCreate(Strict):
     """Another token: a robot's, or an operator's with some scopes."""
 
     name: Name
-    """For people, to tell it from others."""
+    """For people, to tell it from others: no two of a robot, or of operators, have the same."""
     robot: Name | None = None
     scopes: tuple[Scope, ...] = ()
     ttl_s: TokenLife | None = None
@@ -327,6 +327,8 @@ class TokenRotate(Strict):
 
     grace_s: Annotated[float, Field(ge=0, le=30 * 86_400)] = 300
     """How long the old one is good for still."""
+    ttl_s: TokenLife | None = None
+    """How long the new one is good for, for who may make such tokens; None: until the end of the old one."""
 
 
 class Token(Strict):
@@ -336,6 +338,8 @@ class Token(Strict):
     name: str
     robot: str | None = None
     scopes: tuple[Scope, ...] = ()
+    family: str = ""
+    """The same for a token and the one that it was renewed by."""
     created_at: datetime
     expires_at: datetime | None = None
     last_used_at: datetime | None = None

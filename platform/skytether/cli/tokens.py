@@ -77,15 +77,21 @@ def rotate_token(
         typer.Argument(help="Its id; without it the one that this command uses.", autocompletion=names.tokens),
     ] = None,
     grace_s: Annotated[float, typer.Option(min=0, max=30 * _DAY, help="How long the old one is good still.")] = 300,
+    days: Annotated[
+        float | None,
+        typer.Option(min=1 / _DAY, help="How long the new one is good for; without it until the end of the old one."),
+    ] = None,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
 ) -> None:
-    """Make a token with the same rights, and let the old one end soon."""
+    """Make a token with the same rights and the same end, and let the old one end soon."""
     from skytether.api.rest import TokenRotate
 
     with connected(url, token_file) as client:
-        _show(client.rotate_token(token, TokenRotate(grace_s=grace_s)), json)
+        _show(
+            client.rotate_token(token, TokenRotate(grace_s=grace_s, ttl_s=None if days is None else days * _DAY)), json
+        )
 
 
 @app.command("delete")
@@ -94,7 +100,7 @@ def delete_token(
     url: Url = None,
     token_file: TokenFile = None,
 ) -> None:
-    """Revoke a token by its id."""
+    """Revoke a token by its id, and the one that it was renewed by."""
     with connected(url, token_file) as client:
         need("token", token, lambda: [row.id for row in client.tokens()])
         client.delete_token(token)

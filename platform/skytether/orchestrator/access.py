@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import secrets as random
 import time
 from collections import OrderedDict
@@ -204,6 +205,7 @@ class Access:
 
         Raises:
             ForbiddenError: It would have a scope that the one who asks has not.
+            ConflictError: There is one of that name.
             InvalidError: Scopes for a robot, or none for an operator.
             NotFoundError: There is no such robot.
         """
@@ -218,39 +220,55 @@ class Access:
         _require_all(by, robot, scopes)
         row, token = self._new(name, robot, scopes, ttl_s)
         if not self._store.add_token(row):
-            raise NotFoundError(f"there is no robot '{robot}': register it first")
+            if robot is not None and self._store.robot(robot) is None:
+                raise NotFoundError(f"there is no robot '{robot}': register it first")
+            whose = "there is a token" if robot is None else f"robot '{robot}' has a token"
+            raise ConflictError(f"{whose} '{name}' already: give another name, or delete it first")
         return row, token
 
-    def rotate(self, by: Principal, id_: str, grace_s: float) -> tuple[TokenRow, str]:
-        """Another token with the same rights and the same time to live; the old one is good for a while longer.
+    def rotate(self, by: Principal, id_: str, grace_s: float, ttl_s: float | None = None) -> tuple[TokenRow, str]:
+        """Another token with the same rights and the same end; the old one is good for a while longer.
+
+        Each has one successor: as long as that was not used, for its answer may have been lost, another one takes its
+        place. No more than these two are good at a time, and all end with each of them.
+
+        Args:
+            by: Who asks.
+            id_: Which; ``OWN`` for their own.
+            grace_s: How long the old one is good for still, at most until its end.
+            ttl_s: How long the new one is good for, for who may make such tokens; None: until the end of the old one.
 
         Raises:
+            ConflictError: It was renewed already, and the new one is in use.
             ForbiddenError: Not for this token.
             NotFoundError: There is none of that id.
         """
-        if id_ == OWN or (by.token and id_ == by.token.id):
-            old = by.token
-            if old is None:
-                raise NotFoundError(
-                    "the operator's token of the state folder is renewed by deleting its file and a restart"
-                )
-        else:
+        own = id_ == OWN or (by.token is not None and id_ == by.token.id)
+        if own and by.token is None:
+            raise NotFoundError(
+                "the operator's token of the state folder is renewed by deleting its file and a restart"
+            )
+        if not own or ttl_s is not None:
             by.require_scope("tokens")
-            old = self._store.token(id_)
-            if old is None:
-                raise NotFoundError(f"there is no token '{id_}'")
+        old = by.token if own else self._store.token(id_)
+        if old is None:
+            raise NotFoundError(f"there is no token '{id_}'")
+        if not own or ttl_s is not None:
             _require_all(by, old.robot, old.scopes)
-        now = self._clock()
-        ttl_s = None if old.expires_at is None else old.expires_at - old.created_at
-        row, token = self._new(old.name, old.robot, old.scopes, ttl_s)
-        self._store.add_token(row)
-        ends = now + grace_s
-        if old.expires_at is None or ends < old.expires_at:
-            self._store.change_token(old.id, expires_at=ends)
+        successor = self._store.token(old.successor) if old.successor else None
+        row, token = self._new(old.name, old.robot, old.scopes, ttl_s, old)
+        expires = min(row.created_at + grace_s, math.inf if old.expires_at is None else old.expires_at)
+        if (successor and successor.last_used_at is not None) or not self._store.renew_token(old, row, expires):
+            raise ConflictError(
+                f"token '{old.name}' ({old.id}) was renewed already, and the new one is in use: use that one; "
+                "if nobody of yours has it, delete it and make another"
+            )
         return row, token
 
     def forget(self, by: Principal, id_: str) -> None:
-        """A token is worth nothing from now on. One that is gone already is no error.
+        """A token, and those that it was renewed by or renewed, are worth nothing from now on.
+
+        One that is gone already is no error.
 
         Raises:
             ForbiddenError: It may more than the one who asks.
@@ -258,14 +276,21 @@ class Access:
         row = self._store.token(id_)
         if row is not None:
             _require_all(by, row.robot, row.scopes)
-            self._store.delete_token(id_)
+            self._store.delete_family(row.family)
 
     def _new(
-        self, name: str, robot: str | None, scopes: tuple[Scope, ...], ttl_s: float | None
+        self,
+        name: str,
+        robot: str | None,
+        scopes: tuple[Scope, ...],
+        ttl_s: float | None,
+        renews: TokenRow | None = None,
     ) -> tuple[TokenRow, str]:
-        token, now = new_token(), self._clock()
-        expires = None if ttl_s is None else now + ttl_s
-        return TokenRow(random.token_hex(8), name, robot, scopes, TokenHash.of(token), now, expires), token
+        """A token; without ``ttl_s`` it ends with the one that it renews, or never."""
+        token, id_, now = new_token(), random.token_hex(8), self._clock()
+        ends = now + ttl_s if ttl_s is not None else renews.ends_at if renews is not None else None
+        family = renews.family if renews is not None else id_
+        return TokenRow(id_, name, robot, scopes, TokenHash.of(token), now, ends, family=family, ends_at=ends), token
 
 
 def _digest(token: str) -> str:

@@ -45,6 +45,13 @@ class TokenRow:
     created_at: float
     expires_at: float | None = None
     last_used_at: float | None = None
+    family: str = ""
+    """Id of the first of those that were made from one another."""
+    ends_at: float | None = None
+    """When it would end if nobody renewed it: what is made from it by itself ends then, too. ``expires_at`` is earlier
+    once it was renewed."""
+    successor: str | None = None
+    """Id of the one that it was renewed by."""
 
 
 _HOLDERS = (
@@ -203,17 +210,39 @@ class Database:
         return [(_token(row), robot) for row, robot in zip(rows, robots_, strict=True)]
 
     def add_token(self, token: TokenRow) -> bool:
-        """False if its robot is gone."""
+        """False if its robot is gone, or there is one of that name."""
         return self._insert(tokens, _token_values(token))
+
+    def renew_token(self, old: TokenRow, new: TokenRow, expires_at: float | None) -> bool:
+        """Put a successor in the place of the one that there was, and end all of the family but these two.
+
+        Args:
+            old: As it was seen.
+            new: The successor.
+            expires_at: When the old one ends.
+
+        Returns:
+            False if somebody else was quicker.
+        """
+        seen = tokens.c.successor.is_(None) if old.successor is None else tokens.c.successor == old.successor
+        renewed = {"successor": new.id, "expires_at": expires_at, "handle": None}
+        with self._writing() as connection:
+            changed = connection.execute(update(tokens).where(tokens.c.id == old.id, seen).values(**renewed))
+            if changed.rowcount == 0:
+                return False
+            connection.execute(delete(tokens).where(tokens.c.family == old.family, tokens.c.id != old.id))
+            connection.execute(insert(tokens).values(**_token_values(new)))
+        return True
 
     def change_token(self, id_: str, **values: float | None) -> None:
         """Set when it expires, or when it was last used."""
         with self._writing() as connection:
             connection.execute(update(tokens).where(tokens.c.id == id_).values(**values))
 
-    def delete_token(self, id_: str) -> None:
+    def delete_family(self, family: str) -> None:
+        """Of tokens that were made from one another."""
         with self._writing() as connection:
-            connection.execute(delete(tokens).where(tokens.c.id == id_))
+            connection.execute(delete(tokens).where(tokens.c.family == family))
 
     def _insert(self, table: Any, values: dict[str, Any]) -> bool:
         try:
@@ -231,10 +260,12 @@ def _robot(row: Row[Any]) -> RobotRow:
 def _token(row: Row[Any]) -> TokenRow:
     kept = TokenHash(row.prefix, row.sha256)
     times = row.created_at, row.expires_at, row.last_used_at
-    return TokenRow(row.id, row.name, row.robot, tuple(row.scopes), kept, *times)
+    kin = row.family, row.ends_at, row.successor
+    return TokenRow(row.id, row.name, row.robot, tuple(row.scopes), kept, *times, *kin)
 
 
 def _token_values(token: TokenRow) -> dict[str, Any]:
     plain = {"id": token.id, "name": token.name, "robot": token.robot, "scopes": list(token.scopes)}
-    times = {"created_at": token.created_at, "expires_at": token.expires_at}
-    return {**plain, **times, "prefix": token.hash.prefix, "sha256": token.hash.digest}
+    times = {"created_at": token.created_at, "expires_at": token.expires_at, "ends_at": token.ends_at}
+    kin = {"family": token.family or token.id, "handle": f"{token.robot or ''}/{token.name}"}
+    return {**plain, **times, **kin, "prefix": token.hash.prefix, "sha256": token.hash.digest}

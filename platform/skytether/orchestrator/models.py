@@ -70,6 +70,11 @@ tokens = Table(
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
     Column("last_used_at", Float),
+    Column("family", String(16), nullable=False, server_default="", index=True),
+    Column("ends_at", Float, comment="NULL: never"),
+    Column("successor", String(16), comment="NULL: it was not renewed"),
+    Column("handle", String(127), comment="Robot and name, of one token at a time; NULL: it was renewed"),
+    Index(None, "handle", unique=True),
 )
 
 instances = Table(

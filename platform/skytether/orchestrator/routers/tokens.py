@@ -19,7 +19,7 @@ def _fields(row: TokenRow) -> dict[str, object]:
         "expires_at": utc(row.expires_at) if row.expires_at is not None else None,
         "last_used_at": utc(row.last_used_at) if row.last_used_at is not None else None,
     }
-    return {"id": row.id, "name": row.name, "robot": row.robot, "scopes": row.scopes, **times}
+    return {"id": row.id, "name": row.name, "robot": row.robot, "scopes": row.scopes, "family": row.family, **times}
 
 
 @router.get("")
@@ -28,7 +28,7 @@ def list_tokens(core: Core, _: Reader) -> list[Token]:
     return [Token.model_validate(_fields(row)) for row in core.store.tokens()]
 
 
-@router.post("", status_code=201, responses=says(404, 422))
+@router.post("", status_code=201, responses=says(404, 409, 422))
 def create_token(core: Core, caller: TokensOperator, asked: TokenCreate, response: Response) -> TokenCreated:
     """Make a token: another one of a robot, or an operator's with some of the scopes that the caller has."""
     row, token = core.access.create(caller, asked.name, asked.robot, asked.scopes, asked.ttl_s)
@@ -36,15 +36,18 @@ def create_token(core: Core, caller: TokensOperator, asked: TokenCreate, respons
     return TokenCreated.model_validate({**_fields(row), "token": token})
 
 
-@router.post("/{token}/rotate", status_code=201, responses=says(404, 422))
+@router.post("/{token}/rotate", status_code=201, responses=says(404, 409, 422))
 def rotate_token(core: Core, caller: Authenticated, token: str, asked: TokenRotate, response: Response) -> TokenCreated:
-    """Make one with the same rights; the old one ends soon. `self` is the one that the request came with."""
-    row, fresh = core.access.rotate(caller, token, asked.grace_s)
+    """Make one with the same rights and the same end; the old one ends soon. `self` is that of the request.
+
+    Each has one successor: another one takes its place as long as it was not used, and is refused afterwards.
+    """
+    row, fresh = core.access.rotate(caller, token, asked.grace_s, asked.ttl_s)
     made(response, "tokens", row.id)
     return TokenCreated.model_validate({**_fields(row), "token": fresh})
 
 
 @router.delete("/{token}", status_code=204)
 def delete_token(core: Core, caller: TokensOperator, token: str) -> None:
-    """Revoke a token; may be called again."""
+    """Revoke a token, and those that it renewed or was renewed by; may be called again."""
     core.access.forget(caller, token)
