@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import socket
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import pytest
 from pydantic import ValidationError
 
-from skytether.api.rest import Measurement
+from skytether.api.client import ApiError
+from skytether.api.rest import Measurement, RobotCreate
 
 ASK = '{"robot": "walker", "service": "toy", "params": {"mass": %s}}'
 
@@ -51,3 +54,68 @@ def test_a_name_that_no_database_knows(http: httpx.Client, path: str) -> None:
     for method in ("GET", "DELETE"):
         answer = http.request(method, path)
         assert (answer.status_code, answer.json()["title"]) == (404, "Not found")
+
+
+ASTRAY = ("../robots/walker", "", ".", "..", "toy#x", "toy?x=1", "a/b", "a\nb", "a b", "%2e%2e", "x" * 65, "ä", "/")
+
+
+def test_a_name_that_is_a_path_leads_nowhere_else(served: Any) -> None:
+    """`instance delete ../robots/walker` once deleted a robot, with its token."""
+    served.site("lab")
+    operator = served.operator
+    operator.create_robot(RobotCreate(name="walker"))
+    before = (operator.robots(), operator.services(), operator.tokens(), [site.name for site in operator.sites()])
+    for name in ASTRAY:
+        for ask in (
+            operator.get_instance,
+            operator.delete_instance,
+            operator.renew_instance,
+            operator.migrate_instance,
+            operator.logs,
+            lambda name: list(operator.follow_logs(name)),
+            lambda name: list(operator.watch(name)),
+            lambda name: operator.claim_session(name, "c" * 16),
+            operator.get_service,
+            operator.delete_service,
+            lambda name: operator.put_service(name, {}),
+            lambda name: operator.apply_service(name, {}),
+            operator.get_site,
+            operator.delete_site,
+            operator.probe,
+            operator.delete_robot,
+            operator.rotate_token,
+            operator.delete_token,
+        ):
+            with pytest.raises(ApiError, match="is no name of anything") as caught:
+                ask(name)
+            assert caught.value.problem.status == 404
+    assert (operator.robots(), operator.services(), operator.tokens(), [s.name for s in operator.sites()]) == before
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/instances/../robots/walker",
+        "/instances/%2e%2e/robots/walker",
+        "/instances/..%2frobots%2fwalker",
+        "/instances/",
+        "/instances//renew",
+        "//robots/walker",
+        "/robots/walker/",
+        "/robots/wal%0aker",
+        "/robots/walker%20",
+        "/robots/%2e",
+        "/robots/toy%23x",
+    ],
+)
+def test_so_it_is_whoever_asks(served: Any, path: str) -> None:
+    served.operator.create_robot(RobotCreate(name="walker"))
+    where = urlsplit(served.url)
+    for method in ("GET", "DELETE", "POST"):
+        head = f"{method} /api/v1{path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {served.token}\r\n"
+        with socket.create_connection((where.hostname or "", where.port or 0)) as raw:  # no client tidies the path
+            raw.sendall(f"{head}Content-Length: 0\r\nConnection: close\r\n\r\n".encode())
+            raw.settimeout(30)
+            answer = b"".join(iter(lambda: raw.recv(65_536), b""))
+        assert answer.split()[1] in (b"404", b"405"), answer
+    assert [robot.name for robot in served.operator.robots()] == ["walker"]

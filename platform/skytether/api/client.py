@@ -20,6 +20,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from .manifest import Manifest
 from .rest import (
     CHANGE,
+    PATH_NAME,
     Change,
     Instance,
     InstanceCreate,
@@ -151,27 +152,27 @@ class Client:
 
     def get_instance(self, instance_id: str) -> Instance:
         """One instance, with its session."""
-        return self._one(Instance, "GET", f"/instances/{instance_id}")
+        return self._one(Instance, "GET", _at("instances", instance_id))
 
     def renew_instance(self, instance_id: str, renew: Renew | None = None) -> Instance:
         """Keep the lease. What has ended is not revived: look at the state."""
-        return self._one(Instance, "POST", f"/instances/{instance_id}/renew", renew or Renew())
+        return self._one(Instance, "POST", _at("instances", instance_id, "renew"), renew or Renew())
 
     def migrate_instance(self, instance_id: str, site: str | None = None) -> Instance:
         """Move it; the answer is the instance that its robot changes to."""
-        return self._one(Instance, "POST", f"/instances/{instance_id}/migrate", Migrate(site=site))
+        return self._one(Instance, "POST", _at("instances", instance_id, "migrate"), Migrate(site=site))
 
     def claim_session(self, instance_id: str, claim: str) -> str:
         """The key of its session [base64], which one claim gets and no other; may be called again with the same."""
-        return self._one(SessionKey, "POST", f"/instances/{instance_id}/session", SessionClaim(claim=claim)).key
+        return self._one(SessionKey, "POST", _at("instances", instance_id, "session"), SessionClaim(claim=claim)).key
 
     def delete_instance(self, instance_id: str) -> None:
         """End it; may be called again."""
-        self._request("DELETE", f"/instances/{instance_id}")
+        self._request("DELETE", _at("instances", instance_id))
 
     def logs(self, instance_id: str, tail: int = 200) -> str:
         """The last lines that it wrote."""
-        return self._request("GET", f"/instances/{instance_id}/logs?tail={tail}").text
+        return self._request("GET", f"{_at('instances', instance_id, 'logs')}?tail={tail}").text
 
     def follow_logs(
         self, instance_id: str, tail: int = 200, on_resume: Callable[[], None] = lambda: None
@@ -185,7 +186,7 @@ class Client:
             tail: How many lines.
             on_resume: Called before what another connection brings.
         """
-        path = f"/instances/{instance_id}/logs?tail={tail}&follow=true"
+        path = f"{_at('instances', instance_id, 'logs')}?tail={tail}&follow=true"
         run = self._run(instance_id)
         reached, silent_since = False, None
         while True:
@@ -258,7 +259,7 @@ class Client:
 
     def _watch(self, instance_id: str, after: int, deadline: float) -> Iterator[InstanceEvent]:
         patience = max(0.001, min(_PING_LIMIT, deadline - time.monotonic()))
-        path = f"/instances/{instance_id}/events"
+        path = _at("instances", instance_id, "events")
         with self._stream(path, patience, {"Last-Event-ID": str(after)}) as response:
             for line in response.iter_lines():
                 if line.startswith("data:"):
@@ -312,17 +313,17 @@ class Client:
 
     def get_service(self, name: str) -> Manifest:
         """One service's manifest."""
-        return self._one(Manifest, "GET", f"/catalog/{name}")
+        return self._one(Manifest, "GET", _at("catalog", name))
 
     def put_service(self, name: str, manifest: Manifest | dict[str, Any]) -> Manifest:
         """Add or change a service. A plain document is validated by the orchestrator."""
-        return self._one(Manifest, "PUT", f"/catalog/{name}", manifest)
+        return self._one(Manifest, "PUT", _at("catalog", name), manifest)
 
     def apply_service(
         self, name: str, manifest: Manifest | dict[str, Any], *, dry_run: bool = False
     ) -> tuple[Manifest, Change]:
         """The same, and what it did; with ``dry_run`` what it would do, and nothing is stored."""
-        response = self._request("PUT", f"/catalog/{name}?dry_run={str(dry_run).lower()}", manifest)
+        response = self._request("PUT", f"{_at('catalog', name)}?dry_run={str(dry_run).lower()}", manifest)
         try:
             change = Change(response.headers.get(CHANGE, ""))
         except ValueError as error:
@@ -331,7 +332,7 @@ class Client:
 
     def delete_service(self, name: str) -> None:
         """Remove a service that was put."""
-        self._request("DELETE", f"/catalog/{name}")
+        self._request("DELETE", _at("catalog", name))
 
     # Sites
 
@@ -341,7 +342,7 @@ class Client:
 
     def get_site(self, name: str) -> Site:
         """One site."""
-        return self._one(Site, "GET", f"/sites/{name}")
+        return self._one(Site, "GET", _at("sites", name))
 
     def create_site(self, site: SiteCreate) -> Site:
         """Add a site."""
@@ -349,12 +350,12 @@ class Client:
 
     def delete_site(self, name: str) -> None:
         """Forget a site that has no instances."""
-        self._request("DELETE", f"/sites/{name}")
+        self._request("DELETE", _at("sites", name))
 
     def probe(self, site: str) -> float:
         """One round trip to where a site answers, in seconds; the first one also opens the connection."""
         before = time.perf_counter()
-        self._request("GET", f"/sites/{site}/probe")
+        self._request("GET", _at("sites", site, "probe"))
         return time.perf_counter() - before
 
     # Robots
@@ -369,7 +370,7 @@ class Client:
 
     def delete_robot(self, name: str) -> None:
         """Revoke a robot's token and end what it holds."""
-        self._request("DELETE", f"/robots/{name}")
+        self._request("DELETE", _at("robots", name))
 
     # Everything
 
@@ -385,11 +386,16 @@ class Client:
 
     def rotate_token(self, token_id: str | None = None, rotate: TokenRotate | None = None) -> TokenCreated:
         """Another one with the same rights; None: instead of this client's own."""
-        return self._one(TokenCreated, "POST", f"/tokens/{token_id or 'self'}/rotate", rotate or TokenRotate())
+        return self._one(
+            TokenCreated,
+            "POST",
+            _at("tokens", "self" if token_id is None else token_id, "rotate"),
+            rotate or TokenRotate(),
+        )
 
     def delete_token(self, token_id: str) -> None:
         """Revoke a token, and those that it renewed or was renewed by; may be called again."""
-        self._request("DELETE", f"/tokens/{token_id}")
+        self._request("DELETE", _at("tokens", token_id))
 
     def metrics(self) -> str:
         """In Prometheus' text format."""
@@ -485,6 +491,18 @@ class Client:
             f"no orchestrator answers at {self._shown}: "
             "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
         )
+
+
+def _at(kind: str, name: str, what: str = "") -> str:
+    """The path of something by its name, which is a word; anything else would lead to something else.
+
+    Raises:
+        ApiError: It is none.
+    """
+    if not PATH_NAME.fullmatch(name):
+        detail = f"{name!r} is no name of anything: names are letters, digits, '-' and '_'"
+        raise ApiError(Problem(title="Not found", status=404, detail=detail))
+    return f"/{kind}/{name}/{what}" if what else f"/{kind}/{name}"
 
 
 def _trust(ca_file: Path | str | None) -> ssl.SSLContext:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
@@ -37,6 +38,8 @@ class Change(StrEnum):
 
 
 CHANGE = "Skytether-Change"
+PATH_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+"""What can stand for something in a path: names and ids; never a part of a path, a query, or a control character."""
 
 
 class Measurement(Strict):

@@ -26,6 +26,7 @@ def create_app(core: Orchestrator) -> FastAPI:
         description="Ask for services for robots; see what runs where, and how well.",
         dependencies=[Depends(plain_request)],
         telemetry=_NO_TELEMETRY,
+        redirect_slashes=False,  # a name that is empty is none, and not another request
     )
     app.state.core = core
     problems.install(app)

@@ -33,6 +33,8 @@ _FREE = "/healthz"
 """Costs nothing; and to take an orchestrator for dead because it has much to do would help nobody."""
 _API = "/api/"
 _RENEWAL = re.compile(r"/api/v1/instances/[^/]+/renew")
+_ASTRAY = re.compile(r"/(\.{0,2})(/|$)|[\x00-\x1f\x7f]")
+"""What some proxies and clients take for another path than we would."""
 _PROBE = re.compile(r"/api/v1/sites/[^/]+/probe")
 _MOST_HELD = 64 << 20
 """Bytes of bodies, of all that have not arrived whole: as many as 64 manifests of the largest size."""
@@ -82,6 +84,9 @@ class Reception:
             return await self._app(scope, _nothing, send)
         if not scope["path"].startswith(_API):  # whatever is open to all, or asks for a token itself, takes no body
             return await self._place(scope, b"", send, renewal=False)
+        if _ASTRAY.search(scope["path"]):
+            text = "a path goes down, by names: none of them is empty or made of dots"
+            return await answer(Request(scope), 404, "Not found", text)(scope, receive, send)
         renewal = scope["method"] == "POST" and _RENEWAL.fullmatch(scope["path"]) is not None
         try:
             caller = await self._who(scope, renewal)

@@ -10,7 +10,7 @@ from fastapi import Depends, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from skytether.api.plain import oddity
-from skytether.api.rest import Problem, Scope
+from skytether.api.rest import PATH_NAME, Problem, Scope
 
 from ..access import Principal
 from ..core import Orchestrator
@@ -105,8 +105,8 @@ async def plain_request(request: Request) -> None:
         NotFoundError: It is in the path.
     """
     for name, value in request.path_params.items():
-        if "\0" in value:
-            raise NotFoundError(f"there is no {name} of that name: it holds a NUL character")
+        if not PATH_NAME.fullmatch(value):
+            raise NotFoundError(f"there is no {name} of that name: names are letters, digits, '-' and '_'")
     body = await request.body()
     try:
         document = await request.json() if body else None
