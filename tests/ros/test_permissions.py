@@ -1,3 +1,5 @@
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -150,6 +152,10 @@ def test_every_part_of_an_action_and_both_ways_of_a_call_are_looked_at():
     with pytest.raises(
         ValueError, match=r"'/cmd_vel_safe': /cmd_vel_safe is never published for the cloud: the wheels"
     ):
+        check(permissions(), specs, names, "cmd_vel")
+    parts = "/navigate/_action/send_goal, /navigate/_action/cancel_goal, /navigate/_action/get_result"
+    lists = f"publish: [/move_base/goal, /move_base/cancel], call: [{parts}, /get_map], offer: [/reset]"
+    with pytest.raises(ValueError, match=re.escape(f"cloud: {{{lists}}}")):
         check(permissions(), specs, names, "cmd_vel")
     listed = permissions(publish=["/move_base"], call=["/navigate", "/get_map"], offer=["/reset"])
     check(listed, specs[:-1], names, "cmd_vel")

@@ -19,6 +19,8 @@ from skytether.guard.latch import FIRST_ACT
 from skytether.robot.safety.client import GateError, ask, listens
 from skytether.robot.safety.config import SafetyConfig
 
+from .config_file import ConfigError
+from .gate_config import load_safety
 from .output import console, fail
 
 _START_S = 20.0
@@ -108,6 +110,25 @@ class OwnGate:
                 ask(self._folder, {"do": "start"}, _ASK_S)
 
 
+def other_wheels(config: Path, folder: Path) -> str:
+    """Whether the gate that runs in a folder is another robot's: a sentence; empty: it is this one's, or hangs.
+
+    Raises:
+        ConfigError: The gate's part of the file is wrong.
+    """
+    ours = load_safety(config).frozen().wheels_at()
+    try:
+        theirs = ask(folder, {"do": "status"}, _ASK_S)["wheels"]
+    except (GateError, KeyError, OSError):
+        return ""
+    if theirs == ours:
+        return ""
+    return (
+        f"the gate that runs in {folder} has other wheels ({theirs}) than robot.yaml says ({ours}); if it is another "
+        "robot's, name a folder of this one's own: safety.folder, or SKYTETHER_GATE_FOLDER"
+    )
+
+
 @contextmanager
 def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterator[OwnGate | None]:
     """See that there is a gate for as long as the context lasts; None: it is not ours, or there is to be none.
@@ -122,6 +143,12 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         yield None
         return
     if listens(safety.place()):
+        try:
+            strange = other_wheels(config, safety.place())
+        except (ConfigError, OSError) as error:
+            fail(str(error), 2)
+        if strange:
+            fail(strange)
         console.print(f"gate: uses the one that runs in {safety.place()}", markup=False, soft_wrap=True)
         yield None
         return

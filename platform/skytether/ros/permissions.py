@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -145,9 +146,22 @@ def check(permissions: Permissions, specs: Iterable[TopicSpec], names: Names, co
     Raises:
         ValueError: It does not; the text names each.
     """
-    found = refused(permissions, specs, names, command_topic)
-    if found:
-        raise ValueError("; ".join(f"the service's '{row}': {sentence}" for row, _, sentence in found))
+    never, unlisted = [], defaultdict[Access, list[str]](list)
+    for row, access, name in _uses(specs, names, command_topic):
+        sentence = permissions.refusal(access, name)
+        if sentence and permissions.protected(name):
+            never.append(f"the service's '{row}': {sentence}")
+        elif sentence:
+            unlisted[access].append(name)
+    if unlisted:
+        lists = ", ".join(f"{access}: [{', '.join(named)}]" for access, named in unlisted.items())
+        all_of_them = ", ".join(name for named in unlisted.values() for name in named)
+        never.append(
+            f"the service wants {all_of_them}, which robot.yaml does not allow; what of it is wanted is written there: "
+            f"cloud: {{{lists}}}"
+        )
+    if never:
+        raise ValueError("; ".join(never))
 
 
 def canonical(name: str) -> str:

@@ -198,3 +198,15 @@ def test_who_else_publishes_the_wheels_topic_is_named_and_counted(graph, walker,
     graph.end(other)
     wait_for(lambda: status() == {"names": [], "noticed": 1}, "the other one to be gone")
     graph.end(agent)
+
+
+def test_a_gate_of_another_robot_is_not_used(graph, walker, start):
+    gate = start("gate", safety=SECTION)
+    wait_for(lambda: listens(start.folder), "the gate")
+    agent = start("run", safety={**SECTION, "ros1": {"cmd_vel": "/other/cmd_vel"}})
+    assert agent.wait(60) == 1
+    said = " ".join(start.log.read_text().split())
+    assert "has other wheels (/cmd_vel at the ROS master" in said
+    assert "than robot.yaml says (/other/cmd_vel at" in said
+    gate.terminate()
+    gate.wait(30)

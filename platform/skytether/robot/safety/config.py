@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,13 @@ from pydantic import Field, field_validator, model_validator
 from skytether.guard.kinematics import Bounds
 from skytether.messages import Message
 from skytether.robot.supervisor import Limits
-from skytether.ros.names import check_name
+from skytether.ros.names import check_name, resolve
 
 from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Metres, Numbers, Topic
 from .footprint import Footprint, circle, polygon
 from .odometry_config import OdometryConfig, odometry_kind
-from .protocol import default_folder, default_record
+from .protocol import WHEELS_SOCKET, default_folder, default_record
 from .rules import Rules
 from .sensor_config import SensorConfig, UnseenConfig
 from .source_config import SourcesConfig
@@ -206,6 +207,18 @@ class SafetyConfig(SourcesConfig):
         period = 1 / self.rate_hz
         writer = 0.0 if self.ros1 is None and self.ros2 is None else period
         return Stages(self.zones.sensing_s, period, self.guard_s, writer, self.zones.reaction_s)
+
+    def wheels_at(self) -> str:
+        """Where the wheels are, in words that tell one robot's from another's."""
+        if self.ros1 is not None:
+            master = re.sub(r"//(127\.0\.0\.1|\[::1\])", "//localhost", self.ros1.master).rstrip("/")
+            return f"{resolve(self.ros1.cmd_vel, self.ros1.namespace)} at the ROS master {master}"
+        if self.ros2 is not None:
+            where = self.ros2.router or self.ros2.zenoh_config or "the usual router"
+            topic = resolve(self.ros2.cmd_vel, self.ros2.namespace)
+            return f"{topic} of the ROS 2 domain {self.ros2.domain} by {where}"
+        given = self.sockets.wheels if self.sockets is not None else None
+        return given or str(self.place() / WHEELS_SOCKET)
 
     def place(self) -> Path:
         """The gate's folder."""

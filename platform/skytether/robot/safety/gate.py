@@ -187,6 +187,7 @@ class GateLoop:
             "turns": self._turns,
             "overruns": self._overruns,
             "seconds": round(self._clock() - self._started, 1),
+            "wheels": self._config.wheels_at(),
             "pid": os.getpid(),
             "guard_pid": os.getppid(),
             "not_permitted": list(self._refused),
