@@ -95,3 +95,23 @@ def accept(document: dict[str, Any], page: str) -> None:
     else:
         graph = {"ros1": None} if "ros2" in document else {}
         check_config(inherit({**ROBOT, **graph, **document}), RobotConfig, page)
+
+
+def promises() -> list[str]:
+    """Rows of the table of what the gate guarantees."""
+    text = (ROOT / "docs" / "safety.md").read_text()
+    part = text.partition("## What is guaranteed\n")[2].partition("\n\n")[0]
+    return part.splitlines()[2:]
+
+
+def test_each_promise_of_the_gate_names_tests_that_are_there() -> None:
+    assert len(promises()) > 15
+    for row in promises():
+        cells = [cell.strip() for cell in row.strip("|").split(" | ")]
+        assert len(cells) == 3, row
+        named = re.findall(r"`(test_\w+\.py)::(test_\w+)`", cells[2])
+        assert named, f"no test holds: {row}"
+        assert cells[2] == " ".join(f"`{file}::{name}`" for file, name in named)
+        for file, name in named:
+            found = list((ROOT / "tests").rglob(file))
+            assert any(f"def {name}(" in path.read_text() for path in found), f"{file}::{name} of: {row}"

@@ -25,7 +25,17 @@ def test_all_attacks_fit_into_some_minutes():
     assert estimate(attacks(), 1) < 300
 
 
-FEW = ("agent-killed", "gate-killed", "gate-frozen-1", "guard-frozen-1", "guard-gate-killed", "stop-gate-killed")
+FEW = (
+    "agent-killed",
+    "gate-frozen-1",
+    "gate-killed-thrice",
+    "guard-frozen-1",
+    "guard-gate-killed",
+    "stop-gate-killed",
+    "reset-alone",
+    "wheels-gone-0.5",
+    "pipe-full",
+)
 UNHURRIED = {"rate_hz": 20, "guard_s": 0.4, "limits": {**LIMITS, "max_gap_s": 0.4}}
 """What is promised, and what may be late, follows from these: a machine that others use too is no violation."""
 
@@ -37,10 +47,11 @@ def test_some_attacks_on_real_processes():
     assert len(rows) == len(FEW) + 3
     for row in rows:
         assert row.velocity_max_m_s > 0.4  # it did drive
-        assert row.standstill_max_s is not None
-        assert row.promised_s is not None
-        assert 0 < row.standstill_max_s <= row.promised_s
-    assert all(0.5 < row.acceleration_max_m_s2 <= 2.0 for row in rows)
+        assert 0.5 < row.acceleration_max_m_s2 <= 2.0
+        if row.attack != "wheels-gone-0.5":
+            assert row.standstill_max_s is not None
+            assert row.promised_s is not None
+            assert 0 < row.standstill_max_s <= row.promised_s
 
 
 @pytest.mark.slow

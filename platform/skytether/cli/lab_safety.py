@@ -23,12 +23,13 @@ def safety(
         bool, typer.Option("--ros1", help="Attacks on a robot that is a ROS 1 graph, too; needs rosmaster.")
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each attack.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table of docs/safety.md.")] = False,
 ) -> None:
     """Attack the robot's gate on real processes, and hold what the wheels received against what is promised.
 
     Guard, gate and agent are real; sensors and wheels are played. Ends with exit status 1 if a promise was broken.
     """
-    from skytether.lab.bench.safety import bench_safety, estimate, select
+    from skytether.lab.bench.safety import HEADING, bench_safety, estimate, select
     from skytether.lab.safety.ros1_hardware import available
 
     if ros1 and not available():
@@ -46,6 +47,8 @@ def safety(
         fail(str(error))
     if json:
         print_json([row.document() for row in rows])
+    elif markdown:
+        print(HEADING, *(row.line(known.what) for row, known in zip(rows, chosen, strict=True)), sep="\n")
     else:
         _show(rows)
     broken = [row for row in rows if row.violations]

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +54,22 @@ class SafetyRow:
     promised_s: float | None
     what: tuple[str, ...]
 
+    def line(self, what: str) -> str:
+        """For ``--markdown``; ``what`` is done, in words."""
+        stands = "" if self.standstill_max_s is None else f"{self.standstill_max_s:.2f} of {self.promised_s:.2f}"
+        return (
+            f"| `{self.attack}` | {what} | {self.n} | {self.violations} | {self.acceleration_max_m_s2:.1f} | {stands} |"
+        )
+
     def document(self) -> dict[str, object]:
         """For ``--json``."""
         return asdict(self)
+
+
+HEADING = """\
+| attack | what is done | n | violations | m/s² | stands after [s] |
+| --- | --- | --- | --- | --- | --- |"""
+"""Of the lines of ``--markdown``."""
 
 
 def attacks(with_ros1: bool = False) -> list[Attack]:
@@ -116,7 +128,7 @@ def bench_safety(
         n: How often each.
         busy: Other programs take all cores meanwhile.
         tell: Told what goes on.
-        safety: Keys of the section ``safety`` that are to be others, where the attack has no robot of its own.
+        safety: Keys of the section ``safety`` that are to be others.
     """
     with ExitStack() as undo:
         if busy:
@@ -152,8 +164,7 @@ class _Robots:
             self.end()
         if self._robot is None:
             folder = Path(self._undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-")))
-            make = attack.robot or partial(PlayedRobot, safety=self._safety)
-            self._robot = self._undo.enter_context(make(folder))
+            self._robot = self._undo.enter_context((attack.robot or PlayedRobot)(folder, self._safety))
             self._made_by = attack.robot
         return self._robot
 

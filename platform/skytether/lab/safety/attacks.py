@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from .checker import Finding
 from .robot import PlayedRobot
 from .stage import Stage
 
-MakeRobot = Callable[[Path], AbstractContextManager[PlayedRobot]]
+MakeRobot = Callable[[Path, Mapping[str, Any]], AbstractContextManager[PlayedRobot]]
+"""Given a folder, and keys of the section ``safety`` that are to be others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +27,7 @@ class Attack:
         rehearse: Instead of that: stages it without processes.
         spoils: The robot is of no use for another attack.
         seconds: About how long it takes, for the estimate.
-        robot: Makes the robot that it needs, in a folder; None: the usual one.
+        robot: Makes the robot that it needs; None: the usual one.
     """
 
     name: str

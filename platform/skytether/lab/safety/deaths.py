@@ -15,6 +15,8 @@ ROLES = ("agent", "gate", "guard")
 _FREEZES_S = (0.2, 1.0, 2.0)
 _NEXT_S = 0.05
 """From the first death to the second: less than it takes to notice the first."""
+_TOO_OFTEN = 3
+"""Ends of the gate within a minute after which the robot is stopped."""
 _WATCH_S = 1.0
 """For so long the robot has to stay where it stands."""
 _STARTS_AGAIN_S = 0.5
@@ -52,6 +54,7 @@ def enter(attacks: Attacks, roles: tuple[str, ...] = ROLES) -> None:
             _frozen_and_killed(first, second),
             seconds=4,
         )
+    attacks.add("gate-killed-thrice", "the gate is killed three times within a minute", _thrice, seconds=6)
     for name, number in (("terminated", signal.SIGTERM), ("hung-up", signal.SIGHUP)):
         attacks.add(
             f"guard-{name}",
@@ -90,6 +93,20 @@ def killed(role: str) -> Run:
             stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends without its guard")
 
     return run
+
+
+def _thrice(stage: Stage) -> None:
+    for _ in range(_TOO_OFTEN - 1):
+        stage.robot.another_gate(stage.robot.signal("gate", signal.SIGKILL))
+        stage.robot.start()
+    victim = stage.robot.pid("gate")
+    with stage.stands(stage.promised.partner, "the gate was killed three times; nobody has reset the robot"):
+        stage.robot.kill(victim)
+        stage.robot.another_gate(victim)
+        stage.robot.start()
+        stage.sleep(_WATCH_S)
+        if not stage.robot.ask("status")["stopped"]:
+            stage.wrong("stop", "a gate that ended three times within a minute is not stopped")
 
 
 def frozen(role: str, seconds: float) -> Run:

@@ -1,12 +1,13 @@
-"""Attacks on a robot that is a ROS 1 graph: the same processes and a writer, a master that dies, somebody else."""
+"""Attacks on a robot that is a ROS 1 graph: the same processes and a writer, a master that dies."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 from . import deaths, hardware, stops
 from .attacks import Attacks
@@ -39,12 +40,11 @@ def enter(attacks: Attacks) -> None:
     add("wheels-gone", "the wheels' node is gone for 0.5 s", hardware.wheels_gone(0.5), 3)
     add("laser-silent", "the laser falls silent", hardware.blind("nothing any more", lambda _: lambda: None), 4)
     add("master-killed", "the master is killed, then the agent; the master starts again", _master, 6)
-    add("another-publisher", "somebody else advertises the wheels' topic", _publisher, 5)
 
 
 @contextmanager
-def _robot(folder: Path) -> Iterator[PlayedRobot]:
-    with PlayedRobot(folder, hardware=Ros1Hardware) as robot:
+def _robot(folder: Path, safety: Mapping[str, Any]) -> Iterator[PlayedRobot]:
+    with PlayedRobot(folder, safety, hardware=Ros1Hardware) as robot:
         yield robot
 
 
@@ -66,11 +66,3 @@ def _master(stage: Stage) -> None:
             stage.sleep(1.0)
     finally:
         graph.start_master()
-
-
-def _publisher(stage: Stage) -> None:
-    end = _graph(stage).another_publisher()
-    try:
-        stage.expect(lambda: "somebody_else" in str(stage.robot.ask("status")), "somebody else is named in the status")
-    finally:
-        end()

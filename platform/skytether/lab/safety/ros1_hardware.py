@@ -88,13 +88,6 @@ class Ros1Hardware:
         self._process.kill()
         self._process.wait()
 
-    def another_publisher(self) -> Callable[[], None]:
-        """Somebody else advertises the wheels' topic, and publishes nothing; the return value ends that."""
-        node = Node("somebody_else", self.master, host=_HOST)
-        node.start()
-        node.advertise(_WHEELS, Twist.TYPE, hash_of(Twist.TYPE, "ros1"))
-        return node.close
-
     def send(self, topic: str, message: Message) -> None:
         """Hardware: publish it."""
         self._sensors[topic].publish(encode(message, "ros1"))

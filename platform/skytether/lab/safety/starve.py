@@ -7,9 +7,10 @@ import resource
 import signal
 import socket
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -160,7 +161,7 @@ def _memory(stage: Stage) -> None:
 
 
 @contextmanager
-def _unread(folder: Path) -> Iterator[PlayedRobot]:
+def _unread(folder: Path, safety: Mapping[str, Any]) -> Iterator[PlayedRobot]:
     """Processes whose output goes into a pipe that is full from the start and that nobody reads."""
     unread, output = os.pipe()
     os.set_blocking(output, False)
@@ -172,7 +173,7 @@ def _unread(folder: Path) -> Iterator[PlayedRobot]:
             os.write(output, b"\0")
     os.set_blocking(output, True)
     try:
-        with PlayedRobot(folder, output=output) as robot:
+        with PlayedRobot(folder, safety, output=output) as robot:
             yield robot
     finally:
         os.close(unread)
@@ -194,7 +195,7 @@ def _mute(stage: Stage) -> None:
 
 
 @contextmanager
-def _small_disk(folder: Path) -> Iterator[PlayedRobot]:
+def _small_disk(folder: Path, safety: Mapping[str, Any]) -> Iterator[PlayedRobot]:
     """On a disk of its own, where that is permitted; else no file of the processes may become larger than it is."""
     with ExitStack() as undo:
         before: Callable[[], None] | None = None
@@ -202,7 +203,7 @@ def _small_disk(folder: Path) -> Iterator[PlayedRobot]:
             undo.enter_context(small_disk(folder, _DISK_BYTES))
         except OSError:
             before = _no_room
-        yield undo.enter_context(PlayedRobot(folder, before=before))
+        yield undo.enter_context(PlayedRobot(folder, safety, before=before))
 
 
 def _no_room() -> None:
