@@ -144,13 +144,24 @@ def test_any_detail_fits_in_a_slot_and_damage_is_left_out(detail, damage):
 
 
 GIVEN = settings.Settings(
-    "/run/x", "/var/x", 0.02, 0.1, Bounds(1, -1, 1, 1, 1, 2, 2), ("10.0.0.1", 5), ("python", "-m"), (), 7, ("ö",)
+    "/run/x",
+    "/var/x",
+    0.02,
+    0.1,
+    Bounds(1, -1, 1, 1, 1, 2, 2),
+    ("10.0.0.1", 5),
+    ("10.0.0.2", 6),
+    ("python", "-m"),
+    (),
+    7,
+    ("ö",),
 )
 
 
 def test_settings_go_there_and_back():
     assert settings.load(settings.dump(GIVEN)) == GIVEN
-    assert settings.load(settings.dump(GIVEN._replace(wheels=None))).wheels is None
+    nothing = GIVEN._replace(wheels=None, estop=None)
+    assert settings.load(settings.dump(nothing)) == nothing
 
 
 def test_what_is_frozen_stays_and_can_be_read_twice():

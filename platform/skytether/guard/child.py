@@ -25,11 +25,14 @@ class Child:
     Args:
         name: For people.
         command: Its arguments; the number of the socket comes after them.
-        config: File descriptor of its configuration, whose number comes last.
+        config: File descriptor of its configuration, whose number comes after that.
         now: [s]
+        inherited: Further file descriptors that it gets, whose numbers come after that.
     """
 
-    def __init__(self, name: str, command: Sequence[str], config: int, now: float) -> None:
+    def __init__(
+        self, name: str, command: Sequence[str], config: int, now: float, inherited: tuple[int, ...] = ()
+    ) -> None:
         self.name = name
         self.heard_at: float | None = None
         self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -40,7 +43,7 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._failed = ""
         self._ended = False
-        threading.Thread(target=self._start, args=(tuple(command), theirs, config), daemon=True).start()
+        threading.Thread(target=self._start, args=(tuple(command), theirs, (config, *inherited)), daemon=True).start()
 
     @property
     def pid(self) -> int:
@@ -71,15 +74,15 @@ class Child:
         """Whether nothing is left of it."""
         return bool(self._failed) or (self._process is not None and self._process.poll() is not None)
 
-    def _start(self, command: tuple[str, ...], theirs: socket.socket, config: int) -> None:
+    def _start(self, command: tuple[str, ...], theirs: socket.socket, files: tuple[int, ...]) -> None:
         with theirs:
             with suppress(OSError):  # it takes its own priority, and is to start with none
                 os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             try:
                 self._process = subprocess.Popen(
-                    [*command, str(theirs.fileno()), str(config)],
+                    [*command, *map(str, (theirs.fileno(), *files))],
                     stdin=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno(), config],
+                    pass_fds=[theirs.fileno(), *files],
                     start_new_session=True,  # a Ctrl-C is for the guard, which ends its children when the wheels stand
                 )
             except OSError as error:

@@ -17,6 +17,7 @@ from .child import Child
 from .clock import now as boottime
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
+from .mailbox import bind
 from .protocol import LARGEST, STOP_SOCKET, Answer, Beat, pack_answer, unpack_beat, unpack_note
 from .record import Record
 from .requests import Reply, Requests
@@ -78,6 +79,10 @@ class Guard:
             self._requests = Requests(os.path.join(settings.folder, STOP_SOCKET), self._answer)
         except OSError as error:
             raise GuardError(f"cannot have {STOP_SOCKET} in {settings.folder}: {error.strerror}") from error
+        try:
+            self._estop = None if settings.estop is None else bind(settings.estop)
+        except OSError as error:
+            raise GuardError(f"cannot have {settings.estop} for stops: {error.strerror}") from error
         self._watch = Watch(settings.bounds, settings.period_s, settings.patience_s)
         self._wheels = WriterWheels() if settings.wheels is None else SocketWheels(settings.wheels)
         self._systemd = Systemd()
@@ -106,6 +111,8 @@ class Guard:
         if self._writer is not None:
             self._writer.socket.close()  # it says standstill for a while, leaves the graph and ends
         self._requests.close()
+        if self._estop is not None:
+            self._estop.close()
         end = time.monotonic() + _LEAVES_S
         while time.monotonic() < end and not (
             self._record.written and self._latch.kept and (self._writer is None or self._writer.reaped())
@@ -223,7 +230,8 @@ class Guard:
             if now - self._tried.get(name, -_AGAIN_S) < _AGAIN_S:
                 return None
             self._tried[name] = now
-            return Child(name, command, self._settings.config, now)
+            inherited = (self._estop.fileno(),) if name == "gate" and self._estop is not None else ()
+            return Child(name, command, self._settings.config, now, inherited)
         why = child.ended(now)
         if not why:
             return child

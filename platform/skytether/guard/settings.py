@@ -28,6 +28,8 @@ class Settings(NamedTuple):
     bounds: Bounds
     wheels: Address | None
     """Where the guard writes velocities to; None: a writer does."""
+    estop: Address | None
+    """Where drivers send stops, for the gate; None: they are topics."""
     gate: tuple[str, ...]
     """The gate's command."""
     writer: tuple[str, ...]
@@ -50,19 +52,25 @@ def load(text: str) -> Settings:
         ValueError, TypeError, KeyError: It is not that.
     """
     found = json.loads(text)
-    wheels = found["wheels"]
     return Settings(
         folder=str(found["folder"]),
         record=str(found["record"]),
         period_s=float(found["period_s"]),
         patience_s=float(found["patience_s"]),
         bounds=Bounds(**{key: float(value) for key, value in found["bounds"].items()}),
-        wheels=(str(wheels[0]), int(wheels[1])) if isinstance(wheels, list) else wheels,
+        wheels=_address(found["wheels"]),
+        estop=_address(found["estop"]),
         gate=tuple(found["gate"]),
         writer=tuple(found["writer"]),
         config=int(found["config"]),
         say=tuple(found["say"]),
     )
+
+
+def _address(found: object) -> Address | None:
+    if isinstance(found, list):
+        return str(found[0]), int(found[1])
+    return None if found is None else str(found)
 
 
 def freeze(name: str, text: str) -> int:

@@ -4,7 +4,7 @@ import json
 import math
 import socket
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,11 +14,12 @@ import pytest
 from skytether.guard.latch import Keeper, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
-from skytether.messages import LaserScan, Message, encode
+from skytether.messages import Bool, Joy, LaserScan, Message, encode
 from skytether.robot.safety.client import GateError, GateLink, ask
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.gate import GateLoop
 from skytether.robot.safety.hardware import SocketSensors
+from skytether.robot.safety.inbox import Topics
 from skytether.robot.safety.protocol import GateState, pack_state, unpack_state
 
 SCAN = LaserScan(
@@ -35,6 +36,10 @@ class Hardware:
 
     def __init__(self) -> None:
         self.told: list[Velocity] = []
+
+    def stops(self) -> list[tuple[str, Message]]:
+        """There is no button."""
+        return []
 
     def read(self) -> list[tuple[str, Message]]:
         return [("scan", SCAN)]
@@ -290,16 +295,36 @@ def test_a_reset_waits_for_what_the_guard_says_first(bench):
 
 def test_readings_come_as_datagrams_and_others_are_told(tmp_path):
     told = {}
-    address = str(tmp_path / "sensors.sock")
-    sensors = SocketSensors(address, {"scan": LaserScan}, lambda kind, sentence: told.setdefault(kind, sentence))
+    address, stops = str(tmp_path / "sensors.sock"), str(tmp_path / "estop.sock")
+    topics = Topics({"scan": LaserScan, "joy": Joy, "estop": Bool}, {"estop": lambda message: message.data})
+    sensors = SocketSensors(address, stops, topics, lambda kind, sentence: told.setdefault(kind, sentence))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as driver:
-        for data in (b"scan\0" + encode(SCAN), b"scan\0\1\2\3", b"odom\0x", b"", b"\0", b"\xff" * 500):
+        for data in (b"joy\0\1\2\3", b"odom\0x", b"", b"\0", b"\xff" * 500, b"estop\0" + encode(Bool(data=True))):
             driver.sendto(data, address)
+        driver.sendto(b"scan\0" + encode(SCAN), address)
+        driver.sendto(b"scan\0" + encode(SCAN), stops)
+        assert list(sensors.stops()) == []
         found = list(sensors.read())
     assert [topic for topic, _ in found] == ["scan"]
     assert found[0][1].ranges.tolist() == SCAN.ranges.tolist()
-    assert set(told) == {"sensors:scan:bytes", "sensors:topic"}
+    assert set(told) == {"sensors:joy:bytes", "sensors:topic", "sensors:estop:socket", "sensors:scan:socket"}
+    assert "belongs to sockets.estop" in told["sensors:estop:socket"]
     assert list(sensors.read()) == []
+    sensors.close()
+
+
+def test_a_press_is_not_lost_behind_readings_however_many(tmp_path):
+    address, stops = str(tmp_path / "sensors.sock"), str(tmp_path / "estop.sock")
+    topics = Topics({"scan": LaserScan, "estop": Bool}, {"estop": lambda message: message.data})
+    sensors = SocketSensors(address, stops, topics, lambda *_: None)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as driver:
+        driver.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                driver.sendto(b"scan\0" + encode(SCAN), address)
+        driver.sendto(b"estop\0" + encode(Bool(data=True)), stops)
+        driver.sendto(b"estop\0" + encode(Bool(data=False)), stops)
+        assert [message.data for _, message in sensors.stops()] == [True, False]
     sensors.close()
 
 

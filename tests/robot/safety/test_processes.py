@@ -130,13 +130,13 @@ class Robot:
             link.settimeout(0.2)
             while not self._ended.wait(0.04):
                 self._send(link, "scan", self._scan())
-                self._send(link, "estop", Bool())
+                self._send(link, "estop", Bool(), "estop.sock")
                 if self.pad is not None:
                     self._send(link, "joy", self.pad)
 
-    def _send(self, link: socket.socket, topic: str, message: Message) -> None:
+    def _send(self, link: socket.socket, topic: str, message: Message, where: str = "sensors.sock") -> None:
         try:
-            link.sendto(topic.encode() + b"\0" + encode(message), str(self.folder / "sensors.sock"))
+            link.sendto(topic.encode() + b"\0" + encode(message), str(self.folder / where))
         except OSError:  # the gate is not there, or does not take it: so much the worse for it
             return
 

@@ -71,8 +71,7 @@ class SocketHardware:
 
     def send(self, topic: str, message: Message) -> None:
         """Hardware: a datagram."""
-        stops = self._folder / "estop.sock"
-        path = stops if topic == "estop" and stops.exists() else self._folder / "sensors.sock"
+        path = self._folder / ("estop.sock" if topic == "estop" else "sensors.sock")
         with suppress(OSError):  # the gate is not there, or does not take it: so much the worse for it
             self._sends.sendto(topic.encode() + b"\0" + encode(message), str(path))
 

@@ -6,6 +6,7 @@ import os
 import re
 import socket
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,17 +14,19 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
-from skytether.messages import Message
+from skytether.messages import Bool, Message
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name, resolve
 
 from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Metres, Numbers, Topic
+from .contact import ContactParams, feels
 from .footprint import Footprint, circle, polygon
+from .inbox import IsStop, Topics
 from .odometry_config import OdometryConfig, odometry_kind
 from .protocol import WHEELS_SOCKET, default_folder, default_record
 from .rules import Rules
-from .sensor_config import SensorConfig, UnseenConfig
+from .sensor_config import ContactConfig, SensorConfig, UnseenConfig
 from .source_config import SourcesConfig
 from .stopping import Stages, shortfall
 from .zones import ZoneParams
@@ -56,10 +59,12 @@ class SocketsConfig(Numbers):
 
     sensors: str | None = None
     """Where the gate listens: the topic's name, a zero byte, the message as CDR; null: ``sensors.sock``."""
+    estop: str | None = None
+    """The same for the emergency stop button, bumpers and cliff sensors; null: ``estop.sock``."""
     wheels: str | None = None
     """Where velocities go: a geometry_msgs/msg/Twist as CDR; null: ``wheels.sock`` in the gate's folder."""
 
-    @field_validator("sensors", "wheels")
+    @field_validator("sensors", "estop", "wheels")
     @classmethod
     def _an_address(cls, text: str | None) -> str | None:
         if text is not None:
@@ -120,6 +125,8 @@ class SafetyConfig(SourcesConfig):
     """By topic. Without any (``{}``) the robot is blind, and all that it does is moving where no sensor looks."""
     unseen: UnseenConfig = UnseenConfig()
     """Moving where no sensor looks."""
+    contacts: Annotated[dict[Topic, ContactConfig], Field(max_length=32)] = {}
+    """Bumpers and cliff sensors, by topic."""
     odometry: OdometryConfig | None = None
     """What the wheels really do; null: nobody looks."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
@@ -193,6 +200,7 @@ class SafetyConfig(SourcesConfig):
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
             unseen=self.unseen.params(),
+            contacts={topic: contact.params() for topic, contact in self.contacts.items()},
             stages=stages,
             sources=self.source_rules(),
             odometry=None if self.odometry is None else self.odometry.rules(stages),
@@ -236,10 +244,10 @@ class SafetyConfig(SourcesConfig):
             OSError: A host's name is not known.
         """
         changes: dict[str, object] = {"folder": self.place().absolute(), "record": self.record_file().absolute()}
-        if self.sockets is not None and self.sockets.wheels is not None:
-            wheels = numeric(address(self.sockets.wheels))
-            text = f"unix:{wheels}" if isinstance(wheels, str) else f"udp:{wheels[0]}:{wheels[1]}"
-            changes["sockets"] = self.sockets.model_copy(update={"wheels": text})
+        if self.sockets is not None:
+            given = {name: text for name, text in self.sockets.model_dump().items() if text is not None}
+            numbers = {name: _text(numeric(address(text))) for name, text in given.items()}
+            changes["sockets"] = self.sockets.model_copy(update=numbers)
         return self.model_copy(update=changes)
 
     def record_file(self) -> Path:
@@ -253,8 +261,28 @@ class SafetyConfig(SourcesConfig):
 
     def _other_kinds(self) -> list[tuple[str, type[Message]]]:
         """All but range sensors; a topic that is there twice is a mistake."""
+        kinds = [(topic, contact.params().message) for topic, contact in self.contacts.items()]
         odometry = self.odometry
-        return self.source_kinds() + ([] if odometry is None else [(odometry.topic, odometry_kind(odometry))])
+        return kinds + self.source_kinds() + ([] if odometry is None else [(odometry.topic, odometry_kind(odometry))])
+
+    def topics(self) -> Topics:
+        """What the gate listens to, and which of it stops the robot."""
+        stops: dict[str, IsStop] = {topic: partial(_felt, c.params()) for topic, c in self.contacts.items()}
+        if self.estop is not None:
+            stops[self.estop.topic] = partial(_pressed, self.estop.pressed_is)
+        return Topics(self.kinds(), stops)
+
+
+def _felt(contact: ContactParams, message: Message) -> bool:
+    return feels(contact, message) is True
+
+
+def _pressed(pressed_is: bool, message: Message) -> bool:
+    return isinstance(message, Bool) and bool(message.data) is pressed_is
+
+
+def _text(found: str | tuple[str, int]) -> str:
+    return f"unix:{found}" if isinstance(found, str) else f"udp:{found[0]}:{found[1]}"
 
 
 NO_GATE = "none"

@@ -1,4 +1,4 @@
-"""The gate as a process: ``python -m skytether.robot.safety.gate FD CONFIG``, started by the guard and by nobody else.
+"""The gate as a process: ``python -m skytether.robot.safety.gate FD CONFIG [ESTOP]``, started by the guard alone.
 
 One loop at a fixed rate: what came on the sockets goes in, one velocity goes to the guard, which owns the wheels. The
 guard answers each; when it does not, it is gone or frozen, and the gate stops the wheels itself. The configuration
@@ -23,6 +23,7 @@ from skytether.guard import privileges
 from skytether.guard.clock import now as boottime
 from skytether.guard.latch import Keeper, boot_id
 from skytether.guard.loop import LATCH_FILE
+from skytether.guard.mailbox import bind
 from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
@@ -31,7 +32,7 @@ from skytether.robot.notices import Notices
 
 from .config import SafetyConfig
 from .control import Control
-from .hardware import Sensors, Wheels, bind, receive_from
+from .hardware import Sensors, Wheels, receive_from
 from .heartbeat import Heartbeat
 from .process import log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, pack_state, unpack_command
@@ -82,7 +83,7 @@ class GateLoop:
         self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
-        self._commands = bind(str(folder / COMMAND_SOCKET), 0o660)
+        self._commands = bind(str(folder / COMMAND_SOCKET))
         self._notices = Notices(_log)
         self._started = clock()
         self._overruns = 0
@@ -114,6 +115,8 @@ class GateLoop:
         """One turn of the loop."""
         self._heartbeat.hear()
         now = self._clock()
+        for topic, message in self._sensors.stops():  # before all else, a reset above all
+            self._gate.sense(topic, message, now)
         self._control.turn(now)
         agent = self._take_commands(now)
         for topic, message in self._sensors.read():
@@ -206,7 +209,8 @@ def main() -> None:
     warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
     refused = privileges.take(privileges.GATE)
     notices = Notices(_log)
-    sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()))
+    estop = socket.socket(fileno=int(sys.argv[3])) if len(sys.argv) > 3 else None
+    sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)
     loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"), refused)
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short

@@ -7,20 +7,23 @@ this machine that only those may open whom the file system lets, or over UDP to 
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from skytether.guard import wheels
+from skytether.guard.mailbox import bind
 from skytether.guard.protocol import Told
 from skytether.guard.velocity import Velocity
-from skytether.messages import DecodeError, Message, decode
+from skytether.messages import Message
+
+from .inbox import Inbox, Topics
 
 _LARGEST = 256 * 1024
 """Bytes of one reading; more is cut off and then no message."""
 _EACH_TURN = 64
 """Readings taken in one turn of the loop; the rest waits in the socket's buffer, whose size the kernel bounds."""
+_STOPS_EACH_TURN = 1024
+"""More than the kernel keeps: after a stall all that waits is taken at once."""
 
 Address = str | tuple[str, int]
 
@@ -48,8 +51,15 @@ class Wheels(Protocol):
 class Sensors(Protocol):
     """Where readings come from."""
 
+    def stops(self) -> Iterable[tuple[str, Message]]:
+        """What buttons, bumpers and cliff sensors said since the last call: the last press of each, and the last word.
+
+        Taken first at each turn. Returns at once and never raises.
+        """
+        ...
+
     def read(self) -> Iterable[tuple[str, Message]]:
-        """What came since the last call, by topic, oldest first. Returns at once and never raises."""
+        """What else came since the last call, by topic, oldest first. Returns at once and never raises."""
         ...
 
     def close(self) -> None:
@@ -81,65 +91,62 @@ class SocketWheels:
 
 
 class SocketSensors:
-    """Each reading is a datagram: the topic's name, a zero byte, the message as CDR.
+    """Each reading is a datagram: the topic's name, a zero byte, the message as CDR. Stops have a socket of their own.
 
     Args:
-        address: To listen at. A path that is left from before is taken over.
-        kinds: Type of the messages of each topic; others are counted and not used.
+        readings: To listen at for readings. A path that is left from before is taken over.
+        stops: The same for what stops the robot, or the socket that somebody bound for it.
+        topics: Which there are; others are named and not used, and so are those at the other socket.
         trouble: Told a kind and a sentence about each datagram that is not used.
 
     Raises:
-        OSError: The address cannot be had.
+        OSError: An address cannot be had.
     """
 
     def __init__(
-        self, address: Address, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]
+        self,
+        readings: Address,
+        stops: Address | socket.socket,
+        topics: Topics,
+        trouble: Callable[[str, str], object],
     ) -> None:
-        self._kinds = kinds
+        self._topics = topics
         self._trouble = trouble
-        self._socket = bind(address, 0o660)
+        self._inbox = Inbox(topics, "cdr", trouble)
+        self._readings = bind(readings)
+        try:
+            self._stops = stops if isinstance(stops, socket.socket) else bind(stops)
+        except OSError:
+            self._readings.close()
+            raise
+
+    def stops(self) -> Iterable[tuple[str, Message]]:
+        """Sensors: what waits in the socket for stops, all of it."""
+        self._fill(self._stops, _STOPS_EACH_TURN, stops=True)
+        return self._inbox.take_stops()
 
     def read(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what waits in the socket."""
-        found = []
-        for data in receive(self._socket, _LARGEST, _EACH_TURN):
-            name, _, payload = data.partition(b"\0")
-            topic = name[:64].decode("utf-8", errors="replace")
-            kind = self._kinds.get(topic)
-            if kind is None:
-                self._trouble("sensors:topic", f"readings come for '{topic}', which is not configured")
-                continue
-            try:
-                found.append((topic, decode(kind, payload)))
-            except DecodeError as error:
-                self._trouble(f"sensors:{topic}:bytes", f"{topic}: {error}")
-        return found
+        """Sensors: what waits in the socket for readings."""
+        self._fill(self._readings, _EACH_TURN, stops=False)
+        return self._inbox.take()
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        """Close the sockets."""
+        self._readings.close()
+        self._stops.close()
 
-
-def bind(address: Address, mode: int) -> socket.socket:
-    """A datagram socket that never waits; a path gets its mode before anybody can send.
-
-    Raises:
-        OSError: The address cannot be had.
-    """
-    made = _datagrams(address)
-    try:
-        if isinstance(address, str):
-            path = Path(address)
-            with suppress(FileNotFoundError):
-                path.unlink()
-            made.bind(address)
-            path.chmod(mode)
-        else:
-            made.bind(address)
-    except OSError:
-        made.close()
-        raise
-    return made
+    def _fill(self, source: socket.socket, most: int, *, stops: bool) -> None:
+        for data in receive(source, _LARGEST, most):
+            name, _, payload = data.partition(b"\0")
+            topic = name[:64].decode("utf-8", errors="replace")
+            if topic not in self._topics.kinds:
+                self._trouble("sensors:topic", f"readings come for '{topic}', which is not configured")
+            elif (topic in self._topics.stops) is not stops:
+                where = "sockets.sensors" if stops else "sockets.estop"
+                sentence = f"'{topic}' comes at the wrong socket and is not used; it belongs to {where}"
+                self._trouble(f"sensors:{topic}:socket", sentence)
+            else:
+                self._inbox.put(topic, payload)
 
 
 def receive_from(source: socket.socket, largest: int, most: int) -> list[tuple[bytes, object]]:
@@ -166,10 +173,3 @@ def receive(source: socket.socket, largest: int, most: int) -> list[bytes]:
         except OSError:  # what was sent before found nobody: that is said by the next write
             continue
     return found
-
-
-def _datagrams(address: Address) -> socket.socket:
-    family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    made = socket.socket(family, socket.SOCK_DGRAM)
-    made.setblocking(False)
-    return made

@@ -22,6 +22,7 @@ COMMAND_SOCKET = "command.sock"
 CONTROL_SOCKET = "control.sock"
 """In the gate's folder: one request and one answer, both JSON, on a connection."""
 SENSORS_SOCKET = "sensors.sock"
+ESTOP_SOCKET = "estop.sock"
 WHEELS_SOCKET = "wheels.sock"
 
 

@@ -6,7 +6,7 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Message, Twist, Vector3, encode, hash_of
@@ -15,7 +15,7 @@ from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
 
 from .config import Ros1Way
-from .inbox import Inbox
+from .inbox import Inbox, Topics
 
 
 class Ros1Wheels:
@@ -53,22 +53,26 @@ class Ros1Sensors:
 
     Args:
         way: Where they are.
-        kinds: Message type by topic, as configured: absolute, or in the namespace.
+        topics: As configured: absolute, or in the namespace.
         trouble: Told a kind and a sentence about each message that is not used.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros1Way, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]) -> None:
-        self._inbox = Inbox(kinds, "ros1", trouble)
+    def __init__(self, way: Ros1Way, topics: Topics, trouble: Callable[[str, str], object]) -> None:
+        self._inbox = Inbox(topics, "ros1", trouble)
         self._node = _start(way, "sensors")
-        for name, kind in kinds.items():
+        for name, kind in topics.kinds.items():
             topic = resolve(name, way.namespace)
             self._node.subscribe(topic, kind.TYPE, hash_of(kind.TYPE, "ros1"), self._listener(name))
 
+    def stops(self) -> Iterable[tuple[str, Message]]:
+        """Sensors: what stops the robot."""
+        return self._inbox.take_stops()
+
     def read(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what came since the last turn."""
+        """Sensors: what else came since the last turn."""
         return self._inbox.take()
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ A router that dies takes sensors and wheels away at once: a base that is told no
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 
 from skytether.control.admittance import Velocity
@@ -17,7 +17,7 @@ from skytether.ros.ros2.node import Ros2Error, Ros2Node
 from skytether.ros.ros2.qos import Qos
 
 from .config import Ros2Way
-from .inbox import Inbox
+from .inbox import Inbox, Topics
 
 
 class Ros2Wheels:
@@ -60,22 +60,26 @@ class Ros2Sensors:
 
     Args:
         way: Where they are.
-        kinds: Message type by topic, as configured: absolute, or in the namespace.
+        topics: As configured: absolute, or in the namespace.
         trouble: Told a kind and a sentence about each message that is not used.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros2Way, kinds: Mapping[str, type[Message]], trouble: Callable[[str, str], object]) -> None:
-        self._inbox = Inbox(kinds, "cdr", trouble)
+    def __init__(self, way: Ros2Way, topics: Topics, trouble: Callable[[str, str], object]) -> None:
+        self._inbox = Inbox(topics, "cdr", trouble)
         self._node = _start(way, "sensors")
-        for name, kind in kinds.items():
+        for name, kind in topics.kinds.items():
             endpoint = _endpoint(Kind.SUBSCRIPTION, resolve(name, way.namespace), kind.TYPE)
             self._node.subscribe(endpoint, partial(self._inbox.put, name))
 
+    def stops(self) -> Iterable[tuple[str, Message]]:
+        """Sensors: what stops the robot."""
+        return self._inbox.take_stops()
+
     def read(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what came since the last turn."""
+        """Sensors: what else came since the last turn."""
         return self._inbox.take()
 
     def close(self) -> None:

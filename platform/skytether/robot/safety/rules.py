@@ -18,6 +18,7 @@ from skytether.robot.command import Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import kinematics as reach
+from .contact import ContactParams, Contacts
 from .coverage import Action, Unseen, UnseenParams
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
@@ -43,6 +44,7 @@ class Rules:
         zones: Sizes of the zones.
         sensors: By topic.
         unseen: What to do about moving where none of them looks.
+        contacts: Bumpers and cliff sensors, by topic.
         sources: Who may drive, and who may stop the robot.
         stages: Latencies from the light to the brakes.
     """
@@ -52,6 +54,7 @@ class Rules:
     zones: ZoneParams = field(default_factory=ZoneParams)
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
     unseen: UnseenParams = field(default_factory=UnseenParams)
+    contacts: Mapping[str, ContactParams] = field(default_factory=dict)
     sources: SourceRules = field(default_factory=SourceRules)
     odometry: OdometryRules | None = None
     stages: Stages = field(default_factory=Stages)
@@ -94,6 +97,7 @@ class Gate:
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.footprint, rules.limits.clock_tolerance_s)
+        self._contacts = Contacts(rules.contacts)
         self._unseen = Unseen(rules.unseen, rules.footprint, rules.zones.slow_speed)
         oldest = max((sensor.max_age_s for sensor in rules.sensors.values()), default=0.0)
         self._reckoning = DeadReckoning(oldest + rules.stages.reaction_s(0.0))
@@ -117,6 +121,10 @@ class Gate:
             wrong = self._sensing.look(topic, message, now)
             if wrong is not None:
                 self._event(*wrong)
+        elif topic in self._rules.contacts and isinstance(message, self._rules.contacts[topic].message):
+            reason = self._contacts.hear(topic, message, now)
+            if reason:
+                self.engage(reason)
         elif self._sources.expects(topic, message):
             self._hear(topic, message, now)
         elif self._motion is not None and self._rules.odometry is not None and topic == self._rules.odometry.topic:
@@ -135,7 +143,7 @@ class Gate:
         Returns:
             Why it was refused; empty: it was not.
         """
-        refused = self._sources.reset(now)
+        refused = self._contacts.refuses_reset(now) or self._sources.reset(now)
         if not refused:
             self._sensing.relearn()
             self._supervised = replace(
@@ -154,7 +162,7 @@ class Gate:
 
     def refuses_reset(self, now: float) -> str:
         """Why `reset` would be refused now; empty: it would not."""
-        return self._sources.refuses_reset(now)
+        return self._contacts.refuses_reset(now) or self._sources.refuses_reset(now)
 
     def rebase(self, velocity: Velocity, at: float) -> None:
         """The wheels were told something else than the last step decided: the next one goes on from there.
@@ -189,6 +197,10 @@ class Gate:
         if broken:
             self.engage(broken)
         hand = self._sources.look(now, troubles)
+        silent = self._contacts.silent(now)
+        if silent:
+            troubles.update(silent)
+            hand = Hand.NOBODY
         wanted = self._supervise(hand, now, troubles)
         allowed = self._see(wanted, now, troubles)
         if self._motion is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import radians
+from math import inf, radians
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from skytether.messages import LaserScan, Message, Range
 
 from .config_base import Metres, Numbers
+from .contact import ContactKind, ContactParams
 from .coverage import Action, UnseenParams
 from .ranges import Mount
 from .sensing import RangeSensor
@@ -109,3 +110,22 @@ class UnseenConfig(Numbers):
     def params(self) -> UnseenParams:
         """As the rules take it."""
         return UnseenParams(Action(self.action), self.near_m)
+
+
+class ContactConfig(Numbers):
+    """A bumper or a cliff sensor: it stops the robot until a reset."""
+
+    kind: Literal["bumper", "cliff"] = "bumper"
+    pressed_is: bool = True
+    """std_msgs/msg/Bool: the value that stops; false for a circuit that opens."""
+    below_m: Annotated[float, Field(gt=0, le=10)] | None = None
+    """sensor_msgs/msg/Range instead: nearer than this stops [m]."""
+    above_m: Annotated[float, Field(gt=0, le=10)] | None = None
+    """sensor_msgs/msg/Range instead: farther than this stops [m], as over a step down."""
+    max_age_s: Annotated[float, Field(gt=0, le=60)] | None = 0.5
+    """Silence after which the robot stands; null: it speaks only when it changes."""
+
+    def params(self) -> ContactParams:
+        """As the rules take it."""
+        age = inf if self.max_age_s is None else self.max_age_s
+        return ContactParams(ContactKind(self.kind), self.pressed_is, self.below_m, self.above_m, age)

@@ -10,6 +10,7 @@ from skytether.guard.settings import Settings, dump, freeze
 
 from .config import SafetyConfig, SocketsConfig, address
 from .protocol import WHEELS_SOCKET
+from .ways import estop_address
 
 _PYTHON = (sys.executable, "-P")
 
@@ -47,6 +48,7 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
         patience_s=config.guard_s,
         bounds=config.bounds(),
         wheels=None if on_graph else wheels,
+        estop=None if on_graph else estop_address(config),
         gate=(*_PYTHON, "-m", "skytether.robot.safety.gate"),
         writer=(*_PYTHON, "-m", "skytether.robot.safety.writer") if on_graph else (),
         config=file,

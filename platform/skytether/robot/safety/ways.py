@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from typing import Literal
 
 from .config import SafetyConfig, SocketsConfig, address
 from .hardware import Address, Sensors, SocketSensors, SocketWheels, Wheels
-from .protocol import SENSORS_SOCKET, WHEELS_SOCKET
+from .protocol import ESTOP_SOCKET, SENSORS_SOCKET, WHEELS_SOCKET
 
 
-def open_sensors(config: SafetyConfig, trouble: Callable[[str, str], object]) -> Sensors:
-    """Where readings come from.
+def open_sensors(
+    config: SafetyConfig, trouble: Callable[[str, str], object], estop: socket.socket | None = None
+) -> Sensors:
+    """Where readings and stops come from.
+
+    Args:
+        config: The section of robot.yaml.
+        trouble: Told a kind and a sentence about each message that is not used.
+        estop: The socket for stops, which the guard keeps while gates come and go; None: it is bound here.
 
     Raises:
         OSError: It cannot be had.
@@ -19,13 +27,14 @@ def open_sensors(config: SafetyConfig, trouble: Callable[[str, str], object]) ->
     if config.ros1 is not None:
         from .ros1 import Ros1Sensors
 
-        return Ros1Sensors(config.ros1, config.kinds(), trouble)
+        return Ros1Sensors(config.ros1, config.topics(), trouble)
     if config.ros2 is not None:
         from .ros2 import Ros2Sensors
 
-        return Ros2Sensors(config.ros2, config.kinds(), trouble)
+        return Ros2Sensors(config.ros2, config.topics(), trouble)
     sockets = config.sockets or SocketsConfig()
-    return SocketSensors(_address(config, sockets.sensors, SENSORS_SOCKET), config.kinds(), trouble)
+    readings = _address(config, sockets.sensors, SENSORS_SOCKET)
+    return SocketSensors(readings, estop or estop_address(config), config.topics(), trouble)
 
 
 def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
@@ -48,6 +57,11 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
         return Ros2Wheels(config.ros2, role)
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
+
+
+def estop_address(config: SafetyConfig) -> Address:
+    """Where drivers send what stops the robot."""
+    return _address(config, (config.sockets or SocketsConfig()).estop, ESTOP_SOCKET)
 
 
 def _address(config: SafetyConfig, text: str | None, name: str) -> Address:
