@@ -13,6 +13,8 @@ def main() -> None:
     """Run the command line. A request to end is an interrupt, so that what was started is ended in order."""
     try:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+            signal.signal(signal.SIGHUP, signal.default_int_handler)
         from .app import app
 
         app()

@@ -63,7 +63,7 @@ def slowest(told, since):
     return max(steps, default=0.0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_without_a_section_there_is_a_gate_that_stops_the_wheels_and_ends_with_the_agent(graph, walker, start, number):
     agent = start("run")
     drives(walker)
@@ -94,6 +94,15 @@ def test_without_a_gate_the_last_velocity_of_a_killed_agent_is_the_last_word(wal
     time.sleep(3.0)
     assert walker.speed == pytest.approx(0.2)
     assert "there is no gate (safety: none)" in start.log.read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_without_a_gate_an_agent_that_is_told_to_end_stops_the_wheels_first(walker, start, number):
+    agent = start("run", safety="none")
+    drives(walker)
+    agent.send_signal(number)
+    agent.wait(60)
+    assert walker.speed == 0.0
 
 
 def test_a_gate_that_runs_already_is_used_and_stays(graph, walker, start):
