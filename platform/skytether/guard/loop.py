@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 from .child import Child
 from .clock import now as boottime
+from .enable import Enable, Power, WriterLine, open_line
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
 from .mailbox import bind
@@ -85,6 +86,7 @@ class Guard:
             raise GuardError(f"cannot have {settings.estop} for stops: {error.strerror}") from error
         self._watch = Watch(settings.bounds, settings.period_s, settings.patience_s)
         self._wheels = WriterWheels() if settings.wheels is None else SocketWheels(settings.wheels)
+        self._enable = self._enable_signal()
         self._systemd = Systemd()
         self._gate: Child | None = None
         self._writer: Child | None = None
@@ -95,6 +97,18 @@ class Guard:
         self._due = self._last = self._started = clock()
         self._troubles: dict[str, str] = {}
         self._ready = self._ends = False
+
+    def _enable_signal(self) -> Enable | None:
+        settings, wheels = self._settings, self._wheels
+        if not settings.enable:
+            return None
+        bounds = settings.bounds
+        fastest = max(bounds.linear_max, -bounds.linear_min)
+        brakes = max(fastest / bounds.linear_braking, bounds.angular_max / bounds.angular_braking)
+        power = Power(brakes + 2 * settings.period_s + settings.patience_s, settings.enable_after_s)
+        if settings.enable[0] == "topic" and isinstance(wheels, WriterWheels):
+            return Enable(lambda: WriterLine(wheels), power)
+        return Enable(lambda: open_line(settings.enable), power)
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Guard until told to end; the wheels stand at the end."""
@@ -198,6 +212,19 @@ class Guard:
             sentence = f"the wheels cannot be told anything: {error.strerror or error}"
             self._troubles["wheels"] = sentence
             self._trouble("wheels", "wheels", sentence, now)
+        if self._enable is not None:
+            self._toggle(self._enable, now, well=not wrong and not self._latch.reason and not self._ends)
+
+    def _toggle(self, enable: Enable, now: float, *, well: bool) -> None:
+        """Let the enable signal change, as long as all is well and the wheels are told what they are to do."""
+        told = self._watch.told
+        known = 0 <= now - told.at <= self._settings.patience_s and "wheels" not in self._troubles
+        enable.turn(now, well=well, told=known, stands=told.velocity == STANDSTILL)
+        if enable.trouble:
+            self._troubles["enable"] = enable.trouble
+            self._trouble("enable", "enable", enable.trouble, now)
+        else:
+            self._troubles.pop("enable", None)
 
     def _answer_gate(self, now: float) -> None:
         latch = self._latch
@@ -314,6 +341,7 @@ class Guard:
             "gate_restarts": self._restarts.get("gate", 0),
             "writer_restarts": self._restarts.get("writer", 0),
             "seconds": round(self._clock() - self._started, 1),
+            "enabled": None if self._enable is None else self._enable.on,
             "not_permitted": list(self._refused),
             "troubles": list(self._troubles.values()),
         }

@@ -23,6 +23,7 @@ _BEAT = struct.Struct("<4sddddddIB")
 _ANSWER = struct.Struct("<4sddddIB")
 _TWIST = struct.Struct("<4s6d")
 _BEAT_MAGIC, _ANSWER_MAGIC, _NOTE_MAGIC = b"SkB2", b"SkA2", b"SkN2"
+_ENABLE = (b"SkE2\x00", b"SkE2\x01")
 _LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
 _TAKE, _KEPT = 1, 2
 
@@ -107,6 +108,16 @@ def pack_note(text: str) -> bytes:
 def unpack_note(data: bytes) -> str | None:
     """None: the bytes are none."""
     return _text(data[4 : 4 + NOTE_BYTES]) if data[:4] == _NOTE_MAGIC else None
+
+
+def pack_enable(*, high: bool) -> bytes:
+    """A level of the enable signal, for the writer."""
+    return _ENABLE[high]
+
+
+def unpack_enable(data: bytes) -> bool | None:
+    """None: the bytes are none."""
+    return _ENABLE.index(data) == 1 if data in _ENABLE else None
 
 
 def pack_twist(velocity: Velocity) -> bytes:

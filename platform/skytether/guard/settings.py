@@ -36,6 +36,10 @@ class Settings(NamedTuple):
     """The writer's command; empty: there is none."""
     config: int
     """File descriptor of the configuration of gate and writer."""
+    enable: tuple[str, ...] = ()
+    """Line of the enable signal, see `enable.open_line`; ``topic``: the writer publishes it; empty: there is none."""
+    enable_after_s: float = 0.0
+    """From the standstill that is told to the end of the enable signal [s]."""
     say: tuple[str, ...] = ()
     """What the command that checked the configuration has to say; by the log, which is never waited for."""
 
@@ -63,6 +67,8 @@ def load(text: str) -> Settings:
         gate=tuple(found["gate"]),
         writer=tuple(found["writer"]),
         config=int(found["config"]),
+        enable=tuple(found["enable"]),
+        enable_after_s=float(found["enable_after_s"]),
         say=tuple(found["say"]),
     )
 

@@ -107,9 +107,15 @@ class WriterWheels:
         return newest.told
 
 
+def family_of(address: Address) -> socket.AddressFamily:
+    """The kind of socket that an address needs."""
+    if isinstance(address, str):
+        return socket.AF_UNIX
+    return socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+
+
 def _connected(address: Address) -> socket.socket:
-    family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    made = socket.socket(family, socket.SOCK_DGRAM)
+    made = socket.socket(family_of(address), socket.SOCK_DGRAM)
     made.setblocking(False)
     try:
         made.connect(address)

@@ -7,7 +7,8 @@ import yaml
 from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
 from skytether.messages import Joy, LaserScan, Range
-from skytether.robot.safety.config import SafetyConfig, address, default_folder
+from skytether.robot.safety.address import address
+from skytether.robot.safety.config import SafetyConfig, default_folder
 from skytether.robot.safety.coverage import Action
 
 LEAST = {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}}
@@ -208,3 +209,32 @@ def test_the_usual_folder_is_the_users_own(monkeypatch):
     assert default_folder() == Path("/run/user/1000/skytether")
     monkeypatch.setattr("os.geteuid", lambda: 0)
     assert default_folder() == Path("/run/skytether")
+
+
+@pytest.mark.parametrize(
+    ("enable", "words"),
+    [
+        ({"file": "/sys/class/gpio/gpio17/value"}, ("file", "/sys/class/gpio/gpio17/value")),
+        ({"chip": "/dev/gpiochip0", "line": 17}, ("gpio", "/dev/gpiochip0", "17")),
+        ({"socket": "unix:/run/power"}, ("unix", "/run/power")),
+        ({"socket": "udp:127.0.0.1:900"}, ("udp", "127.0.0.1", "900")),
+    ],
+)
+def test_an_enable_signal_has_one_line(load, enable, words):
+    assert load({"footprint": {"radius": 0.3}, "sensors": {}, "enable": enable}).enable.words() == words
+
+
+@pytest.mark.parametrize(
+    ("enable", "says"),
+    [
+        ({}, "give one of file"),
+        ({"file": "/a", "socket": "unix:/b"}, "give one of file"),
+        ({"chip": "/dev/gpiochip0"}, "chip and line go together"),
+        ({"topic": "on"}, "enable.topic needs ros1 or ros2"),
+        ({"socket": "power"}, "must be unix:PATH"),
+        ({"file": "/a", "after_s": 60}, "enable.after_s must be 0 to 3 s"),
+    ],
+)
+def test_an_enable_signal_that_is_none_is_refused(load, enable, says):
+    with pytest.raises(ConfigError, match=says):
+        load({"footprint": {"radius": 0.3}, "sensors": {}, "enable": enable})

@@ -10,13 +10,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from skytether.messages import Bool, Joy, LaserScan, Message, Twist, decode, encode
+from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, decode, encode
 from skytether.robot.safety.client import GateError, ask
 
 pytestmark = pytest.mark.slow
@@ -28,6 +29,16 @@ CONFIG = {
     "sensors": {"scan": {"max_age_s": 1.0}},
     "joystick": {"deadman": 0, "linear_axis": 0, "angular_axis": 1, "max_age_s": 1.0},
     "estop": {"max_age_s": 2.0},
+    # Wide, for a busy machine: what is told and what is measured may be seconds apart.
+    "odometry": {
+        "type": "geometry_msgs/msg/Twist",
+        "latency_s": 0.5,
+        "lag_s": 0.5,
+        "confirm_s": 1.0,
+        "blocked_s": 1.0,
+        "max_age_s": 1.0,
+        "on_unknown": "free",
+    },
     "guard_s": 0.5,
     "limits": {"max_gap_s": 0.5},
 }
@@ -40,17 +51,23 @@ class Robot:
         self.folder = folder
         self.wall = 5.0
         self.pad: Joy | None = None
+        self.blocked = False
         self.told: list[tuple[float, float]] = []
         self._log = log
         self._ended = threading.Event()
         self._wheels = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._wheels.bind(str(folder / "wheels.sock"))
         self._wheels.settimeout(0.2)
-        self._threads = [threading.Thread(target=target) for target in (self._turn, self._sense)]
+        self.edges: list[float] = []
+        self._power = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._power.bind(str(folder / "power.sock"))
+        self._power.settimeout(0.2)
+        self._threads = [threading.Thread(target=target) for target in (self._turn, self._sense, self._switch)]
         for thread in self._threads:
             thread.start()
         config = folder.parent / "robot.yaml"
-        config.write_text(yaml.safe_dump({"safety": CONFIG | {"folder": str(folder)}}))
+        enable = {"socket": f"unix:{folder}/power.sock", "after_s": 0.1}
+        config.write_text(yaml.safe_dump({"safety": CONFIG | {"folder": str(folder), "enable": enable}}))
         with log.open("ab") as output:
             self.guard = subprocess.Popen(
                 [sys.executable, "-m", "skytether.cli", "robot", "gate", str(config)], stdout=output, stderr=output
@@ -113,6 +130,22 @@ class Robot:
         for thread in self._threads:
             thread.join()
         self._wheels.close()
+        self._power.close()
+
+    def powered(self) -> None:
+        """The enable signal changes, again and again."""
+        before = len(self.edges)
+        wait(lambda: len(self.edges) > before + 10, "the enable signal changes", self)
+
+    def cut(self) -> None:
+        """The enable signal is still for longer than any relay waits for it."""
+
+        def still() -> bool:
+            before = len(self.edges)
+            time.sleep(0.5)
+            return len(self.edges) == before
+
+        wait(still, "the enable signal is still", self)
 
     def _newest(self) -> tuple[float, float]:
         return self.told[-1] if self.told else (0.0, 0.0)
@@ -125,12 +158,25 @@ class Robot:
                 continue
             self.told.append((twist.linear.x, twist.angular.z))
 
+    def _switch(self) -> None:
+        level = None
+        while not self._ended.is_set():
+            try:
+                high = decode(Bool, self._power.recv(64)).data
+            except TimeoutError:
+                continue
+            if high is not level:
+                level = high
+                self.edges.append(time.monotonic())
+
     def _sense(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
             link.settimeout(0.2)
             while not self._ended.wait(0.04):
                 self._send(link, "scan", self._scan())
                 self._send(link, "estop", Bool(), "estop.sock")
+                linear, angular = (0.0, 0.0) if self.blocked else self._newest()
+                self._send(link, "odom", Twist(linear=Vector3(x=linear), angular=Vector3(z=angular)))
                 if self.pad is not None:
                     self._send(link, "joy", self.pad)
 
@@ -309,6 +355,44 @@ def test_people_and_things_in_the_way(robot):
     robot.drives()
     for name in ("control.sock", "command.sock", "sensors.sock", "stop.sock"):
         assert (robot.folder / name).stat().st_mode & 0o007 == 0  # closed to other users
+
+
+def test_wheels_that_are_blocked_stop_the_robot_until_a_reset(robot):
+    robot.drives()
+    robot.blocked = True
+    robot.stands()
+    assert "the wheels do not move" in robot.status()["stopped"]
+    robot.blocked = False
+    robot.stands()
+    ask(robot.folder, {"do": "reset"}, PATIENCE_S)
+    robot.start()
+    robot.drives()
+
+
+def test_the_enable_signal_takes_power_away(robot):
+    robot.drives()
+    robot.powered()
+    assert robot.status()["guard"]["enabled"] is True
+    ask(robot.folder, {"do": "stop"}, PATIENCE_S)
+    robot.stands()
+    robot.cut()
+    ask(robot.folder, {"do": "reset"}, PATIENCE_S)
+    robot.powered()
+    robot.start()
+    robot.drives()
+    os.kill(gate_pid(robot), signal.SIGKILL)
+    stopped = time.monotonic()
+    robot.powered()  # when there is another gate
+    edges = [at for at in robot.edges if at > stopped]
+    assert max(later - earlier for earlier, later in pairwise(edges)) > 0.5  # and not before
+    robot.start()
+    robot.drives()
+    robot.guard.send_signal(signal.SIGSTOP)
+    robot.cut()
+    robot.guard.send_signal(signal.SIGCONT)
+    robot.powered()
+    robot.guard.kill()
+    robot.cut()
 
 
 def _alive(pid: int) -> bool:

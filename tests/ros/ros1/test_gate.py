@@ -2,6 +2,7 @@
 
 import subprocess
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ import yaml
 from gate_robot import release
 from ros1_graph import wait_for
 
-from skytether.messages import Joy, LaserScan, encode, type_hash
+from skytether.messages import Bool, Joy, LaserScan, decode, encode, type_hash
 from skytether.robot.safety.client import GateError, ask
+from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
 
@@ -25,6 +27,7 @@ def gated(config, tmp_path):
         "joystick": {"topic": "/joy", "deadman": 0, "max_age_s": 1.0},
         "estop": {"topic": "/estop", "max_age_s": None},
         "guard_s": 0.5,
+        "enable": {"topic": "/motors_on"},
         "folder": str(tmp_path / "gate"),
     }
     config.write_text(yaml.safe_dump(document))
@@ -48,6 +51,10 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     button = graph.start("rostopic", "pub", "-r", "5", "/estop", "std_msgs/Bool", "data: false")
     release(folder)
     drives(walker)
+    levels = []
+    listener = Listener(lambda data, _: levels.append(decode(Bool, data, "ros1").data))
+    walker.node.subscribe("/motors_on", "std_msgs/Bool", type_hash(Bool, "ros1"), listener)
+    wait_for(lambda: sum(a != b for a, b in pairwise(levels)) > 10, "the enable signal")
     assert set(graph.publishers("/cmd_vel")) == {"/skytether_guard", "/skytether_gate"}
     # The agent, and with it its bridge, is killed at full speed.
     agent.kill()
@@ -97,6 +104,10 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     # The guard itself is killed: the gate has a publisher of its own.
     guard.kill()
     stands(walker)
+    time.sleep(0.5)
+    levels.clear()
+    time.sleep(0.5)
+    assert not levels
     assert "Traceback" not in (tmp_path / "gate.log").read_text()
 
 

@@ -13,7 +13,7 @@ import yaml
 from gate_robot import release
 
 from skytether.control.admittance import Velocity
-from skytether.messages import LaserScan, TwistStamped, decode, encode, type_hash
+from skytether.messages import Bool, LaserScan, TwistStamped, decode, encode, type_hash
 from skytether.robot.safety.client import GateError, GateLink, ask
 
 pytestmark = pytest.mark.slow
@@ -38,6 +38,7 @@ def folder(stage, tmp_path):
         "sensors": {"/scan": {"max_age_s": 1.0}},
         "limits": {"max_gap_s": 0.5},
         "guard_s": 0.5,
+        "enable": {"topic": "/motors_on"},
         "folder": str(tmp_path / "gate"),
     }
     graph = {"router": stage.router.address, "domain": stage.domain, "namespace": "/", "cmd_vel_type": STAMPED}
@@ -55,6 +56,7 @@ def folder(stage, tmp_path):
 def test_the_wheels_of_a_ros_2_robot_are_behind_the_gate(stage, folder):
     base = stage.rmw("base")
     wheels = base.subscribe("/cmd_vel", DDS_STAMPED, type_hash(TwistStamped, "cdr"))
+    power = base.subscribe("/motors_on", "std_msgs::msg::dds_::Bool_", type_hash(Bool, "cdr"))
     laser = base.publisher("/scan", DDS_SCAN, type_hash(LaserScan, "cdr"))
     link, ended = GateLink(folder), threading.Event()
 
@@ -76,8 +78,9 @@ def test_the_wheels_of_a_ros_2_robot_are_behind_the_gate(stage, folder):
             return 0
 
     def start():
-        """A person lets the agent go on with what it wants."""
+        """A person resets, and lets the agent go on with what it wants."""
         try:
+            ask(folder, {"do": "reset"}, 30)
             return ask(folder, {"do": "start"}, 30)["started"]
         except GateError:
             return []
@@ -88,6 +91,7 @@ def test_the_wheels_of_a_ros_2_robot_are_behind_the_gate(stage, folder):
         release(folder)
         stage.until(start, "the gate does not let the agent drive")
         stage.until(lambda: speed() is not None and speed() > 0.15, "the agent does not drive")
+        stage.until(lambda: len({bytes(data) for data in power.payloads[-10:]}) == 2, "no enable signal")
         assert decode(TwistStamped, wheels.payloads[-1]).header.frame_id == "base_link"
         first = stage.until(gate, "the gate does not answer")
         os.kill(first, signal.SIGKILL)

@@ -87,6 +87,7 @@ BOUNDS: tuple[Bound, ...] = (
     Bound("odometry.confirm_s", 0.05, 1, "s", "a runaway is found so much later"),
     Bound("odometry.blocked_s", 0.2, 10, "s", "a blocked motor burns"),
     Bound("odometry.max_age_s", 0.02, 1, "s", "the real motion is not known for so long"),
+    Bound("enable.after_s", 0, 3, "s", "power goes so late after a stop"),
     Bound("rate_hz", 10, 500, "Hz", "slower it reacts late, faster Python does not turn"),
     Bound("guard_s", 0.02, 0.5, "s", "the wheels go on as they were told for so long when the gate hangs"),
 )

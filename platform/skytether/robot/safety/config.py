@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import socket
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,9 +17,11 @@ from skytether.messages import Bool, Message
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name, resolve
 
+from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Metres, Numbers, Topic
 from .contact import ContactParams, feels
+from .enable_config import EnableConfig
 from .footprint import Footprint, circle, polygon
 from .inbox import IsStop, Topics
 from .odometry_config import OdometryConfig, odometry_kind
@@ -129,6 +130,8 @@ class SafetyConfig(SourcesConfig):
     """Bumpers and cliff sensors, by topic."""
     odometry: OdometryConfig | None = None
     """What the wheels really do; null: nobody looks."""
+    enable: EnableConfig | None = None
+    """An output that takes power away; null: there is none."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
@@ -162,6 +165,8 @@ class SafetyConfig(SourcesConfig):
             raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
         for name in self.kinds() if self.ros1 or self.ros2 else ():
             check_name(name, 1 if self.ros1 else 2)
+        if self.enable is not None and self.enable.topic and not (self.ros1 or self.ros2):
+            raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
         topics = [*self.sensors, *(topic for topic, _ in self._other_kinds())]
         for topic in topics:
             if topics.count(topic) > 1:
@@ -289,32 +294,3 @@ NO_GATE = "none"
 """What is written instead of the section where there is to be no gate."""
 WITHOUT_SECTION: dict[str, Any] = {"footprint": {"radius": 0.3}, "sensors": {}, "unseen": {"action": "free"}}
 """The gate of a robot.yaml that has no such section: limits and silence only. Without sensors no outline counts."""
-
-
-def address(text: str) -> str | tuple[str, int]:
-    """A socket's address: a path, or host and port.
-
-    Raises:
-        ValueError: It is neither.
-    """
-    kind, _, rest = text.partition(":")
-    if kind == "unix" and rest:
-        if len(os.fsencode(rest)) > 100:
-            raise ValueError(f"'{text}' is longer than the 100 bytes that a socket's path may have")
-        return rest
-    host, _, port = rest.rpartition(":")
-    if kind == "udp" and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536:
-        return host.strip("[]"), int(port)
-    raise ValueError(f"must be unix:PATH or udp:HOST:PORT, not '{text}'")
-
-
-def numeric(where: str | tuple[str, int]) -> str | tuple[str, int]:
-    """The same with the address of a host instead of its name: who writes to it must not wait for a name server.
-
-    Raises:
-        OSError: The name is not known.
-    """
-    if isinstance(where, str):
-        return where
-    found = socket.getaddrinfo(*where, type=socket.SOCK_DGRAM)[0][4]
-    return str(found[0]), where[1]

@@ -39,6 +39,14 @@ class Wheels(Protocol):
         """
         ...
 
+    def enable(self, level: bool) -> None:
+        """Publish a level of the enable signal, where that is a topic.
+
+        Raises:
+            OSError: It did not get there.
+        """
+        ...
+
     def listeners(self) -> frozenset[str] | None:
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
@@ -80,6 +88,9 @@ class SocketWheels:
     def write(self, velocity: Velocity) -> None:
         """Wheels: send it."""
         self._wheels.write(velocity, Told(), 0.0)
+
+    def enable(self, level: bool) -> None:
+        """Wheels: the guard has a line of its own for that."""
 
     def listeners(self) -> frozenset[str] | None:
         """Wheels: not known."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from skytether.control.admittance import Velocity
-from skytether.messages import Message, Twist, Vector3, encode, hash_of
+from skytether.messages import Bool, Message, Twist, Vector3, encode, hash_of
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
@@ -24,20 +24,30 @@ class Ros1Wheels:
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
+        enable_topic: Of the enable signal, std_msgs/Bool; empty: there is none.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros1Way, role: str) -> None:
+    def __init__(self, way: Ros1Way, role: str, enable_topic: str = "") -> None:
         self._node = _start(way, role)
         topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+        self._enable = None
+        if enable_topic:
+            name = resolve(enable_topic, way.namespace)
+            self._enable = self._node.advertise(name, Bool.TYPE, hash_of(Bool.TYPE, "ros1"), queue=1)
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
         twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
         self._publication.publish(encode(twist, "ros1"))
+
+    def enable(self, level: bool) -> None:
+        """Wheels: publish it."""
+        if self._enable is not None:
+            self._enable.publish(encode(Bool(data=level), "ros1"))
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""

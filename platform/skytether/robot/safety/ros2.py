@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from skytether.control.admittance import Velocity
-from skytether.messages import Header, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
+from skytether.messages import Bool, Header, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
 from skytether.ros.ros2.node import Ros2Error, Ros2Node
@@ -26,16 +26,21 @@ class Ros2Wheels:
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
+        enable_topic: Of the enable signal, std_msgs/msg/Bool; empty: there is none.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros2Way, role: str) -> None:
+    def __init__(self, way: Ros2Way, role: str, enable_topic: str = "") -> None:
         self._way = way
         self._node = _start(way, role)
         self._topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type))
+        self._enable = None
+        if enable_topic:
+            name = resolve(enable_topic, way.namespace)
+            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE))
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
@@ -45,6 +50,11 @@ class Ros2Wheels:
             self._publication.put(encode(TwistStamped(header, twist)))
         else:
             self._publication.put(encode(twist))
+
+    def enable(self, level: bool) -> None:
+        """Wheels: publish it."""
+        if self._enable is not None:
+            self._enable.put(encode(Bool(data=level)))
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""

@@ -8,7 +8,8 @@ from typing import NoReturn
 
 from skytether.guard.settings import Settings, dump, freeze
 
-from .config import SafetyConfig, SocketsConfig, address
+from .address import address
+from .config import SafetyConfig, SocketsConfig
 from .protocol import WHEELS_SOCKET
 from .ways import estop_address
 
@@ -52,5 +53,7 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
         gate=(*_PYTHON, "-m", "skytether.robot.safety.gate"),
         writer=(*_PYTHON, "-m", "skytether.robot.safety.writer") if on_graph else (),
         config=file,
+        enable=() if config.enable is None else config.enable.words(),
+        enable_after_s=0.0 if config.enable is None else config.enable.after_s,
         say=tuple(say),
     )

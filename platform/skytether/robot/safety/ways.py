@@ -6,7 +6,8 @@ import socket
 from collections.abc import Callable
 from typing import Literal
 
-from .config import SafetyConfig, SocketsConfig, address
+from .address import address
+from .config import SafetyConfig, SocketsConfig
 from .hardware import Address, Sensors, SocketSensors, SocketWheels, Wheels
 from .protocol import ESTOP_SOCKET, SENSORS_SOCKET, WHEELS_SOCKET
 
@@ -47,14 +48,15 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
     Raises:
         OSError: It cannot be had.
     """
+    enable = config.enable.topic if config.enable is not None and role == "guard" else None
     if config.ros1 is not None:
         from .ros1 import Ros1Wheels
 
-        return Ros1Wheels(config.ros1, role)
+        return Ros1Wheels(config.ros1, role, enable or "")
     if config.ros2 is not None:
         from .ros2 import Ros2Wheels
 
-        return Ros2Wheels(config.ros2, role)
+        return Ros2Wheels(config.ros2, role, enable or "")
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 

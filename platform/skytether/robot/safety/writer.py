@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 from skytether.guard import privileges
 from skytether.guard.clock import now as boottime
-from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat
+from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat, unpack_enable
 from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
@@ -100,9 +100,18 @@ class Writer:
                 self._watch.forget()
                 break
             newest = unpack_beat(data) or newest
+            level = unpack_enable(data)
+            if level is not None:
+                self._enable(level)
         if newest is not None:
             self._watch.hear(newest)
         return newest is not None
+
+    def _enable(self, level: bool) -> None:
+        try:
+            self._wheels.enable(level)
+        except Exception as error:  # then the signal does not change, and the power goes
+            self._notices.say("enable", f"the enable signal cannot be published: {error}", self._clock())
 
     def _tell(self, now: float) -> None:
         listeners = self._wheels.listeners()
