@@ -11,6 +11,7 @@ from skytether import __version__
 from . import (
     apply,
     bridge,
+    commission,
     demo,
     doctor,
     echo,
@@ -53,6 +54,7 @@ resources.robot_app.command("safety-log")(gate.safety_log)
 resources.robot_app.command("stop")(gate.stop)
 resources.robot_app.command("reset")(gate.reset)
 resources.robot_app.command("start")(gate.start)
+resources.robot_app.command("commission")(commission.commission)
 app.add_typer(lab.app, name="lab")
 
 

@@ -149,7 +149,7 @@ class Motion:
         Returns:
             What is wrong with it; empty: nothing.
         """
-        twist, stamp = _twist(message)
+        twist, stamp = twist_of(message), _stamp(message)
         if twist is None:
             return f"a {message.TYPE} is no odometry"
         if any(stamp) and stamp == self._stamp:
@@ -214,14 +214,19 @@ class Motion:
         return Fault.BRAKING if abs(newest) < fastest < abs(value) else Fault.RUNAWAY
 
 
-def _twist(message: Message) -> tuple[Twist | None, tuple[int, int]]:
-    if isinstance(message, Twist):
-        return message, (0, 0)
+def twist_of(message: Message) -> Twist | None:
+    """The velocity that a reading holds; None: it is no odometry."""
     if isinstance(message, Odometry):
-        return message.twist.twist, (message.header.stamp.sec, message.header.stamp.nanosec)
+        return message.twist.twist
     if isinstance(message, TwistStamped):
-        return message.twist, (message.header.stamp.sec, message.header.stamp.nanosec)
-    return None, (0, 0)
+        return message.twist
+    return message if isinstance(message, Twist) else None
+
+
+def _stamp(message: Message) -> tuple[int, int]:
+    if isinstance(message, Odometry | TwistStamped):
+        return message.header.stamp.sec, message.header.stamp.nanosec
+    return 0, 0
 
 
 _SAYS: Mapping[Fault, str] = {
