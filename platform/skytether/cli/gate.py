@@ -77,6 +77,9 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
     print(f"ahead     {answer['zone']}: {way}")
     print(f"stopped   {answer['stopped'] or 'no'}")
+    enabled = (answer.get("guard") or {}).get("enabled")
+    if enabled is not None:
+        print(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
     for source, why in answer["waiting"].items():
         print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["beyond"]:

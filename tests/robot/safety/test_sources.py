@@ -333,7 +333,9 @@ def test_a_source_that_sends_one_stamp_again_and_again_is_silent():
     assert "sends the same command again" in bench.last.troubles["key_vel:message"]
 
 
-@pytest.mark.parametrize("bad", [twist(float("nan")), twist(0.1, inf), Bool(data=True), joy(1.0)])
+@pytest.mark.parametrize(
+    "bad", [twist(float("nan")), twist(0.1, inf), Bool(data=True), joy(1.0), Twist(linear=Vector3(y=0.2))]
+)
 def test_a_command_that_is_none_is_named_and_not_followed(bad):
     bench = Bench()
     bench.says["nav_vel"] = bad
