@@ -92,12 +92,13 @@ class Machine:
                 self.drives.roll(now, now - last)
                 last = now
                 linear, angular = self.drives.shown
-                self._send(link, "odom", encode(Twist(linear=Vector3(x=linear), angular=Vector3(z=angular))))
-                self._send(link, "estop", encode(Bool(data=self.button)))
+                odom = encode(Twist(linear=Vector3(x=linear), angular=Vector3(z=angular)))
+                self._send(link, "sensors.sock", "odom", odom)
+                self._send(link, "estop.sock", "estop", encode(Bool(data=self.button)))
 
-    def _send(self, link: socket.socket, topic: str, data: bytes) -> None:
+    def _send(self, link: socket.socket, where: str, topic: str, data: bytes) -> None:
         try:
-            link.sendto(topic.encode() + b"\0" + data, str(self.folder / "sensors.sock"))
+            link.sendto(topic.encode() + b"\0" + data, str(self.folder / where))
         except OSError:  # nobody listens yet, or takes it
             return
 

@@ -36,13 +36,14 @@ class Hardware:
 
     def __init__(self) -> None:
         self.told: list[Velocity] = []
+        self.more: list[tuple[str, Message]] = []
 
     def stops(self) -> list[tuple[str, Message]]:
         """There is no button."""
         return []
 
     def read(self) -> list[tuple[str, Message]]:
-        return [("scan", SCAN)]
+        return [("scan", SCAN), *self.more]
 
     def write(self, velocity: Velocity) -> None:
         self.told.append(velocity)
@@ -65,7 +66,13 @@ class Bench:
             end.setblocking(False)
         self._theirs = theirs
         config = SafetyConfig.model_validate(
-            {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}, "folder": str(folder), "rate_hz": 100}
+            {
+                "footprint": {"radius": 0.3},
+                "sensors": {"scan": {}},
+                "joystick": {"deadman": 0},
+                "folder": str(folder),
+                "rate_hz": 100,
+            }
         )
         self.loop = GateLoop(config, theirs, self.hardware, self.hardware, clock=lambda: self.now)
         self.link = GateLink(folder, clock=lambda: self.now)
@@ -118,6 +125,23 @@ def bench(tmp_path):
     bench = Bench(tmp_path)
     yield bench
     bench.close()
+
+
+def test_a_reset_ends_a_lost_joystick_on_a_robot_that_is_not_stopped(bench):
+    for held, turns in ((False, 30), (True, 10)):
+        pad = Joy(axes=np.zeros(2, dtype=np.float32), buttons=np.array([held], dtype=np.int32))
+        bench.hardware.more = [("joy", pad)]
+        for _ in range(turns):
+            bench.turn()
+    bench.hardware.more = []
+    for _ in range(50):
+        bench.turn()
+    assert any("fell silent" in sentence for sentence in bench.ask(do="status")["troubles"])
+    bench.ask(do="reset")
+    bench.turn()
+    status = bench.ask(do="status")
+    assert not any("fell silent" in sentence for sentence in status["troubles"])
+    assert status["waiting"] == {"agent": "the reset"}
 
 
 def test_what_the_agent_wants_goes_to_the_guard(bench):

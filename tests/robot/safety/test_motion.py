@@ -125,6 +125,32 @@ def test_a_gap_counts_as_standstill_and_as_what_was_told():
     assert bench.faults == []
 
 
+def test_a_reading_that_comes_first_after_a_long_pause_is_not_judged():
+    bench = Bench(Wheels(noise=0.0))
+    bench.drive(Velocity(0.4, 0.0), 3.0)
+    for pause in (5.0, 1e6, math.inf, math.nan):
+        assert bench.motion.measure(odometry(0.0, 0.0, 5.0 + bench.turns), bench.now + pause) == ""
+        bench.turns += 1
+    assert bench.motion.look(bench.now).fault is None
+
+
+wild = st.one_of(st.floats(), st.sampled_from([0.0, 0.02, 0.2, math.nan, math.inf, -math.inf, 1e308]))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(["told", "measure", "look"]), wild, wild, wild), max_size=60))
+def test_whatever_comes_and_whatever_the_clock_does_nothing_is_raised(events):
+    motion, now = Motion(PARAMS, LIMITS, 0.1), 10.0
+    for k, (what, first, second, dt) in enumerate(events):
+        now = now + dt if math.isfinite(now) else 10.0
+        if what == "told":
+            motion.told(Velocity(0.2, 0.0) if k % 2 else STANDSTILL, now)
+        elif what == "measure":
+            motion.measure(odometry(first, second, float(k)), now)
+        else:
+            motion.look(now)
+
+
 def test_one_reading_outside_is_no_fault():
     bench = Bench(Wheels(noise=0.0))
     bench.drive(STANDSTILL, 2.0)

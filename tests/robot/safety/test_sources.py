@@ -1,7 +1,7 @@
 """Who drives, with made-up time: sequences of presses, losses, resets, locks and commands, against plain oracles."""
 
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import inf, nan
 
 import numpy as np
 import pytest
@@ -221,6 +221,14 @@ def test_a_source_is_neutral_when_it_wanted_nothing_else_for_long_enough(wants):
         since = None if abs(value) > 0.001 else (now if since is None else since)
         state = neutral.want(state, Velocity(value, 0.0), now)
         assert (not state.why) is free
+
+
+@pytest.mark.parametrize("now", [inf, -inf, nan])
+def test_a_clock_that_is_no_number_makes_nobody_neutral(now):
+    state = neutral.want(neutral.require("a reset"), STANDSTILL, 10.0)
+    assert neutral.look(state, now).why
+    up, _ = joystick.hear(PAD, Joystick(), joy(0.0, 0.0, held=False), 10.0)
+    assert joystick.hear(PAD, up, joy(1.0, 0.0), now)[0].grip is not Grip.HELD
 
 
 def test_a_gate_that_was_started_lets_nobody_go_on_with_what_was_before():

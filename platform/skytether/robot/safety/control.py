@@ -107,6 +107,7 @@ class Control:
             return {"refused": refused}
         answer = self._heartbeat.answer
         if not self._gate.stopped and answer is not None and not answer.stopped:
+            self._gate.reset(now)  # a joystick that was lost, and what sensors have learnt
             return self._status()
         self.resets, self._reset_until = True, now + _RESET_S
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import isfinite, nan
+from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Joy
@@ -103,7 +103,7 @@ def hear(params: JoystickParams, before: Joystick, message: Joy, now: float) -> 
     if not message.buttons[params.deadman]:
         heard = heard if before.up_since <= now else replace(heard, up_since=now)
         return replace(heard, grip=Grip.OFF, lost=""), ""
-    seen_released = before.seen_released or now - before.up_since >= RELEASED_S
+    seen_released = before.seen_released or RELEASED_S <= now - before.up_since < inf
     heard = replace(heard, up_since=nan, seen_released=seen_released)
     if before.grip is Grip.LOST or not seen_released:
         return replace(heard, grip=before.grip if before.grip is Grip.LOST else Grip.UNSURE), ""

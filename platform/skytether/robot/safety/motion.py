@@ -178,6 +178,9 @@ class Motion:
         if not self._told or self._told[0].since > begin:  # what was told before is not known
             return
         pieces = [piece.velocity for piece in self._told if piece.until >= begin]
+        if not pieces:  # this process stood still for longer than readings show
+            self._since.clear()
+            return
         stands = all(velocity == STANDSTILL for velocity in pieces)
         found: dict[bool, tuple[Fault, str]] = {}
         for axis, (verb, unit) in enumerate((("drives", "m/s"), ("turns", "rad/s"))):

@@ -7,7 +7,7 @@ after a standstill does, for somebody decided on it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import nan
+from math import inf, nan
 
 from skytether.control.admittance import Velocity
 
@@ -48,4 +48,4 @@ def want(before: Neutral, velocity: Velocity, now: float) -> Neutral:
 
 def look(before: Neutral, now: float) -> Neutral:
     """Whether it may drive by now. One that wanted a standstill and then fell silent wants it still."""
-    return Neutral() if before.why and now - before.still_since >= NEUTRAL_S else before
+    return Neutral() if before.why and NEUTRAL_S <= now - before.still_since < inf else before

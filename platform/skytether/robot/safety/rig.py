@@ -121,7 +121,7 @@ class HardwareRig:
     def _read(self) -> None:
         if self._sensors is None:
             return
-        for topic, message in self._sensors.read():
+        for topic, message in (*self._sensors.stops(), *self._sensors.read()):
             now = self.now()
             if topic == self._odometry.topic:
                 twist = twist_of(message)
