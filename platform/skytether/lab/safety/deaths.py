@@ -76,8 +76,8 @@ def _alone(role: str) -> Callable[[Promised], float]:
 
 def _two(first: str, second: str) -> Callable[[Promised], float]:
     if {first, second} & {"agent", "writer"}:  # somebody is left who can speak to the wheels
-        return lambda promised: _NEXT_S + promised.partner
-    return lambda promised: _NEXT_S + promised.silence
+        return lambda promised: promised.partner
+    return lambda promised: promised.silence
 
 
 def killed(role: str) -> Run:
@@ -98,7 +98,7 @@ def killed(role: str) -> Run:
 def _thrice(stage: Stage) -> None:
     for _ in range(_TOO_OFTEN - 1):
         stage.robot.another_gate(stage.robot.signal("gate", signal.SIGKILL))
-        stage.robot.start()
+        stage.robot.go()
     victim = stage.robot.pid("gate")
     with stage.stands(stage.promised.partner, "the gate was killed three times; nobody has reset the robot"):
         stage.robot.kill(victim)
@@ -131,9 +131,9 @@ def both_killed(first: str, second: str) -> Run:
 
     def run(stage: Stage) -> None:
         one, victim = stage.robot.pid(first), stage.robot.pid(second)
+        stage.robot.kill(one)
+        stage.sleep(_NEXT_S)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were killed"):
-            stage.robot.kill(one)
-            stage.sleep(_NEXT_S)
             stage.robot.kill(victim)
             stage.sleep(_WATCH_S)
 
@@ -143,9 +143,9 @@ def both_killed(first: str, second: str) -> Run:
 def _both_frozen(first: str, second: str) -> Run:
     def run(stage: Stage) -> None:
         one, other = stage.robot.pid(first), stage.robot.pid(second)
+        stage.robot.kill(one, signal.SIGSTOP)
+        stage.sleep(_NEXT_S)
         with stage.stands(_two(first, second)(stage.promised), f"{first} and {second} were frozen"):
-            stage.robot.kill(one, signal.SIGSTOP)
-            stage.sleep(_NEXT_S)
             stage.robot.kill(other, signal.SIGSTOP)
             stage.sleep(1.0 - _NEXT_S)
         stage.robot.kill(one, signal.SIGCONT)
@@ -159,9 +159,9 @@ def _both_frozen(first: str, second: str) -> Run:
 def _frozen_and_killed(first: str, second: str) -> Run:
     def run(stage: Stage) -> None:
         frozen, victim = stage.robot.pid(first), stage.robot.pid(second)
+        stage.robot.kill(frozen, signal.SIGSTOP)
+        stage.sleep(_NEXT_S)
         with stage.stands(_two(first, second)(stage.promised), f"the {first} was frozen and the {second} killed"):
-            stage.robot.kill(frozen, signal.SIGSTOP)
-            stage.sleep(_NEXT_S)
             stage.robot.kill(victim)
             stage.sleep(1.0 - _NEXT_S)
             stage.robot.kill(frozen, signal.SIGCONT)

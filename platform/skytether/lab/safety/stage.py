@@ -67,8 +67,12 @@ class Promised:
 
 
 def wheels_of(config: SafetyConfig) -> Wheels:
-    """What holds always for the wheels of a configuration."""
-    return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=1 / config.rate_hz)
+    """What holds always for the wheels of a configuration.
+
+    On a graph two periods of tolerance: the time is that of the receipt, and the writer has turns of its own.
+    """
+    periods = 1 if config.ros1 is None else 2
+    return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=periods / config.rate_hz)
 
 
 class Stage:

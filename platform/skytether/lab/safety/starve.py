@@ -23,6 +23,8 @@ from .stage import Stage
 _FLOOD_S = 2.0
 _ACKNOWLEDGED_S = 0.5
 _MANY_CLIENTS = 300
+_MORE_FILES = 64
+"""Than are open: many times what guard and gate need, far fewer than there are clients."""
 _LITTLE_MEMORY = 4 * 1024 * 1024
 _DISK_BYTES = 256 * 1024
 _PAGE = 4096
@@ -115,7 +117,7 @@ def _cores(stage: Stage) -> None:
 def _clients(stage: Stage) -> None:
     with ExitStack() as undo:
         for role in ("guard", "gate"):
-            undo.enter_context(_descriptors_limited(stage.robot.pid(role), 16))
+            undo.enter_context(_descriptors_limited(stage.robot.pid(role), _MORE_FILES))
         for path in (stage.robot.folder / "control.sock", stage.robot.folder / "stop.sock"):
             for _ in range(_MANY_CLIENTS if path.exists() else 0):
                 client = undo.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
