@@ -1,5 +1,6 @@
 import logging
 import re
+from dataclasses import replace
 from itertools import count, pairwise
 from math import nan
 
@@ -167,6 +168,24 @@ def test_nonsense_from_the_cloud_is_counted_and_not_followed(driven, nan_twist):
     assert status.errors == {"decode": 1}
     assert status.objections["not_finite"] == 1
     assert status.source is Source.FALLBACK
+
+
+SIDEWAYS = [Vector3(y=0.1), Vector3(z=-0.1)]
+TILTING = [Vector3(x=0.1), Vector3(y=-0.1)]
+
+
+@pytest.mark.parametrize(
+    "twist", [*(Twist(linear=way) for way in SIDEWAYS), *(Twist(angular=turn) for turn in TILTING)], ids=str
+)
+def test_a_command_along_an_axis_that_the_wheels_do_not_have_is_refused_and_named(driven, caplog, twist):
+    for _ in range(50):
+        driven.cloud.send_bytes(driven.now, encode(replace(twist, linear=replace(twist.linear, x=0.2))))
+        status = driven.run(TICK)
+    assert status.objections["unused_axes"] == 50
+    assert status.source is Source.FALLBACK
+    said = [message for message in caplog.messages if message.startswith("commands of cloud")]
+    axes = "linear.y, linear.z, angular.x, angular.y"
+    assert said == [f"commands of cloud: one wants to move along {axes}, and the wheels cannot; such are not followed"]
 
 
 def test_each_trouble_is_named_once_not_at_every_tick(driven, nan_twist, caplog):

@@ -63,6 +63,8 @@ def test_the_other_sources_command_is_not_followed():
     [
         ({"linear": nan}, Objection.NOT_FINITE),
         ({"angular": -inf}, Objection.NOT_FINITE),
+        ({"unused": nan}, Objection.NOT_FINITE),
+        ({"unused": 0.01}, Objection.UNUSED_AXES),
         ({"sent_at_error": inf}, Objection.CLOCK),
         ({"sent_at_error": nan}, Objection.CLOCK),
         ({"sent_at_error": -1.0}, Objection.CLOCK),

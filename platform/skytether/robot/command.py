@@ -5,6 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from skytether.messages import Twist
+
+UNUSED_AXES = "linear.y, linear.z, angular.x, angular.y"
+"""Of a Twist: what wheels that go forward and turn cannot do."""
+
 
 class Source(StrEnum):
     """Who drives."""
@@ -30,6 +35,7 @@ class Command:
         sent_at: When it was made from what was then known; of a fallback's command, when its readings were taken.
         sent_at_error: Bound of the error of ``sent_at`` [s]; inf while the peer's clock is not known.
         received_at: When it reached this robot.
+        unused: What it wants along `UNUSED_AXES`, all added up [m/s, rad/s].
     """
 
     source: str
@@ -40,3 +46,9 @@ class Command:
     sent_at: float
     sent_at_error: float
     received_at: float
+    unused: float = 0.0
+
+
+def unused_axes(twist: Twist) -> float:
+    """What a Twist wants along `UNUSED_AXES`, all added up [m/s, rad/s]; NaN if one is."""
+    return abs(twist.linear.y) + abs(twist.linear.z) + abs(twist.angular.x) + abs(twist.angular.y)

@@ -18,7 +18,7 @@ from skytether.wire.events import MessageReceived
 
 from . import arbiter, service_manager, supervisor
 from .arbiter import Choice, Link, Needs
-from .command import Command, Source
+from .command import UNUSED_AXES, Command, Source, unused_axes
 from .fallback import Fallback, Reading, Watching
 from .link import Quality
 from .notices import Notices
@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 
 _NAMED = {
     Objection.NOT_FINITE: "a velocity is NaN or infinite; such are not followed",
+    Objection.UNUSED_AXES: f"one wants to move along {UNUSED_AXES}, and the wheels cannot; such are not followed",
     Objection.SEQUENCE: "one came again, or after a newer one; such are not followed",
     Objection.STALE: "made from information that is too old; such are not followed",
     Objection.FUTURE: "sent later than now; such are not followed",
@@ -409,4 +410,5 @@ def _command(epoch: int, message: MessageReceived, encoding: Encoding) -> Comman
         sent_at=message.sent_at,
         sent_at_error=message.sent_at_error,
         received_at=message.received_at,
+        unused=unused_axes(twist),
     )

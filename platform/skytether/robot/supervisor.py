@@ -28,6 +28,8 @@ class Objection(StrEnum):
 
     NOT_FINITE = "not_finite"
     """A number of the command is NaN or infinite."""
+    UNUSED_AXES = "unused_axes"
+    """It wants to move along an axis that these wheels do not have; to follow a part of it would lead elsewhere."""
     SEQUENCE = "sequence"
     """Not newer than one that was admitted in the same or a later handshake."""
     STALE = "stale"
@@ -186,6 +188,10 @@ DEFAULT_MAX_RTT_S = 1.0
 """For services that state no need: no robot is driven by what is older."""
 
 
+_UNUSED_MOST = 1e-3
+"""A speed along an axis that the wheels do not have which is some planner's rounding [m/s, rad/s]."""
+
+
 def elapsed(limits: Limits, state: Supervised, now: float) -> float:
     """Time [s] that the step at ``now`` counts for: since the last one, or a period when the clock does not say."""
     if state.now is not None and isfinite(now) and now > state.now:
@@ -206,8 +212,10 @@ def _advance(state: Supervised, now: float) -> Supervised:
 def _objection_at_arrival(
     limits: Limits, state: Supervised, command: Command, max_age_s: float, now: float
 ) -> Objection | None:
-    if not (isfinite(command.linear) and isfinite(command.angular)):
+    if not (isfinite(command.linear) and isfinite(command.angular) and isfinite(command.unused)):
         return Objection.NOT_FINITE
+    if abs(command.unused) > _UNUSED_MOST:
+        return Objection.UNUSED_AXES
     held = state.held.get(command.source)
     if held is not None and (command.epoch, command.sequence) <= (held.epoch, held.sequence):
         return Objection.SEQUENCE

@@ -1,11 +1,14 @@
 from math import inf, nan
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import Joy
+from skytether.messages import Joy, Twist, Vector3
 from skytether.robot.safety import joystick, kinematics, latch
+from skytether.robot.safety.base import GatedBase
+from skytether.robot.safety.client import GateLink
 from skytether.robot.safety.joystick import Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams, Latch
 from skytether.robot.supervisor import Limits
@@ -130,3 +133,9 @@ def test_a_button_is_silent_when_it_is_not_heard(now, silent):
 def test_a_button_that_speaks_only_when_it_changes_is_never_silent_once_heard():
     assert latch.silent(ButtonParams(max_age_s=inf), Latch(heard_at=1.0), 1e6) is False
     assert latch.silent(ButtonParams(max_age_s=inf), Latch(), 1e6) is True
+
+
+def test_the_agents_wheels_are_not_asked_for_what_they_do_not_have(tmp_path):
+    base = GatedBase(SimpleNamespace(topics={}), GateLink(tmp_path))
+    with pytest.raises(ValueError, match=r"linear\.y, linear\.z, angular\.x, angular\.y cannot be asked"):
+        base.write(Twist(linear=Vector3(x=0.1, y=0.1)))

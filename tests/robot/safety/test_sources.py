@@ -446,3 +446,17 @@ def _in_order(bench: Bench) -> None:
     assert not bench.gate.stopped or hand == Hand.NOBODY
     if hand != Hand.NOBODY and hand != Hand.JOYSTICK:
         assert hand not in bench.gate.waiting
+
+
+def test_a_further_source_that_wants_to_go_sideways_is_refused_by_name_and_not_in_part():
+    bench = Bench()
+    bench.says["nav_vel"] = twist(0.0)
+    bench.run(0.5)
+    bench.says["nav_vel"] = Twist(linear=Vector3(x=0.2, y=0.1))
+    for _ in range(20):
+        decision = bench.run()
+        assert decision.velocity == STANDSTILL
+        assert "linear.y" in decision.troubles["command:navigation:unused_axes"]
+    assert bench.gate.counts["command:navigation:unused_axes"] == 20
+    bench.says["nav_vel"] = twist(0.2)
+    assert bench.run(0.5).velocity.linear == pytest.approx(0.2)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Message, Twist
+from skytether.robot.command import UNUSED_AXES, unused_axes
 from skytether.robot.driver import Base
 
 from .client import GateLink
@@ -33,5 +34,10 @@ class GatedBase:
 
         Raises:
             OSError: There is no gate; tried again at the next tick.
+            ValueError: It wants to move along an axis that the wheels do not have.
         """
+        if unused_axes(twist):
+            raise ValueError(
+                f"a velocity along {UNUSED_AXES} cannot be asked of the gate: the wheels do not have these"
+            )
         self._link.send(Velocity(twist.linear.x, twist.angular.z))

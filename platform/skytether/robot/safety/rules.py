@@ -14,7 +14,7 @@ from math import inf, isfinite
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Message
 from skytether.robot import supervisor
-from skytether.robot.command import Command
+from skytether.robot.command import UNUSED_AXES, Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import kinematics as reach
@@ -272,6 +272,7 @@ class Gate:
 
 _SAYS: Mapping[Objection, str] = {
     Objection.NOT_FINITE: "its velocity is NaN or infinite",
+    Objection.UNUSED_AXES: f"it wants to move along {UNUSED_AXES}, which these wheels do not have",
     Objection.SEQUENCE: "it is not newer than one that was taken before",
     Objection.STALE: "it was made too long ago",
     Objection.GAP: "the last valid command is too old; the robot stops",

@@ -14,7 +14,7 @@ from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
-from skytether.robot.command import Command
+from skytether.robot.command import Command, unused_axes
 from skytether.robot.supervisor import Limits
 
 from . import joystick, latch, neutral
@@ -343,7 +343,8 @@ class Sources:
             return None, "wants to go sideways (linear.y), which the gate does not pass on; the command is not used"
         source = replace(source, sequence=source.sequence + 1, stamp=stamp)
         self._sources[name] = source
-        return Command(name, twist.linear.x, twist.angular.z, 0, source.sequence, now, 0.0, now), ""
+        linear, angular, unused = twist.linear.x, twist.angular.z, unused_axes(twist)
+        return Command(name, linear, angular, 0, source.sequence, now, 0.0, now, unused), ""
 
 
 _HOLDS_BACK = frozenset({Grip.LOST, Grip.UNSURE})
