@@ -66,6 +66,15 @@ def start(folder: Folder = None) -> None:
     console.print(sentence, markup=False, soft_wrap=True)
 
 
+def mode(
+    names: Annotated[str, typer.Argument(help="Those that hold, with commas between; none: none of them.")],
+    folder: Folder = None,
+) -> None:
+    """Say which modes of the gate hold (safety.modes): with a load, with people near."""
+    holding = _ask(folder, {"do": "mode", "modes": names})["modes"]
+    console.print(f"modes that hold: {', '.join(holding) or 'none'}", markup=False, soft_wrap=True)
+
+
 def gate_status(folder: Folder = None, json: Json = False) -> None:
     """Say who drives, what lies ahead, and what stands in the way."""
     answer = _ask(folder, {"do": "status"})
@@ -80,6 +89,8 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     enabled = (answer.get("guard") or {}).get("enabled")
     if enabled is not None:
         print(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
+    if answer.get("modes"):
+        print(f"modes     {', '.join(answer['modes'])}")
     for source, why in answer["waiting"].items():
         print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["beyond"]:

@@ -47,8 +47,8 @@ def numbers(kind: Any, path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
     return {path} if kind is float else set()
 
 
-WITHOUT_SIZE = {("sensors", "*", "fov_deg")}
-"""Directions, of which none is too large."""
+WITHOUT_SIZE = {("sensors", "*", "fov_deg"), ("modes", "*", "limits", "*"), ("modes", "*", "zones", "*")}
+"""Directions, of which none is too large; what has the rows of the keys that it tightens."""
 
 
 def test_every_number_of_the_section_has_bounds_and_every_row_is_a_key():

@@ -136,6 +136,7 @@ def test_a_button_that_speaks_only_when_it_changes_is_never_silent_once_heard():
 
 
 def test_the_agents_wheels_are_not_asked_for_what_they_do_not_have(tmp_path):
-    base = GatedBase(SimpleNamespace(topics={}), GateLink(tmp_path))
+    base = GatedBase(SimpleNamespace(topics={}), link := GateLink(tmp_path))
+    link.close()
     with pytest.raises(ValueError, match=r"linear\.y, linear\.z, angular\.x, angular\.y cannot be asked"):
         base.write(Twist(linear=Vector3(x=0.1, y=0.1)))

@@ -88,13 +88,16 @@ BOUNDS: tuple[Bound, ...] = (
     Bound("odometry.blocked_s", 0.2, 10, "s", "a blocked motor burns"),
     Bound("odometry.max_age_s", 0.02, 1, "s", "the real motion is not known for so long"),
     Bound("enable.after_s", 0, 3, "s", "power goes so late after a stop"),
+    Bound("mode.max_age_s", 0.05, 10, "s", "a load that was taken up is not known of for so long"),
     Bound("rate_hz", 10, 500, "Hz", "slower it reacts late, faster Python does not turn"),
     Bound("guard_s", 0.02, 0.5, "s", "the wheels go on as they were told for so long when the gate hangs"),
 )
 
 
 def bound_of(path: Sequence[str]) -> Bound | None:
-    """The row of a number; None: it has none."""
+    """The row of a number; None: it has none. A mode's numbers have the rows of what they tighten."""
+    if len(path) > 2 and path[0] == "modes":
+        path = path[2:]
     for bound in BOUNDS:
         parts = bound.key.split(".")
         if len(parts) == len(path) and all(p in ("*", name) for p, name in zip(parts, path, strict=True)):

@@ -13,18 +13,20 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
-from skytether.messages import Bool, Message
+from skytether.messages import Bool, Message, String
 from skytether.robot.supervisor import Limits
 from skytether.ros.names import check_name, resolve
 
 from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
-from .config_base import Metres, Numbers, Topic
+from .config_base import Numbers, Topic
 from .contact import ContactParams, feels
 from .enable_config import EnableConfig
-from .footprint import Footprint, circle, polygon
 from .inbox import IsStop, Topics
+from .mode_config import Modes, ModeSource, mode_rules
+from .modes import Envelope
 from .odometry_config import OdometryConfig, odometry_kind
+from .outline_config import OutlineConfig
 from .protocol import WHEELS_SOCKET, default_folder, default_record
 from .rules import Rules
 from .sensor_config import ContactConfig, SensorConfig, UnseenConfig
@@ -33,26 +35,6 @@ from .stopping import Stages, shortfall
 from .zones import ZoneParams
 
 DEFAULT_MASTER = "http://localhost:11311"
-
-
-class OutlineConfig(Numbers):
-    """The robot with all that it carries, seen from above: a polygon or a circle about the origin."""
-
-    polygon: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=3, max_length=100)] | None = None
-    """Corners (x forward, y left) in the base frame [m], in any order; of a dented outline the hull is taken."""
-    radius: Annotated[float, Field(gt=0, le=100)] | None = None
-    """[m]"""
-
-    @model_validator(mode="after")
-    def _is_one(self) -> OutlineConfig:
-        if (self.polygon is None) == (self.radius is None):
-            raise ValueError("give either polygon or radius")
-        self.footprint()
-        return self
-
-    def footprint(self) -> Footprint:
-        """The outline as geometry."""
-        return polygon(self.polygon) if self.polygon is not None else circle(self.radius or 0.0)
 
 
 class SocketsConfig(Numbers):
@@ -132,6 +114,10 @@ class SafetyConfig(SourcesConfig):
     """What the wheels really do; null: nobody looks."""
     enable: EnableConfig | None = None
     """An output that takes power away; null: there is none."""
+    modes: Modes = {}
+    """Tighter limits, zones and outlines that hold at times, by name."""
+    mode: ModeSource = ModeSource()
+    """Who says which of them hold."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
@@ -181,32 +167,41 @@ class SafetyConfig(SourcesConfig):
     @model_validator(mode="after")
     def _can_stop(self) -> SafetyConfig:
         """The inequality of `stopping`, for what is known before anything is seen."""
-        limits, stages, outline = self.limits or Limits(), self.stages(), self.footprint.footprint()
+        rules = self.rules()
+        self._check_stop("", Envelope(rules.limits, rules.zones, rules.footprint))
+        for name, envelope in rules.modes.envelopes.items():
+            self._check_stop(f"modes.{name}.", envelope)
+        return self
+
+    def _check_stop(self, where: str, envelope: Envelope) -> None:
+        limits, zones, outline = envelope.limits, envelope.zones, envelope.footprint
+        stages = replace(self.stages(), sensing_s=zones.sensing_s, wheels_s=zones.reaction_s)
         braking = min(limits.linear_braking, limits.angular_braking * outline.radius)
-        wrong = shortfall(stages, self.zones.slow_speed, braking, 0.0, self.zones.slow_m)
+        wrong = shortfall(stages, zones.slow_speed, braking, 0.0, zones.slow_m)
         if wrong:
-            raise ValueError(f"zones.slow_speed, zones.slow_m: {wrong}")
+            raise ValueError(f"{where}zones.slow_speed, {where}zones.slow_m: {wrong}")
         if self.sensors and all(sensor.range_max for sensor in self.sensors.values()):
             name, eye = max(self.sensors.items(), key=lambda item: item[1].x + item[1].range_max)
-            front = float(outline.vertices[:, 0].max()) + self.zones.stop_m
+            front = float(outline.vertices[:, 0].max()) + zones.stop_m
             way = eye.x + eye.range_max - front
             wrong = shortfall(stages, limits.linear_max, limits.linear_braking, eye.max_age_s, way)
             if wrong:
-                raise ValueError(f"limits.linear_max, sensors.{name}.range_max: {wrong}")
-        return self
+                raise ValueError(f"{where}limits.linear_max, sensors.{name}.range_max: {wrong}")
 
     def rules(self) -> Rules:
         """The rules that follow."""
         stages = self.stages()
         limits = replace(self.limits or Limits(), period_s=stages.period_s, max_step_s=stages.longest_step_s)
+        footprint = self.footprint.footprint()
         return Rules(
-            footprint=self.footprint.footprint(),
+            footprint=footprint,
             limits=limits,
             zones=self.zones,
             sensors={topic: sensor.sensor() for topic, sensor in self.sensors.items()},
             unseen=self.unseen.params(),
             contacts={topic: contact.params() for topic, contact in self.contacts.items()},
             stages=stages,
+            modes=mode_rules(self.modes, self.mode, Envelope(limits, self.zones, footprint)),
             sources=self.source_rules(),
             odometry=None if self.odometry is None else self.odometry.rules(stages),
         )
@@ -268,6 +263,8 @@ class SafetyConfig(SourcesConfig):
         """All but range sensors; a topic that is there twice is a mistake."""
         kinds = [(topic, contact.params().message) for topic, contact in self.contacts.items()]
         odometry = self.odometry
+        if self.mode.topic is not None:
+            kinds.append((self.mode.topic, String))
         return kinds + self.source_kinds() + ([] if odometry is None else [(odometry.topic, odometry_kind(odometry))])
 
     def topics(self) -> Topics:

@@ -73,7 +73,10 @@ class Control:
         if what == "start":
             started, refused = self._gate.start(self._clock())
             return {"refused": refused} if refused else {**self._status(), "started": started}
-        return {"refused": f"there is no request {str(what)[:40]!r}; there are status, stop, reset and start"}
+        if what == "mode":
+            refused = self._gate.set_modes(str(asked.get("modes", "")), self._clock())
+            return {"refused": refused} if refused else self._status()
+        return {"refused": f"there is no request {str(what)[:40]!r}; there are status, stop, reset, start and mode"}
 
     def _stop(self, reason: str) -> Callable[[], Reply | None]:
         self._gate.engage(reason)

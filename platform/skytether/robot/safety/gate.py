@@ -179,6 +179,7 @@ class GateLoop:
             "kept": answer.kept if answer else None,
             "hand": last.hand if last else None,
             "waiting": dict(self._gate.waiting),
+            "modes": self._gate.modes,
             "zone": last.zone if last else None,
             "way_m": round(last.way, 3) if last and isfinite(last.way) else None,
             "share": round(last.share, 3) if last else None,

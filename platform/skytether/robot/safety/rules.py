@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.messages import Message
+from skytether.messages import Message, String
 from skytether.robot import supervisor
 from skytether.robot.command import UNUSED_AXES, Command
 from skytether.robot.supervisor import Limits, Objection, Supervised
@@ -22,6 +22,7 @@ from .contact import ContactParams, Contacts
 from .coverage import Action, Unseen, UnseenParams
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
+from .modes import Envelope, ModeRules, Modes
 from .real_motion import OdometryRules, RealMotion
 from .sensing import RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
@@ -47,6 +48,7 @@ class Rules:
         contacts: Bumpers and cliff sensors, by topic.
         sources: Who may drive, and who may stop the robot.
         stages: Latencies from the light to the brakes.
+        modes: Tighter limits, zones and outlines that hold at times.
     """
 
     footprint: Footprint
@@ -58,6 +60,7 @@ class Rules:
     sources: SourceRules = field(default_factory=SourceRules)
     odometry: OdometryRules | None = None
     stages: Stages = field(default_factory=Stages)
+    modes: ModeRules = field(default_factory=ModeRules)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +84,16 @@ class Decision:
     troubles: Mapping[str, str]
 
 
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What the modes of a time leave."""
+
+    limits: Limits
+    stages: Stages
+    zones: Zones
+    unseen: Unseen
+
+
 class Gate:
     """Takes in commands and readings as they come, and says at each step what the wheels are told.
 
@@ -93,12 +106,13 @@ class Gate:
         self.counts: Counter[str] = Counter()
         """What was objected to, by kind."""
         self._rules = rules
-        self._zones = Zones(rules.zones, rules.footprint, rules.limits, rules.stages)
+        self._modes = Modes(rules.modes, Envelope(rules.limits, rules.zones, rules.footprint))
+        self._places: dict[frozenset[str], _Place] = {}
+        self._active, self._place = frozenset[str](), self._place_of(frozenset())
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.footprint, rules.limits.clock_tolerance_s)
         self._contacts = Contacts(rules.contacts)
-        self._unseen = Unseen(rules.unseen, rules.footprint, rules.zones.slow_speed)
         oldest = max((sensor.max_age_s for sensor in rules.sensors.values()), default=0.0)
         self._reckoning = DeadReckoning(oldest + rules.stages.reaction_s(0.0))
         odometry = rules.odometry
@@ -110,6 +124,25 @@ class Gate:
     def stopped(self) -> str:
         """Why the robot stands until somebody resets it; empty: it does not."""
         return self._sources.stopped
+
+    @property
+    def modes(self) -> list[str]:
+        """The modes that hold, by name."""
+        return sorted(self._active)
+
+    def set_modes(self, text: str, now: float) -> str:
+        """A person or a program of the robot says which modes hold; see `Modes.hear`.
+
+        Returns:
+            Why it is refused; empty: it is not.
+        """
+        if not self._rules.modes.envelopes:
+            return "there are no modes (safety.modes)"
+        if self._rules.modes.topic:
+            return f"the topic {self._rules.modes.topic} says which modes hold (safety.mode.topic)"
+        refused = self._modes.hear(text, now)
+        self._active = self._modes.active(now, {})
+        return refused
 
     def command(self, command: Command, now: float) -> Objection | None:
         """Take a velocity in that the agent wants; its ``source`` must be `Hand.AGENT`."""
@@ -125,6 +158,9 @@ class Gate:
             reason = self._contacts.hear(topic, message, now)
             if reason:
                 self.engage(reason)
+        elif topic == self._rules.modes.topic and isinstance(message, String):
+            if unknown := self._modes.hear(message.data, now):
+                self._event("mode:message", f"{topic}: {unknown}")
         elif self._sources.expects(topic, message):
             self._hear(topic, message, now)
         elif self._motion is not None and self._rules.odometry is not None and topic == self._rules.odometry.topic:
@@ -192,7 +228,9 @@ class Gate:
         return decision
 
     def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
-        before, dt = self._supervised.velocity, supervisor.elapsed(self._rules.limits, self._supervised, now)
+        self._active = self._modes.active(now, troubles)
+        self._place = place = self._place_of(self._active)
+        before, dt = self._supervised.velocity, supervisor.elapsed(place.limits, self._supervised, now)
         broken = self._motion.look(now, troubles) if self._motion is not None else ""
         if broken:
             self.engage(broken)
@@ -207,15 +245,15 @@ class Gate:
             share = min(self._motion.share(hand, before, wanted, now), self._most(self._motion.action, wanted))
             allowed = replace(allowed, share=min(allowed.share, share))
         velocity = Velocity(wanted.linear * allowed.share, wanted.angular * allowed.share)
-        if not reach.within_reach(self._rules.limits, before, velocity, dt):
-            velocity = reach.brake_on_curve(self._rules.limits, before, dt)
+        if not reach.within_reach(place.limits, before, velocity, dt):
+            velocity = reach.brake_on_curve(place.limits, before, dt)
         if not (isfinite(velocity.linear) and isfinite(velocity.angular)):
             velocity = STANDSTILL
         self._supervised = replace(self._supervised, velocity=velocity)
         return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
     def _supervise(self, hand: str, now: float, troubles: dict[str, str]) -> Velocity:
-        limits = self._sources.limits(hand)
+        limits = replace(self._place.limits, max_gap_s=self._sources.limits(hand).max_gap_s)
         self._supervised, objections = supervisor.step(limits, self._supervised, hand, limits.max_gap_s, now)
         for objection in objections:
             if objection in _ORDINARY:
@@ -228,15 +266,15 @@ class Gate:
         """What zones and sensors leave of a velocity."""
         scene = self._sensing.see(now, self._reckoning)
         troubles.update(scene.troubles)
-        varied = self._reckoning.varied(now - scene.age - self._rules.stages.late_s, wanted)
-        allowed = self._zones.allow(wanted, scene.points, varied, self._zone)
+        varied = self._reckoning.varied(now - scene.age - self._place.stages.late_s, wanted)
+        allowed = self._place.zones.allow(wanted, scene.points, varied, self._zone)
         self._zone = allowed.zone
         covers = [part.cover for part in scene.parts]
-        unseen = self._unseen.share(wanted, covers, self._zones.way(wanted))
+        unseen = self._place.unseen.share(wanted, covers, self._place.zones.way(wanted))
         if unseen < 1:
             verb = "does not go there" if unseen == 0 else "goes there slowly"
             troubles["unseen"] = f"no sensor looks where the robot is to move (safety.unseen); it {verb}"
-        sight = self._zones.within_sight(wanted, scene.edge, varied)
+        sight = self._place.zones.within_sight(wanted, scene.edge, varied)
         if sight < 1:
             troubles["sight"] = "the sensors do not see far enough to stop from a higher speed (their range_max)"
         most = self._most(scene.action, wanted)
@@ -246,7 +284,20 @@ class Gate:
 
     def _most(self, action: Action, wanted: Velocity) -> float:
         """What share of a velocity an action leaves."""
-        return {Action.STOP: 0.0, Action.SLOW: self._zones.slow(wanted), Action.FREE: 1.0}[action]
+        return {Action.STOP: 0.0, Action.SLOW: self._place.zones.slow(wanted), Action.FREE: 1.0}[action]
+
+    def _place_of(self, active: frozenset[str]) -> _Place:
+        """Made when these modes hold for the first time."""
+        if active not in self._places:
+            now, rules = self._modes.envelope(active), self._rules
+            stages = replace(rules.stages, sensing_s=now.zones.sensing_s, wheels_s=now.zones.reaction_s)
+            self._places[active] = _Place(
+                now.limits,
+                stages if active else rules.stages,
+                Zones(now.zones, now.footprint, now.limits, stages if active else rules.stages),
+                Unseen(rules.unseen, now.footprint, now.zones.slow_speed),
+            )
+        return self._places[active]
 
     def _hear(self, topic: str, message: Message, now: float) -> None:
         command, wrong = self._sources.hear(topic, message, now)
