@@ -339,8 +339,6 @@ class Sources:
         twist, stamp = (message, (0, 0)) if isinstance(message, Twist) else (message.twist, _stamp(message))
         if any(stamp) and stamp == source.stamp:
             return None, "sends the same command again, which counts as silence"
-        if twist.linear.y:
-            return None, "wants to go sideways (linear.y), which the gate does not pass on; the command is not used"
         source = replace(source, sequence=source.sequence + 1, stamp=stamp)
         self._sources[name] = source
         linear, angular, unused = twist.linear.x, twist.angular.z, unused_axes(twist)
