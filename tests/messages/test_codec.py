@@ -38,6 +38,7 @@ from skytether.messages import (
     definition_of,
     encode,
     hash_of,
+    transcode,
     type_hash,
     type_of,
     warm,
@@ -306,3 +307,10 @@ def test_messages_are_values() -> None:
         Twist().linear = Vector3()
     with pytest.raises(ValueError, match="read-only"):
         PoseWithCovariance().covariance[0] = 1
+
+
+def test_more_elements_than_there_are_bytes_are_refused_before_each_is_looked_at() -> None:
+    with pytest.raises(DecodeError, match="Invalid sequence length 4000000000"):
+        transcode("geometry_msgs/msg/Polygon", (4_000_000_000).to_bytes(4, "little"), "ros1", "cdr")
+    with pytest.raises(DecodeError, match="Invalid sequence length 4000000000"):
+        transcode("geometry_msgs/msg/Polygon", b"\0\1\0\0" + (4_000_000_000).to_bytes(4, "little"), "cdr", "ros1")

@@ -3,6 +3,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
 
 from skytether.api.manifest import Manifest
 from skytether.orchestrator.errors import InvalidError
@@ -108,3 +109,75 @@ def test_a_reference_to_nothing_names_the_key(reference: str) -> None:
 def test_a_schema_that_refers_to_itself_without_end_is_refused() -> None:
     with pytest.raises(InvalidError, match=r"s: spec\.params: the schema refers to itself without end"):
         check_params({"a": 1}, {"$ref": "#"}, "s")
+
+
+EVIL = ("^(a+)+$", "(a|a)*$", "^(([a-z])+.)+[A-Z]([a-z])+$", "(.*a){12}$", "a*a*a*a*a*a*a*a*a*$")
+"""Each takes Python's engine longer than a test runs for a text of a few dozen letters."""
+
+
+@pytest.mark.parametrize("pattern", EVIL)
+def test_a_pattern_takes_time_as_its_text_is_long_and_no_more(pattern: str) -> None:
+    text = "a" * 20_000 + "!"
+    schema = {
+        "properties": {"name": {"pattern": pattern}, "more": {"patternProperties": {pattern: False}}},
+        "patternProperties": {pattern: {"type": "integer"}},
+    }
+    check_schema(schema, "spec.params")
+    params: dict[str, Any] = {"name": text, "more": {text: 1}, text: "x"}
+    with pytest.raises(InvalidError) as caught:
+        check_params(params, schema, "s")
+    assert "params.name: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("params", "wrong"),
+    [
+        ({"id-7": 1, "name": "ab"}, ""),
+        ({"id-7": "x"}, "params.id-7: 'x' is not of type 'integer'"),
+        ({"name": "7"}, "params.name: '7' does not match '^[a-z]+$'"),
+        ({"other": 1}, "additional keys are not allowed: 'other'"),
+        ({"deep": {"x1": 1, "y": 2}}, ""),
+        ({"deep": {"y": "z"}}, "params.deep.y: 'z' is not of type 'integer'"),
+        ({"deep": 3, "name": 4}, ""),
+    ],
+)
+def test_patterns_mean_what_they_always_did(params: dict[str, Any], wrong: str) -> None:
+    schema = {
+        "properties": {
+            "name": {"pattern": "^[a-z]+$"},
+            "deep": {"patternProperties": {"^x": {}}, "additionalProperties": {"type": "integer"}},
+        },
+        "patternProperties": {r"^id-\d+$": {"type": "integer"}},
+    }
+    check_schema(schema, "spec.params")
+    # What the keywords of the library say of the same, but for the words.
+    assert (not wrong) is Draft202012Validator({"additionalProperties": False, **schema}).is_valid(params)
+    if not wrong:
+        check_params(params, schema, "s")
+        return
+    with pytest.raises(InvalidError) as caught:
+        check_params(params, schema, "s")
+    assert wrong in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("schema", "text"),
+    [
+        ({"properties": {"a": {"pattern": "(?=a)b"}}}, r"spec.params.properties.a.pattern: '(?=a)b' is no pattern"),
+        ({"properties": {"a": {"pattern": r"(a)\1"}}}, "neither ahead nor behind"),
+        ({"patternProperties": {"(?<!a)b": {}}}, "spec.params.patternProperties: '(?<!a)b' is no pattern"),
+        ({"items": {"pattern": "a" * 1025}}, "has 1025 characters: at most 1024 can be used"),
+        ({"properties": {"a": {"pattern": "((a{100}){100}){100}"}}}, "is no pattern that can be used"),
+        ({"patternProperties": {"a": {}}, "unevaluatedProperties": False}, "write additionalProperties"),
+    ],
+)
+def test_a_pattern_that_cannot_be_used_is_named_when_the_manifest_is_taken(schema: dict[str, Any], text: str) -> None:
+    with pytest.raises(InvalidError) as caught:
+        check_schema({"allOf": [schema]} if "items" in schema else schema, "spec.params")
+    assert text in str(caught.value)
+    check_schema({"properties": {"a": {"enum": [{"pattern": "("}], "default": {"pattern": "("}}}}, "spec.params")
+
+
+def test_one_that_was_taken_once_says_so_too() -> None:
+    with pytest.raises(InvalidError, match="correct the manifest"):
+        check_params({"a": "b"}, {"properties": {"a": {"pattern": "(?=a)b"}}}, "s")

@@ -92,7 +92,9 @@ def transcode(typename: str, data: bytes | memoryview, source: Encoding, target:
         if typename in _types_with_class():
             return encode(decode(typename, data, source), target)
         # The same layout but for the sequence numbers of headers, which `rosbags` drops, and makes zero.
-        store = typestore("cdr")
+        store = copy.copy(typestore("cdr"))
+        # What claims more elements than there are bytes is looked at for each of them: 4 bytes took 9 s.
+        store.max_sequence_length = max(1, len(data))
         return bytes((store.ros1_to_cdr if source == "ros1" else store.cdr_to_ros1)(memoryview(data), typename))
     except DecodeError:
         raise

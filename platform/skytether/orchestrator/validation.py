@@ -16,6 +16,7 @@ from referencing.jsonschema import DRAFT202012
 from skytether.api.faults import Fault, explain, unknown
 
 from .errors import InvalidError
+from .patterns import PatternError, Validator, wrong_with
 
 Model = TypeVar("Model", bound=BaseModel)
 _MAX_FAULTS = 10
@@ -44,6 +45,7 @@ def check_schema(schema: Mapping[str, Any], prefix: str) -> None:
         Draft202012Validator.check_schema(schema)
     except SchemaError as error:
         raise InvalidError([Fault(_join(prefix, error.absolute_path), error.message)]) from None
+    _check_patterns(schema, prefix)
     here = Registry().with_resource("", DRAFT202012.create_resource(dict(schema))).resolver()
     for path, reference in _references(schema):
         try:
@@ -51,6 +53,29 @@ def check_schema(schema: Mapping[str, Any], prefix: str) -> None:
         except Unresolvable:
             text = f"there is no '{reference}' in this schema, and nothing is fetched from elsewhere"
             raise InvalidError([Fault(_join(prefix, path), text)]) from None
+
+
+def _check_patterns(schema: Mapping[str, Any], prefix: str) -> None:
+    faults, both = [], set()
+    for path, key, value in _keywords(schema):
+        patterns = [value] if key == "pattern" and isinstance(value, str) else []
+        if key == "patternProperties" and isinstance(value, Mapping):
+            patterns = [str(pattern) for pattern in value]
+        faults += [Fault(_join(prefix, path), f"'{p[:80]}' {why}") for p in patterns if (why := wrong_with(p))]
+        both |= {key} & {"patternProperties", "unevaluatedProperties"}
+    if len(both) > 1:
+        faults.append(Fault(prefix, "unevaluatedProperties beside patternProperties: write additionalProperties"))
+    if faults:
+        raise InvalidError(faults[:_MAX_FAULTS])
+
+
+def _keywords(schema: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    """All keys of a schema; examples and the like hold data, in which a key means nothing."""
+    for key, inner in schema.items() if isinstance(schema, Mapping) else enumerate(schema):
+        if isinstance(schema, Mapping):
+            yield (*path, str(key)), str(key), inner
+        if isinstance(inner, Mapping | list) and key not in ("const", "enum", "default", "examples"):
+            yield from _keywords(inner, (*path, str(key)))
 
 
 def _references(schema: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -70,11 +95,13 @@ def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: 
     """
     closed = {"additionalProperties": False, **schema}
     # An empty registry: a manifest must not make this server fetch a reference from somewhere.
-    validator = Draft202012Validator(closed, registry=Registry())
+    validator = Validator(closed, registry=Registry())
     try:
         errors = sorted(validator.iter_errors(params), key=lambda e: [str(p) for p in e.absolute_path])
     except Unresolvable as error:
         raise InvalidError([Fault("spec.params", f"cannot resolve the reference {error.ref}")], service) from None
+    except PatternError as error:
+        raise InvalidError([Fault("spec.params", f"{error}: correct the manifest")], service) from None
     except RecursionError:
         text = "the schema refers to itself without end: correct the manifest"
         raise InvalidError([Fault("spec.params", text)], service) from None
