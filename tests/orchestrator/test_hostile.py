@@ -245,6 +245,37 @@ def test_the_key_of_a_session_is_its_robots_alone_and_handed_out_once(program: P
             assert client.claim_session(honest.instance, "any claim will do") == key
 
 
+def test_instances_and_streams_that_a_robot_asks_for_starve_nobody(
+    program: Program, honest: Honest, hostile: Hostile
+) -> None:
+    asked = {"robot": hostile.name, "service": "toy", "lease_s": 3600}
+    with Client(hostile.url, hostile.token) as client, contextlib.ExitStack() as streams:
+        with hostile.again_and_again(4, "/api/v1/instances", lambda _: asked):
+            honest.renew_for(ATTACK)
+        assert len(client.instances()) == 16
+        assert set(hostile.statuses) <= {201, 409, 429}
+        path = f"/api/v1/instances/{hostile.instance}/logs?follow=true&tail=1"
+        head = f"GET {path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {hostile.token}\r\n\r\n"
+        streams.enter_context(many(address_of(program), 200, head.encode()))
+        honest.renew_for(ATTACK)
+    assert honest.refused == []
+    assert honest.still_has_it()
+    assert max(honest.took) < 2.0
+
+
+def test_a_pattern_freezes_nobody(program: Program, honest: Honest, hostile: Hostile) -> None:
+    schema = {"properties": {"name": {"type": "string", "pattern": "^(a+)+$"}}}
+    evil = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "evil"}}
+    with operator_of(program) as operator:
+        operator.put_service("evil", {**evil, "spec": {"entrypoint": "x", "params": schema}})
+    asked = {"robot": hostile.name, "service": "evil", "params": {"name": "a" * 30 + "!"}}
+    with hostile.again_and_again(4, "/api/v1/instances", lambda _: asked):
+        honest.renew_for(ATTACK)
+    assert honest.refused == []
+    assert max(honest.took) < 2.0
+    assert set(hostile.statuses) <= {422, 429}
+
+
 @pytest.mark.parametrize("head", [SLOW_BODY + b"\r\n", b"GET /hea", b""], ids=["body", "head", "nothing"])
 def test_silent_connections_are_closed(
     program: Program, manifest: Any, head: bytes, monkeypatch: pytest.MonkeyPatch

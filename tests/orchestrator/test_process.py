@@ -402,3 +402,28 @@ def test_the_processor_time_of_children_that_have_ended_counts() -> None:
     assert before is not None
     assert after is not None
     assert after.cpu_s - before.cpu_s >= 0.4
+
+
+@pytest.mark.slow
+def test_what_a_robots_services_write_is_bounded_and_nothing_starts_beyond(open_runtime: Open, tmp_path: Path) -> None:
+    runtime = open_runtime(data_mb=1)
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    runtime.tidy()
+    assert runtime.observe()["i1"].exceeds == ""
+    kept = tmp_path / "data/walker/recorder/earlier"
+    kept.mkdir(parents=True)
+    (kept / "old.mcap").write_bytes(bytes(2 << 20))
+    deadline = time.monotonic() + 10
+    while not runtime.observe()["i1"].exceeds:
+        runtime.tidy()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert "has more than 1 MiB in" in runtime.observe()["i1"].exceeds
+    runtime.stop("i1", force=True)
+    until(runtime, Phase.EXITED)
+    with pytest.raises(RuntimeFailure, match=r"robot 'walker' has more than 1 MiB in .*delete what is not needed"):
+        runtime.start(launch(attempt=2))
+    (kept / "old.mcap").unlink()
+    runtime.start(launch(attempt=2))
+    until(runtime, Phase.RUNNING)

@@ -295,11 +295,23 @@ class RobotCreate(RobotBase):
     """How long its first token is good for; None: until it is deleted."""
 
 
+class RobotUse(Strict):
+    """What a robot's instances that have not ended ask for, and what it may have; see the orchestrator's ``quotas``."""
+
+    instances: int = 0
+    cpu: float = 0.0
+    """Cores."""
+    memory_mb: int = 0
+
+
 class Robot(RobotBase):
     """A registered robot."""
 
     created_at: datetime
     last_seen_at: datetime | None = None
+    use: RobotUse = RobotUse()
+    quota: RobotUse = RobotUse()
+    """The most that it may have of each."""
 
 
 class RobotCreated(Robot):

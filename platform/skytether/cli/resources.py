@@ -282,8 +282,19 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
     if json:
         print_json([plain(robot) for robot in found])
         return
-    rows = [(r.name, ", ".join(r.services), or_dash(r.created_at), or_dash(r.last_seen_at)) for r in found]
-    print_table(("robot", "may ask for", "registered", "last seen"), rows)
+    rows = [
+        (
+            r.name,
+            ", ".join(r.services),
+            or_dash(r.created_at),
+            or_dash(r.last_seen_at),
+            f"{r.use.instances} of {r.quota.instances}",
+            f"{r.use.cpu:g} of {r.quota.cpu:g}",
+            f"{r.use.memory_mb} of {r.quota.memory_mb}",
+        )
+        for r in found
+    ]
+    print_table(("robot", "may ask for", "registered", "last seen", "instances", "cores", "memory MiB"), rows)
 
 
 @robot_app.command("add")

@@ -25,6 +25,7 @@ from .leader import Leadership
 from .loops import Loop
 from .metrics import Metrics, Running, SiteGauges
 from .moves import Moves
+from .quotas import Quotas
 from .reconcile import Reconciler
 from .reports import PERIOD, Reports
 from .runtimes.base import Runtime
@@ -74,11 +75,17 @@ class Orchestrator:
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
-            self._running, settings.limits.reported_topics, self._site_gauges, self._reports, self._accounts
+            self._running,
+            settings.limits.reported_topics,
+            self._site_gauges,
+            self._reports,
+            self._accounts,
+            lambda: self.quotas,
         )
         self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
         self.strain = Strain()
+        self.quotas = Quotas(self.store, settings.quotas)
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
         self.reconciler = Reconciler(
@@ -92,6 +99,7 @@ class Orchestrator:
             self._wake_placer,
             lambda: self.leadership.leads,
             strain=self.strain,
+            site_instances=settings.quotas.site_instances,
         )
         self.sites = Sites(
             settings.state_dir / "sites",
@@ -125,6 +133,7 @@ class Orchestrator:
             secrets,
             clock,
             self._wake_placer,
+            self.quotas,
         )
 
     def _wake_placer(self) -> None:

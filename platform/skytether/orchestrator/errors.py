@@ -32,6 +32,10 @@ class NoSiteError(ConflictError):
         self.refused = tuple(refused)
 
 
+class QuotaError(ConflictError):
+    """It would be more than somebody may have."""
+
+
 class ForbiddenError(DomainError):
     """The token is good, but not for this."""
 

@@ -31,6 +31,7 @@ from .errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundErr
 from .metrics import Metrics
 from .moves import Moves
 from .placement import Decision
+from .quotas import Quotas
 from .reconcile import Reconciler, told
 from .records import Record, new_record
 from .reports import Reports
@@ -61,7 +62,9 @@ class Instances:
         secrets_: Secrets,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
+        quotas: Quotas,
     ) -> None:
+        self._quotas = quotas
         self._store = store
         self._catalogue = catalogue
         self._sites = sites
@@ -81,6 +84,7 @@ class Instances:
             NotFoundError: No such service.
             InvalidError: Wrong parameters.
             NoSiteError: No site could ever run it.
+            QuotaError: The robot has too much already.
         """
         principal.require(asked.robot, asked.service)
         body = json.dumps(asked.model_dump(mode="json"), sort_keys=True).encode()
@@ -89,10 +93,12 @@ class Instances:
             earlier = self._store.made_with(principal.owner, key, digest) if key else None
             if earlier is not None:
                 return earlier
+            self._quotas.check_lease(principal, asked.lease_s)
             record = self._new(asked)
-            return self._claim(record, principal.owner, key, digest) or self._store.add(
-                record, principal.owner, key, digest
-            )
+            with self._quotas.admitting(record):
+                return self._claim(record, principal.owner, key, digest) or self._store.add(
+                    record, principal.owner, key, digest
+                )
         except KeyReusedError:
             fault = Fault("Idempotency-Key", "came before with another body: use a new key for a new request")
             raise InvalidError([fault]) from None
@@ -148,6 +154,7 @@ class Instances:
             NotFoundError: No such instance, or no such site.
             ConflictError: It has ended or ends, is nobody's, has no site yet, or is at that site already.
             NoSiteError: No other site can take it now; nothing was started.
+            QuotaError: Its robot has too much already.
         """
         record = self.get(principal, instance)
         if record.state.final or record.state is State.STOPPING:
@@ -169,7 +176,8 @@ class Instances:
         decision = self._reconciler.weigh(successor)
         if decision.site is None:
             raise self._no_site(successor, decision)
-        added = self._store.add(successor, principal.owner, None, "")
+        with self._quotas.admitting(successor):
+            added = self._store.add(successor, principal.owner, None, "")
         self._wake_placer()
         return added
 
@@ -200,7 +208,8 @@ class Instances:
             there = {site: seen for site, seen in before.items() if self._sites.find(site)}
             measurements = {**there, **self._of_known_sites(renew.measurements)}
         now = self._clock()
-        renewed = self._store.renew(instance, now, renew.lease_s, robot=principal.robot, measurements=measurements)
+        lease_s = self._quotas.lease(principal, renew.lease_s)
+        renewed = self._store.renew(instance, now, lease_s, robot=principal.robot, measurements=measurements)
         if renewed is None:
             return self.show(self.get(principal, instance))
         if renew.report is not None:

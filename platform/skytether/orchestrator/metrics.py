@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 
-from skytether.api.exposition import Family, Sums, exposition, gauge
+from skytether.api.exposition import Family, Sums, counter, exposition, gauge
 from skytether.api.manifest import ANY_TOPIC
 from skytether.api.report_metrics import INSTANCE, Described, Owner, counters_of, gauges_of
 from skytether.api.rest import Refusal, Report
 
 from .accounts import Account, of_instance, of_run
+from .quotas import Quotas, use_by_robot
 from .records import Record
 from .runtimes.base import Capacity, Observation
 
@@ -60,6 +61,7 @@ class Metrics:
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
         reports: Callable[[], Mapping[str, Report]] = dict,
         accounts: Callable[[], Mapping[Owner, Account]] = dict,
+        quotas: Callable[[], Quotas | None] = lambda: None,
     ) -> None:
         """All callables are asked at each scrape.
 
@@ -69,7 +71,9 @@ class Metrics:
             sites: What is known of the sites.
             reports: The last report on each instance, as ``bounded`` left it.
             accounts: What was counted, by robot and service.
+            quotas: What robots may have, and what was refused for that.
         """
+        self._quotas = quotas
         self._running = running
         self._sites = sites
         self._reports = reports
@@ -159,6 +163,8 @@ class Metrics:
         }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
+        if (quotas := self._quotas()) is not None:
+            yield from _of_quotas(quotas, running)
         yield from counters_of(used, USED)
         yield from _sites(self._sites(), running)
         yield from counters_of(sums)
@@ -172,6 +178,24 @@ def _memory(running: Iterable[Running]) -> Family:
             labels = (one.record.robot, one.record.service, one.record.site or "")
             memory.add(labels, one.observation.memory_bytes)
     return gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
+
+
+def _of_quotas(quotas: Quotas, running: Iterable[Running]) -> Iterator[Family]:
+    count, cpu, memory, streams, limits = Sums(), Sums(), Sums(), Sums(), Sums()
+    for robot, use in use_by_robot(one.record for one in running).items():
+        count.put((robot,), use.instances)
+        cpu.put((robot,), use.cpu)
+        memory.put((robot,), use.memory_mb * 2.0**20)
+    for key, most in quotas.limits().items():
+        limits.put((key,), most)
+    streams.put((), quotas.open_streams)
+    refused = [((key,), n) for key, n in dict(quotas.refused).items()]
+    yield gauge("robot_instances", "Instances that have not ended", ("robot",), count)
+    yield gauge("robot_promised_cpu_cores", "Processors that they asked for", ("robot",), cpu)
+    yield gauge("robot_promised_memory_bytes", "Memory that they asked for", ("robot",), memory)
+    yield gauge("open_streams", "Logs and events that are followed", (), streams)
+    yield gauge("quota_limit", "What one may have, in the unit of the setting", ("quota",), limits)
+    yield counter("quota_refusals", "Requests refused because of a quota", ("quota",), refused)
 
 
 def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[Family]:

@@ -39,6 +39,8 @@ class Candidate:
     """Why it does not answer; None: it does."""
     blocked: str | None = None
     """Why it can start nothing at present, though it answers; None: it can."""
+    full: str | None = None
+    """Why it takes no more, whatever its room; None: it does."""
     total: Capacity = NOTHING
     used: Capacity = NOTHING
     """What the instances that are there asked for."""
@@ -140,6 +142,8 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("unreachable", site.unreachable, for_good=False)
     if site.blocked is not None:
         return no("blocked", site.blocked, for_good=False)
+    if site.full is not None:
+        return no("instances", site.full, for_good=False)
     amounts = (
         ("cpu", "cores", needs.cpu, site.total.cpu, site.used.cpu),
         ("memory", "MiB of memory", needs.memory_mb, site.total.memory_mb, site.used.memory_mb),

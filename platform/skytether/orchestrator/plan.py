@@ -151,6 +151,8 @@ def decide(
         if there:
             return Stop(record.id, force=True)  # what is left of an earlier run
         seen = None
+    if seen is not None and there and seen.exceeds:
+        return Crash(record, seen.exceeds, for_good=True)
     if record.state is State.STARTING:
         return _starting(record, seen, now, timing, seen_since)
     return _running(record, seen)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import logging
 import math
+import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any
@@ -66,11 +68,13 @@ class Reconciler:
         leads: Callable[[], bool] = lambda: True,
         steady: Callable[[], float] = time.monotonic,
         strain: Strain | None = None,
+        site_instances: int = sys.maxsize,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
-        While ``strain`` is felt no lease runs out.
+        While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``.
         """
+        self._site_instances = site_instances
         self._strain = strain or Strain(steady)
         self._store = store
         self._secrets = secrets
@@ -217,9 +221,17 @@ class Reconciler:
         others = self._store.live() if placed is None else placed
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
         used = _used(others)
+        there = Counter(other.site for other in others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
         tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
         sites = [site.candidate(record.spec, used.get(site.name, NOTHING), tried.get(site.name)) for site in allowed]
+        most = self._site_instances
+        sites = [
+            replace(s, full=f"{there[s.name]} instances are there, and {most} may be (quotas.site_instances)")
+            if there[s.name] >= most
+            else s
+            for s in sites
+        ]
         if runs:
             sites = [replace(site, blocked=None) for site in sites]
         spec = record.spec
@@ -490,7 +502,7 @@ def _same(one: Observation | None, other: Observation | None) -> bool:
 
 
 def _phase(seen: Observation) -> tuple[object, ...]:
-    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port
+    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port, seen.exceeds
 
 
 def _ended(

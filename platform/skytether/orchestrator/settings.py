@@ -120,6 +120,29 @@ class Limits(Group):
     """Topics of one robot's report that reach /metrics, so that no robot can blow up the number of series."""
 
 
+class Quotas(Group):
+    """How much one of them may have, lest it starves the others; all that is refused says which of these did it."""
+
+    robot_instances: Count = 16
+    """Instances of one robot that have not ended, those included that it is to change to."""
+    robot_cpu: Annotated[float, Field(gt=0, le=1e6)] = 16.0
+    """Cores that they need in all."""
+    robot_memory_mb: Count = 32_768
+    """MiB of memory that they need in all."""
+    robot_lease_s: Annotated[float, Field(ge=1, le=86_400)] = 3600.0
+    """The longest lease that a robot may ask for: so long it holds what it has after it vanished."""
+    robot_streams: Count = 32
+    """Logs and events that one robot follows at a time."""
+    streams: Count = 1024
+    """The same of all callers."""
+    log_streams: Count = 64
+    """Logs that are followed at a time, by all: each takes a thread."""
+    service_instances: Count = 2000
+    """Instances of one service that have not ended."""
+    site_instances: Count = 500
+    """Instances at one site; more wait for another one, or for room."""
+
+
 class Tls(Group):
     """HTTPS without a proxy in front: both files, or none."""
 
@@ -184,6 +207,8 @@ class Settings(Group):
     """How patient the reconciler is."""
     limits: Limits = Limits()
     """Bounds of what is kept and taken."""
+    quotas: Quotas = Quotas()
+    """How much one robot, service or site may have."""
     weights: Weights = Weights()
     """What placement weighs."""
 

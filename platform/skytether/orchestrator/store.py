@@ -141,6 +141,8 @@ _CHANGEABLE = select(*(column for column in instances.c if column is not instanc
 """All but the manifest, which is the largest part and stays as it is."""
 _EVERY = _versions()
 _ALL_LIVE = _versions(_LIVE)
+_LIVE_OF = _versions(_LIVE, instances.c.robot == bindparam("robot"))
+_COUNT_LIVE = select(func.count()).where(_LIVE, instances.c.service == bindparam("service"))
 _LIVE_AT = _versions(_LIVE, instances.c.site == bindparam("site"))
 _CHANGING_AT = _versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
 _WAITING = select(instances.c.id).where(instances.c.state.in_([State.PENDING, State.PLACING])).limit(1)
@@ -217,6 +219,15 @@ class Store(Database):
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
         return self._look(_ALL_LIVE)
+
+    def live_of(self, robot: str) -> list[Record]:
+        """All of one robot that has not ended, oldest first."""
+        return self._look(_LIVE_OF, robot=robot)
+
+    def count_live(self, service: str) -> int:
+        """How many instances of a service have not ended."""
+        with self._reader.connect() as connection:
+            return connection.scalar(_COUNT_LIVE, {"service": service}) or 0
 
     def live_at(self, site: str, *, changing: bool = False) -> list[Record]:
         """All at one site that has not ended, oldest first; with ``changing`` only what is starting or stopping."""

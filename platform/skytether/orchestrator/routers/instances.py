@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Annotated
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -51,6 +52,19 @@ def _own(core: Core, caller: Caller, instance: str) -> Record:
     return core.instances.get(caller, instance)
 
 
+async def _watching(core: Core, caller: Caller) -> AsyncIterator[None]:
+    with core.quotas.stream(caller):
+        yield
+
+
+async def _following(core: Core, caller: Caller, *, follow: bool = False) -> AsyncIterator[None]:
+    if not follow:
+        yield
+        return
+    with core.quotas.stream(caller, log=True):
+        yield
+
+
 Own = Annotated[Record, Depends(_own)]
 """The instance of the address, if the caller may see it."""
 
@@ -88,7 +102,12 @@ def migrate(core: Core, caller: Actor, instance: str, asked: Migrate, response: 
     return core.instances.show(record)
 
 
-@router.get("/{instance}/logs", response_class=PlainTextResponse, responses=says(404, 503))
+@router.get(
+    "/{instance}/logs",
+    response_class=PlainTextResponse,
+    responses=says(404, 429, 503),
+    dependencies=[Depends(_following)],  # until the answer has ended, however it does
+)
 async def logs(
     core: Core,
     caller: Caller,
@@ -102,23 +121,26 @@ async def logs(
     With ``follow`` those of its present run, then what that writes as it comes, until it ends.
     """
     lines = min(tail, core.settings.limits.log_lines)
-    record = await asyncio.to_thread(core.instances.get, caller, instance)
-    stream = await asyncio.to_thread(core.instances.follow, caller, instance, lines) if follow else None
+    record = await to_thread.run_sync(core.instances.get, caller, instance)
+    stream = await to_thread.run_sync(core.instances.follow, caller, instance, lines) if follow else None
     if stream is None:
-        return PlainTextResponse(await asyncio.to_thread(core.instances.logs, caller, instance, lines))
+        return PlainTextResponse(await to_thread.run_sync(core.instances.logs, caller, instance, lines))
     return StreamingResponse(_relayed(core, request, stream, record), media_type="text/plain")
 
 
 async def _relayed(core: Orchestrator, request: Request, stream: LogStream, record: Record) -> AsyncIterator[str]:
     """Until the run ends, nobody listens any more, or the orchestrator is to end."""
+    readers = CapacityLimiter(
+        1
+    )  # a thread for each, of which quotas.log_streams is the bound: others' are not waited for
     try:
         while not core.broker.closed and not await request.is_disconnected():
-            text = await asyncio.to_thread(stream.read)
+            text = await to_thread.run_sync(stream.read, limiter=readers)
             if text is None:
                 return
             if text:
                 yield text
-            elif await asyncio.to_thread(_is_over, core, record):
+            elif await to_thread.run_sync(_is_over, core, record):
                 return
     finally:
         stream.close()
@@ -132,7 +154,12 @@ def _is_over(core: Orchestrator, record: Record) -> bool:
     return False
 
 
-@router.get("/{instance}/events", response_class=EventSourceResponse, responses=says(404))
+@router.get(
+    "/{instance}/events",
+    response_class=EventSourceResponse,
+    responses=says(404, 429),
+    dependencies=[Depends(_watching)],
+)
 async def events(
     core: Core, record: Own, last_event_id: Annotated[int, Header(ge=0)] = 0
 ) -> AsyncIterator[ServerSentEvent]:
@@ -141,7 +168,7 @@ async def events(
     with core.broker.subscribe(record.id) as changed:
         while not core.broker.closed:
             changed.clear()
-            rows, ended = await asyncio.to_thread(_news, core, record.id, last)
+            rows, ended = await to_thread.run_sync(_news, core, record.id, last)
             for row in rows:
                 last = row.id
                 event = InstanceEvent(

@@ -51,6 +51,8 @@ class Observation:
     tell; continues "the service ..."."""
     unstarted: bool = False
     """EXITED: it could not even be begun, and nothing of it or of earlier runs is left: another site may do better."""
+    exceeds: str = ""
+    """STARTING, RUNNING: what it took more of than it may, and is ended for; continues "the service ..."."""
     cpu_s: float | None = None
     """Processor time of this run so far."""
     memory_bytes: int | None = None

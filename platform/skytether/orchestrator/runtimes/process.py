@@ -35,6 +35,7 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
 from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
+from .disk import MOST_FILES, size_of
 from .hosts import AdvertisedHost, BindHost, check_advertised
 from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
 
@@ -42,6 +43,8 @@ _PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
+_WEIGH = 2.0
+"""Seconds between two looks at how much robots' services have written."""
 _MEASURE = 2.0
 """Seconds between two readings of processor time, memory and ready file of a child that runs; whether it still does is
 looked at each time."""
@@ -78,6 +81,9 @@ class ProcessOptions(Strict):
     """More variables for the services."""
     log_bytes: Annotated[int, Field(ge=1024)] = 4 << 20
     """Above this a log is cut to its newer half. Looked at once a second: a flood goes over it until then."""
+    data_mb: Annotated[int, Field(ge=1)] = 20_480
+    """MiB that one robot's services may have written in all; what writes beyond is ended, and nothing is started until
+    there is room again. Looked at every two seconds: a fast writer goes over it until then."""
 
     @model_validator(mode="after")
     def _can_be_reached(self) -> ProcessOptions:
@@ -98,6 +104,8 @@ class _Run:
     child: subprocess.Popen[bytes] | None = None
     """None for one that an earlier orchestrator started."""
     asked_to_end: bool = False
+    exceeds: str = ""
+    """What it took more of than it may."""
     seen: Observation | None = None
     """As it was when it was read last."""
     ready: tuple[tuple[int, int, int], int] | None = None
@@ -134,6 +142,7 @@ class ProcessRuntime(Runtime):
         self._data = folder / "data"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._measured_at = -math.inf
+        self._weighed_at = -_WEIGH
         self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
 
     @override
@@ -178,6 +187,8 @@ class ProcessRuntime(Runtime):
                 old.child.wait()
         folder = self._folder / launch.instance
         data = self._data / launch.grant.robot / launch.grant.service / launch.instance
+        if full := self._full(launch.grant.robot):
+            raise RuntimeFailure(f"robot '{launch.grant.robot}' {full}")
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -254,7 +265,8 @@ class ProcessRuntime(Runtime):
         port = _ready_port(run)
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
-        return Observation(run.attempt, phase, host, port, cpu_s=stat.cpu_s, memory_bytes=stat.memory_bytes)
+        used = stat.memory_bytes
+        return Observation(run.attempt, phase, host, port, exceeds=run.exceeds, cpu_s=stat.cpu_s, memory_bytes=used)
 
     def stop(self, instance: str, *, force: bool) -> None:
         run = self._runs.get(instance)
@@ -303,7 +315,29 @@ class ProcessRuntime(Runtime):
     def close(self) -> None:
         _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
 
+    def _full(self, robot: str) -> str:
+        """Why a robot may write no more here; empty: it may."""
+        most, folder = self._options.data_mb, self._data / robot
+        size = size_of(str(folder), most << 20)
+        if size is None:
+            return f"has more than {MOST_FILES} files in {folder}: delete what is not needed"
+        if size > most << 20:
+            return f"has more than {most} MiB in {folder} (the site's data_mb): delete what is not needed"
+        return ""
+
+    def _weigh(self) -> None:
+        """Mark the runs of robots that wrote too much."""
+        running = [run for run in self._runs.values() if not run.ended and run.data]
+        full = {robot: self._full(robot) for robot in {Path(run.data).parents[1].name for run in running}}
+        for run in running:
+            run.exceeds = full[Path(run.data).parents[1].name]
+            if run.exceeds:
+                run.seen = self._look(run)
+
     def tidy(self) -> None:
+        if time.monotonic() - self._weighed_at >= _WEIGH:
+            self._weigh()
+            self._weighed_at = time.monotonic()
         for run in self._runs.values():
             log = f"{run.folder}/log"
             with contextlib.suppress(FileNotFoundError):
