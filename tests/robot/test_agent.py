@@ -271,6 +271,27 @@ def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
     assert rig.agent.status().driver.transitions[-1].reason is Reason.RTT
 
 
+def test_an_answer_of_the_orchestrator_widens_no_limit_of_the_robot(rig, orchestrator, make_cloud):
+    """The same link as above is too slow by the robot's own needs, whatever the session says that the service bears."""
+    needs = SESSION.needs.model_copy(update={"max_rtt_ms": 1e9, "max_loss": 1.0})
+    orchestrator.session = SESSION.model_copy(update={"needs": needs})
+    rig.ask()
+    cloud = make_cloud(rig.agent._driver.session)
+    rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=1.2),))
+    for _ in range(200):
+        rig.now += 0.01
+        cloud.send(rig.now)
+        rig.agent.tick(rig.now)
+    assert rig.agent.status().driver.source is Source.CLOUD
+    rig.agent.watch(rig.now)
+    for _ in range(60):
+        rig.now += 0.01
+        cloud.send(rig.now)
+        rig.agent.tick(rig.now)
+    assert rig.agent.status().driver.transitions[-1].reason is Reason.RTT
+    assert rig.agent.status().driver.why == "round trip 1200 ms, 1000 ms at most"
+
+
 def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_followed(
     rig, orchestrator, make_cloud, caplog
 ):
