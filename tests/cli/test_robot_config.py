@@ -1,6 +1,7 @@
 import pytest
 
 from skytether.cli.config_file import ConfigError
+from skytether.cli.gate_config import load_safety
 from skytether.cli.robot_config import DEFAULT_MASTER, load_config, load_token
 from skytether.robot.arbiter import Needs
 from skytether.ros.permissions import Allowed
@@ -149,3 +150,9 @@ def test_the_link_has_needs_of_the_robot_s_own(read):
 def test_needs_that_would_be_none_are_refused(read, bad):
     with pytest.raises(ConfigError, match=f"needs.{bad.split(':')[0]}"):
         read(f"ros1: {{}}\nneeds: {{{bad}}}")
+
+
+def test_the_enable_signal_may_be_a_topic_of_the_graph_that_the_file_names(read, tmp_path):
+    more = "ros1: {}\nsafety: {footprint: {radius: 0.3}, sensors: {}, enable: {topic: /motors_on}}\n"
+    assert read(more).safety.enable.topic == "/motors_on"
+    assert load_safety(tmp_path / "robot.yaml").enable.words() == ("topic",)

@@ -143,6 +143,12 @@ def test_a_file_and_a_pipe_take_digits(tmp_path):
     line.close()
 
 
+def test_a_topic_without_a_writer_is_no_line_and_raises_nothing_in_the_loop():
+    enable = Enable(lambda: open_line(["topic"]), Power(BRAKING, AFTER))
+    enable.turn(1.0, well=True, told=True, stands=True)
+    assert (enable.on, enable.trouble) == (False, "the enable signal's line cannot be had: there is no line 'topic'")
+
+
 def test_a_datagram_is_a_bool(tmp_path):
     path = str(tmp_path / "power.sock")
     line = open_line(["unix", path])

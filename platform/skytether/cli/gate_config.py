@@ -25,6 +25,13 @@ class _GateFile(BaseModel):
             raise ValueError("is none: this robot is to have no gate; take the key away for a gate without sensors")
         return section
 
+    @field_validator("safety")
+    @classmethod
+    def _has_a_graph_for_its_topic(cls, safety: SafetyConfig) -> SafetyConfig:
+        if safety.enable is not None and safety.enable.topic and not (safety.ros1 or safety.ros2):
+            raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
+        return safety
+
     @model_validator(mode="before")
     @classmethod
     def _take_from_the_robot(cls, document: Any) -> Any:

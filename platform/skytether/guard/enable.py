@@ -255,4 +255,6 @@ def open_line(words: Sequence[str]) -> Line:
         return DatagramLine(rest[0])
     if kind == "udp":
         return DatagramLine((rest[0], int(rest[1])))
-    return ValueFile(rest[0])
+    if kind == "file":
+        return ValueFile(rest[0])
+    raise OSError(f"there is no line '{' '.join(words)}'")

@@ -151,8 +151,6 @@ class SafetyConfig(SourcesConfig):
             raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
         for name in self.kinds() if self.ros1 or self.ros2 else ():
             check_name(name, 1 if self.ros1 else 2)
-        if self.enable is not None and self.enable.topic and not (self.ros1 or self.ros2):
-            raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
         topics = [*self.sensors, *(topic for topic, _ in self._other_kinds())]
         for topic in topics:
             if topics.count(topic) > 1:
