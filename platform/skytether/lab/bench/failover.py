@@ -101,7 +101,7 @@ class _Base:
         self.written.append(_Written(time.monotonic(), twist.linear.x, self.source()))
 
 
-class _Granted:
+class Granted:
     """An orchestrator that gives the one session there is."""
 
     def __init__(self, session: rest.Session) -> None:
@@ -171,7 +171,7 @@ def _measure(rate: float, n: int, chance: random.Random, on_cut: Callable[[float
             bind=("127.0.0.1", 0),
         )
         placed = session.model_copy(update={"host": address[0], "port": address[1]})
-        agent = stack.enter_context(Agent(config, base, client=_Granted(placed)))
+        agent = stack.enter_context(Agent(config, base, client=Granted(placed)))
         base.source = lambda: agent.source
         times, jumps = [], []
         for i in range(n):
