@@ -59,6 +59,7 @@ TOGETHER = (
     "robot/safety/test_footprint.py",
     "robot/safety/test_rules.py",
     "robot/safety/test_sensing.py",
+    "robot/test_accrual.py",
     "robot/test_arbiter.py",
     "robot/test_ros2.py",
     "robot/test_supervisor.py",

@@ -200,19 +200,19 @@ def test_each_trouble_is_named_once_not_at_every_tick(driven, nan_twist, caplog)
     ]
 
 
-@pytest.mark.parametrize(("period", "patience"), [(0.02, 0.025), (0.05, 0.085), (0.1, 0.185)])
-def test_a_slower_service_is_left_within_two_of_its_periods(base, make_cloud, bridge, period, patience):
+@pytest.mark.parametrize(("period", "patience"), [(0.02, 0.05), (0.05, 0.125), (0.1, 0.25)])
+def test_a_service_is_left_within_three_of_its_periods(base, make_cloud, bridge, period, patience):
     rig = Rig(base, make_cloud, limits=Limits(max_gap_s=1.0))
     rig.connect(bridge)
     rig.driver.hold_to(Terms(period_s=period))
-    for _ in range(round(3 / period)):
+    for _ in range(round(8 / period)):
         rig.cloud.send(rig.now, delay=0.0)
         rig.run(period)
     assert rig.driver.status().source is Source.CLOUD
     silent = rig.now - period
-    status = rig.run(2 * period)
+    status = rig.run(3 * period)
     assert status.source is Source.FALLBACK
-    assert status.transitions[-1].at - silent <= patience + TICK + 1e-9 < 2 * period
+    assert status.transitions[-1].at - silent <= patience + 2 * TICK + 1e-9
 
 
 def test_a_sensor_that_raises_brakes_the_wheels_and_is_logged_once(driven, caplog):

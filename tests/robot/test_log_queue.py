@@ -86,5 +86,9 @@ def test_who_never_reads_is_left_behind(reader):
     lines.use()
     for _ in range(10):
         LOG.warning("unread")
+    thread = lines._thread
     lines.done()
     assert reader.lines == []
+    reader.reads.set()
+    thread.join(30)
+    assert reader.lines == ["unread"], "the one that it had in its hands"

@@ -9,52 +9,16 @@ from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.robot.arbiter import Link, Needs, Reason
 from skytether.robot.link import LinkMonitor, Quality
-from skytether.robot.service_manager import Patience, ServiceManager, Terms, explain, terms, tighten
+from skytether.robot.service_manager import ServiceManager, Terms, explain, terms, tighten
 from skytether.wire.stats import SessionStats, TopicStats
 
 CMD_VEL = TopicSpec(name="cmd_vel", type="geometry_msgs/msg/Twist", direction="out", period_ms=50)
-TICK = 0.01
 
 
 def test_terms_are_read_from_the_manifest():
     asked = ServiceNeeds(max_rtt_ms=100, max_loss=0.05)
     assert terms(asked, [CMD_VEL], "cmd_vel") == Terms(0.1, 0.05, 0.05, 0.05)
     assert terms(ServiceNeeds(), [CMD_VEL], "other") == Terms(None, None, 0.5, None)
-
-
-@pytest.mark.parametrize("period", [None, 0.002, 0.01])
-def test_fast_services_and_those_that_do_not_say_have_all_the_patience(period):
-    patience = Patience(period, 0.15, TICK)
-    for i in range(100):
-        patience.arrived(i * 0.01)
-    assert patience.limit_s == 0.15
-
-
-@pytest.mark.parametrize("period", [0.02, 0.03, 0.05, 0.1, 0.2, 1.0])
-def test_slower_services_are_waited_for_less_than_two_periods(period):
-    patience = Patience(period, 0.15, TICK)
-    assert patience.limit_s == max(0.15, patience.least_s), "nothing is known yet"
-    for i in range(40):
-        patience.arrived(i * period)
-    assert period < patience.limit_s <= 2 * period - TICK
-
-
-def test_uneven_commands_are_waited_for_as_long_as_they_have_been_uneven():
-    patience, at = Patience(0.05, 0.15, TICK), 0.0
-    for i in range(100):
-        at += 0.11 if i in (40, 50) else 0.05
-        patience.arrived(at)
-    assert patience.limit_s == pytest.approx(patience.least_s), "two hiccups make no uneven link"
-    at += 0.11
-    patience.arrived(at)
-    assert patience.limit_s == pytest.approx(0.11 + TICK / 2)
-    for _ in range(1300):  # 65 s
-        at += 0.05
-        patience.arrived(at)
-    assert patience.limit_s == pytest.approx(patience.least_s)
-    at += 3.0
-    patience.arrived(at)
-    assert patience.limit_s == pytest.approx(patience.least_s), "an outage says nothing about ordinary days"
 
 
 def stats(delivered: int, offered: int = 0, expired: int = 0) -> SessionStats:
@@ -84,7 +48,7 @@ def test_a_service_that_sends_at_ten_times_its_rate_is_told():
 def test_a_service_too_slow_for_the_robots_limits_is_told():
     ((kind, sentence),) = ServiceManager(Terms(period_s=0.2), "cmd_vel", 0.15).troubles()
     assert kind == "slow"
-    assert "raise limits.max_gap_s to 0.4 or more" in sentence
+    assert "raise limits.max_gap_s to 0.5 or more" in sentence
 
 
 @pytest.mark.parametrize("reason", list(Reason))

@@ -6,7 +6,7 @@ from math import inf, nan
 import pytest
 
 from skytether.robot import stall
-from skytether.robot.arbiter import Needs, Reason
+from skytether.robot.arbiter import Needs
 from skytether.robot.command import Source
 from skytether.robot.driver import Driver
 from skytether.robot.fallback import Admittance
@@ -65,13 +65,21 @@ def test_after_a_gap_the_robot_begins_from_standstill(robot, gap, slept):
     begin = len(robot.told)
     robot.tick(gap, slept)
     assert robot.told[begin:] == [0.0]
-    assert robot.driver.status().transitions[-1].reason is Reason.STALL
-    robot.run(0.5)
-    assert set(robot.told[begin:]) == {0.0}, "the cloud does not drive before all has been well for a second"
+    robot.run(0.02)
+    assert set(robot.told[begin:]) == {0.0}, "those under way were made before"
     robot.run(1.5)
+    assert robot.driver.source is Source.CLOUD
     assert robot.told[-1] == pytest.approx(0.2)
     assert all(after - before <= STEP + 1e-9 for before, after in pairwise([0.0, *robot.told[begin:]]))
     assert robot.driver.status().stalls == 1
+
+
+def test_a_service_that_is_gone_after_the_gap_is_found_out(robot):
+    begin = len(robot.told)
+    robot.tick(2.0)
+    robot.run(0.2, command=False)
+    assert robot.driver.source is Source.FALLBACK
+    assert robot.told[begin : begin + 10] == [0.0] * 10
 
 
 def test_a_short_delay_is_no_stall(robot):

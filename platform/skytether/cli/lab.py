@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .lab_failover import alarms, failover
 from .lab_safety import safety
 from .output import console, fail, print_json, silenced
 
@@ -204,47 +205,8 @@ def fleet(
         fail("the orchestrator's books do not balance")
 
 
-@bench.command("failover")
-def failover(
-    n: Annotated[int, typer.Option("-n", min=1, max=10_000, help="Cuts at each rate.")] = 20,
-    rate: Annotated[
-        list[float] | None, typer.Option(help="Commands per second; may be repeated. Default: 100, 50, 20, 10, 5.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the moments at which the link is cut.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each rate.")] = False,
-) -> None:
-    """Cut the link under a driven robot, and time it until its own controller drives.
-
-    Ends with exit status 1 if a bound was missed: 200 ms at 100 Hz and faster, two command periods otherwise.
-    """
-    from rich.table import Table
-
-    from skytether.lab.bench.failover import RATES_HZ, bench_failover
-    from skytether.lab.bench.pair import BenchError
-    from skytether.robot import driver
-
-    try:
-        with silenced(driver.__name__), console.status("starting ...") as line:
-            rows = bench_failover(rate or RATES_HZ, n, seed, lambda r, i: line.update(f"{r:g} Hz: cut {i} of {n}"))
-    except ValueError as error:
-        fail(str(error), 2)
-    except (BenchError, OSError) as error:
-        fail(str(error))
-    if json:
-        print_json([row.document() for row in rows])
-    else:
-        table = Table(title="From cut to local control")
-        for heading in ("rate [Hz]", "p50 [ms]", "p99 [ms]", "max [ms]", "bound [ms]", "largest jump [m/s]", "cuts"):
-            table.add_column(heading, justify="right")
-        for row in rows:
-            times = (row.cut_to_local_p50_ms, row.cut_to_local_p99_ms, row.cut_to_local_max_ms, row.bound_ms)
-            table.add_row(
-                f"{row.rate_hz:g}", *(f"{t:.0f}" for t in times), f"{row.velocity_jump_max_m_s:.3f}", str(row.n)
-            )
-        console.print(table)
-    missed = [row for row in rows if row.cut_to_local_max_ms > row.bound_ms]
-    if missed:
-        fail(f"a bound was missed at {', '.join(f'{row.rate_hz:g} Hz' for row in missed)}; is the machine busy?")
+bench.command("failover")(failover)
+bench.command("alarms")(alarms)
 
 
 @bench.command("bridge")

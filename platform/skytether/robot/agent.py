@@ -476,7 +476,7 @@ class Agent:
         if opened is not None and session is not None and session.id != self._served:
             self._left, self._served = self._served, session.id
             self._told(opened.instance)
-            self._manager = ServiceManager(opened.terms, self._config.command_topic, self._config.limits.max_gap_s)
+            self._manager = ServiceManager(opened.terms, self._config.command_topic, self._config.limits.silence_s)
             self._driver.quality = Quality()
             self._driver.hold_to(opened.terms)
         while self._driver.left:

@@ -37,8 +37,6 @@ class Reason(StrEnum):
     """More messages of a topic are too old before they are through than the service bears."""
     CLOCK = "clock"
     """The peer's clock is not known well enough to judge the age of commands."""
-    STALL = "stall"
-    """The control loop stood still: what it knew is forgotten."""
     RECOVERED = "recovered"
     """The link has been good for long enough."""
 
@@ -54,7 +52,8 @@ class Needs:
         max_loss: Share of messages; None: any but all.
         max_late: Share of a topic's messages that may miss their lifespan.
         max_clock_error_s: Largest bound of the clock offset's error [s].
-        command_timeout_s: Without a valid command for this long the robot is on its own [s].
+        command_timeout_s: Without a valid command for this long the robot is on its own [s]; what is learned of the
+            commands takes its place (`accrual`).
         bad_s: How long round trip, loss, lateness or clock must be bad in one piece [s].
         good_s: How long everything must be good in one piece before the cloud drives (again) [s].
         local: Who drives when the cloud does not.
@@ -123,13 +122,6 @@ class Choice:
 def start(needs: Needs, now: float) -> Choice:
     """Before the first command of the cloud the robot is on its own."""
     return Choice(needs.local, Reason.START, now)
-
-
-def stalled(needs: Needs, choice: Choice, now: float) -> Choice:
-    """The control loop stood still: the robot is on its own, and the link has to be good anew."""
-    if choice.source is Source.CLOUD:
-        return Choice(needs.local, Reason.STALL, now)
-    return replace(choice, good_since=None)
 
 
 def choose(needs: Needs, choice: Choice, link: Link, now: float) -> Choice:

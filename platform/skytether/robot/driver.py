@@ -17,12 +17,13 @@ from skytether.messages import DecodeError, Encoding, Message, Twist, Vector3, d
 from skytether.wire.events import MessageReceived
 
 from . import arbiter, service_manager, supervisor
+from .accrual import Accrual
 from .arbiter import Choice, Link, Needs
 from .command import UNUSED_AXES, Command, Source, unused_axes
 from .fallback import Fallback, Reading, Watching
 from .link import Quality
 from .notices import Notices
-from .service_manager import Patience, Terms
+from .service_manager import Terms
 from .session import LiveSession
 from .stall import StallWatch
 from .supervisor import Limits, Objection, Supervised
@@ -40,6 +41,10 @@ _NAMED = {
     Objection.ANGULAR_LIMIT: "turning faster than limits.angular_max allows; they are cut down",
 }
 """Named in the log, once while it lasts. A gap is told by the hand-over; limits of acceleration are no trouble."""
+_LOOKED_TICKS = 2.0
+"""Periods of the loop that one tick counts for at most, when the cloud's silence is measured."""
+_TICK_S = 0.5
+"""No tick takes longer than this: a command that came later than that after its begin is not from this clock."""
 _SETTLE_S = 0.2
 """After a stall, how long readings are not used [s]: those from before it wait in sockets, and are read first."""
 _TRANSITIONS_KEPT = 1000
@@ -98,6 +103,7 @@ class DriverStatus:
         first_command_at: Arrival of the first command from the cloud that was admitted.
         last_command_at: Of the newest.
         readings: Messages read from the base, by topic.
+        silence_limit_s: A longer silence of the cloud hands over, as was learned of its commands.
         stalls: Times that the loop stood still for longer than `Limits.watchdog_s`, or the computer slept.
     """
 
@@ -112,6 +118,7 @@ class DriverStatus:
     first_command_at: float | None
     last_command_at: float | None
     readings: Mapping[str, int]
+    silence_limit_s: float
     stalls: int
 
 
@@ -148,11 +155,13 @@ class Driver:
         self._base = base
         self._fallback = fallback
         self._watching = fallback if isinstance(fallback, Watching) else None
-        self._limits = limits
+        self._own_limits = self._limits = limits
+        """As configured, and with what was learned of the commands' gaps."""
         self._observer = observer
         self._own_needs = self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
         self._command_timeout_s = needs.command_timeout_s
-        self._patience = Patience(None, needs.command_timeout_s, limits.period_s)
+        self._arrivals = Accrual(None, limits.silence_s, needs.command_timeout_s)
+        self._quiet = inf
         self._notices = Notices(_log)
         self._choice: Choice = arbiter.start(self._needs, now)
         self._supervised = Supervised()
@@ -180,7 +189,7 @@ class Driver:
 
     def hold_to(self, terms: Terms) -> None:
         """Take over what the service's manifest says of the link and of its commands, where it is stricter."""
-        self._patience = Patience(terms.period_s, self._command_timeout_s, self._limits.period_s)
+        self._arrivals = Accrual(terms.period_s, self._own_limits.silence_s, self._command_timeout_s)
         self._needs = service_manager.tighten(self._own_needs, terms)
 
     def tick(self, now: float, boot: float | None = None) -> None:
@@ -196,6 +205,8 @@ class Driver:
         self._seconds[self._choice.source] += max(0.0, now - self._now)
         try:
             self._look_for_stall(now, boot)
+            # Time in which nobody could look proves no silence: what came meanwhile may wait in the socket still.
+            self._quiet += min(max(0.0, now - self._now), _LOOKED_TICKS * self._limits.period_s)
             self._take_readings(now)
             self._take_commands(now)
             self._choose(now)
@@ -234,8 +245,9 @@ class Driver:
             objections=dict(self._objections),
             errors=dict(self._errors),
             first_command_at=self._first_command_at,
-            last_command_at=held.received_at if held else None,
+            last_command_at=held.received_at if held and isfinite(held.received_at) else None,
             readings=dict(self._read),
+            silence_limit_s=self._arrivals.limit_s,
             stalls=self._stalls,
         )
 
@@ -251,17 +263,10 @@ class Driver:
         self._readings.clear()
         self._believed_from = now + _SETTLE_S
         self._now = now - self._limits.period_s  # the wheels' step, and the fallback's, is an ordinary one
+        if isfinite(self._quiet):
+            self._quiet = 0.0  # whether the cloud is there is found out from now on
         sentence = f"the control loop stood still for {stood:.2f} s; the robot goes on from standstill"
         self._notices.say("stall", f"control: {sentence}", now)
-        before, self._choice = self._choice, arbiter.stalled(self._needs, self._choice, now)
-        if self._choice.source is not before.source:
-            self._handed_over(before.source, sentence, now)
-
-    def _handed_over(self, before: Source, why: str, now: float) -> None:
-        self._counts[self._choice.reason] += 1
-        self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
-        _log.warning("control: %s -> %s (%s): %s", before, self._choice.source, self._choice.reason, why)
-        self._why = why
 
     def _take_readings(self, now: float) -> None:
         for topic, message in self._base.read(now):
@@ -306,9 +311,13 @@ class Driver:
         except DecodeError as error:
             self._caught("decode", error)
             return
+        late = command.received_at - now
+        if 0 < late < _TICK_S:  # it came while this tick was under way, which began at `now`
+            command = replace(command, received_at=now, sent_at=command.sent_at - late)
         objection = self._admit(command, now)
         if objection is None:
-            self._patience.arrived(command.received_at)
+            self._arrivals.arrived(command.received_at)
+            self._quiet = min(max(0.0, now - command.received_at), _LOOKED_TICKS * self._limits.period_s)
             if self._first_command_at is None:
                 self._first_command_at = command.received_at
         if self._observer is not None:
@@ -321,20 +330,24 @@ class Driver:
         held = self._supervised.held.get(Source.CLOUD)
         link = Link(
             connected=self.session is not None and self.session.connected,
-            command_at=held.received_at if held is not None and isfinite(held.received_at) else None,
+            command_at=now - self._quiet if isfinite(self._quiet) else None,
             rtt=self.quality.rtt,
             loss=self.quality.loss,
             late=self.quality.late,
             clock_error=held.sent_at_error if held else nan,
         )
-        timeout = min(self._patience.limit_s, self._limits.max_gap_s)
+        timeout = self._arrivals.limit_s
         if timeout != self._needs.command_timeout_s:
             self._needs = replace(self._needs, command_timeout_s=timeout)
+            self._limits = replace(self._own_limits, max_gap_s=max(self._own_limits.max_gap_s, timeout))
         before = self._choice
         self._choice = arbiter.choose(self._needs, before, link, now)
         if self._choice.source is not before.source:
             why = service_manager.explain(self._choice.reason, self._needs, link, self.quality, now)
-            self._handed_over(before.source, why, now)
+            self._counts[self._choice.reason] += 1
+            self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
+            _log.warning("control: %s -> %s (%s): %s", before.source, self._choice.source, self._choice.reason, why)
+            self._why = why
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source

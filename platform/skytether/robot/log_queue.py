@@ -34,6 +34,7 @@ class LogQueue:
         self._handler = _Into(self._lines)
         self._before: tuple[list[logging.Handler], bool] = ([], True)
         self._thread: threading.Thread | None = None
+        self._leave = threading.Event()
 
     @property
     def dropped(self) -> int:
@@ -50,7 +51,10 @@ class LogQueue:
             self._before = (logger.handlers[:], logger.propagate)
             logger.handlers[:] = [self._handler]
             logger.propagate = False
-            self._thread = threading.Thread(target=self._run, args=self._before, name="log", daemon=True)
+            self._leave = threading.Event()
+            self._thread = threading.Thread(
+                target=self._run, args=(*self._before, self._leave), name="log", daemon=True
+            )
             self._thread.start()
 
     def done(self) -> None:
@@ -61,14 +65,16 @@ class LogQueue:
                 return
             self._logger.handlers[:], self._logger.propagate = self._before
             thread, self._thread = self._thread, None
+            leave = self._leave
         with suppress(queue.Full):  # nobody has read for long: the thread is left behind, it ends with the program
             self._lines.put(None, timeout=_DRAIN_S)
         if thread is not None:
             thread.join(_DRAIN_S)
+        leave.set()
 
-    def _run(self, handlers: list[logging.Handler], propagate: bool) -> None:
+    def _run(self, handlers: list[logging.Handler], propagate: bool, leave: threading.Event) -> None:
         told = self.dropped
-        while (record := self._lines.get()) is not None:
+        while (record := self._lines.get()) is not None and not leave.is_set():
             _handle(record, handlers, propagate)
             if (dropped := self.dropped) != told and self._lines.empty():
                 told, lines = dropped, dropped - told

@@ -1,10 +1,10 @@
 """What a service promised and what the link gives: whether the service may drive (Mello, thesis, section 3.3).
 
 The thesis's Service Manager "is also responsible for monitoring the status of the communication and triggering the use
-of a local version of the admittance controller in case of poor QoS". Here are its numbers: how long the service may be
-silent, how much may be lost or late on either way, and a sentence for each decision. Who drives is chosen by `arbiter`
-from these, tick by tick; the velocity stays within reach of the one before in `supervisor`, whoever drives.
-Pure: time is an argument.
+of a local version of the admittance controller in case of poor QoS". Here are its numbers: how much may be lost or late
+on either way, and a sentence for each decision; `accrual` learns how long the service may be silent. Who drives is
+chosen by `arbiter` from these, tick by tick; the velocity stays within reach of the one before in `supervisor`, whoever
+drives. Pure: time is an argument.
 """
 
 from __future__ import annotations
@@ -17,21 +17,12 @@ from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.wire.stats import SessionStats
 
+from .accrual import LEAST_PERIODS
 from .arbiter import Link, Needs, Reason
 from .link import LinkMonitor, Quality
 
 MOST_LATE = 0.5
 """Share of a topic's messages that may miss their lifespan where the manifest states no ``max_loss``."""
-_FAST_S = 0.01
-"""Services that command this often (100 Hz) or more often are given `Needs.command_timeout_s`, whole."""
-_BEAR = 1.25
-"""A silence of this many periods is never too long: sender, link and receiver may each be a little late."""
-_LEARNED_AFTER = 20
-"""Gaps between commands that must have been seen before patience is less than the most."""
-_MEMORY_S = 30.0
-"""For how long a long gap is remembered at least [s]; at most twice as long."""
-_HICCUPS = 2
-"""Gaps within that time that may be longer than what is waited for: a machine that stalls once makes no uneven link."""
 _OVERRATE = 3.0
 """A topic that comes more than this many times as often as its manifest says is named."""
 
@@ -81,74 +72,21 @@ def _least(*given: float | None) -> float | None:
     return min((number for number in given if number is not None and isfinite(number)), default=None)
 
 
-class Patience:
-    """How long the service may be silent before the robot's own controller takes over.
-
-    At 100 Hz and faster, or where the manifest does not say how fast: ``most_s``, whole. Slower services are given less
-    than two periods, so that no robot goes on for long with a command that has no successor, but at least the gaps that
-    came again and again in the last half minute (as far as ``most_s``): on a link that lets commands come unevenly the
-    robot would otherwise change hands all the time.
-
-    Args:
-        period_s: Between commands, as the manifest says [s]; None: it does not say.
-        most_s: `Needs.command_timeout_s`.
-        tick_s: Of the control loop: a hand-over happens up to that much later [s].
-    """
-
-    def __init__(self, period_s: float | None, most_s: float, tick_s: float) -> None:
-        self._adapts = period_s is not None and period_s > _FAST_S
-        period = period_s or 0.0
-        self._least = max(2 * period - 1.5 * tick_s, _BEAR * period) if self._adapts else most_s
-        self._most = max(most_s, self._least)
-        self._tick_s = tick_s
-        self._last: float | None = None
-        self._seen = 0
-        self._longest: list[list[float]] = [[], []]
-        """Of this half minute, and of the one before; the longest first."""
-        self._usual = 0.0
-        """Longest gap but for hiccups [s]."""
-        self._turned = -inf
-
-    @property
-    def least_s(self) -> float:
-        """What it is on a link without jitter [s]."""
-        return self._least
-
-    def arrived(self, at: float) -> None:
-        """A command came [monotonic s]."""
-        gap = at - self._last if self._last is not None else 0.0
-        self._last = at
-        if at - self._turned > _MEMORY_S:
-            self._longest = [[], self._longest[0]]
-            self._turned = at
-        if 0 < gap <= self._most:  # a longer one was an outage, and says nothing about ordinary days
-            self._seen += 1
-            self._longest[0] = sorted([*self._longest[0], gap], reverse=True)[: _HICCUPS + 1]
-            self._usual = min(sorted([*self._longest[0], *self._longest[1]], reverse=True)[: _HICCUPS + 1])
-
-    @property
-    def limit_s(self) -> float:
-        """Now [s]."""
-        if not self._adapts or self._seen < _LEARNED_AFTER:
-            return self._most
-        return min(max(self._least, self._usual + self._tick_s / 2), self._most)
-
-
 class ServiceManager:
     """Watches one session against its terms.
 
     Args:
         terms: The session's.
         command_topic: What drives the robot.
-        max_gap_s: How long one command may act at most, by the robot's own limits [s].
+        silence_s: How long one command may act at most, by the robot's own limits [s].
     """
 
-    def __init__(self, terms: Terms, command_topic: str, max_gap_s: float) -> None:
+    def __init__(self, terms: Terms, command_topic: str, silence_s: float) -> None:
         self.terms = terms
         self.quality = Quality()
         self._monitor = LinkMonitor()
         self._command_topic = command_topic
-        self._max_gap_s = max_gap_s
+        self._silence_s = silence_s
         self._second: tuple[float, int] | None = None
         self._rate = 0.0
 
@@ -175,13 +113,13 @@ class ServiceManager:
                     f"{1 / period:.0f}: the newest is followed; mend the service, or period_ms in its manifest",
                 )
             )
-        if period is not None and _BEAR * period > self._max_gap_s:
+        if period is not None and LEAST_PERIODS * period > self._silence_s:
             found.append(
                 (
                     "slow",
                     f"the service sends {self._command_topic} every {period * 1000:.0f} ms, and the robot follows one "
-                    f"for {self._max_gap_s * 1000:.0f} ms at most: raise limits.max_gap_s to {2 * period:.2g} or more, "
-                    "or use a faster service",
+                    f"for {self._silence_s * 1000:.0f} ms at most: raise limits.max_gap_s to "
+                    f"{LEAST_PERIODS * period:.2g} or more, or use a faster service",
                 )
             )
         return found
@@ -207,8 +145,6 @@ def explain(reason: Reason, needs: Needs, link: Link, quality: Quality, now: flo
         case Reason.CLOCK:
             known = f"known to {link.clock_error * 1000:.0f} ms" if link.clock_error < inf else "not known"
             return f"the service's clock is {known}, needed is {needs.max_clock_error_s * 1000:.0f} ms"
-        case Reason.STALL:
-            return "the control loop stood still; new commands are followed once all has been well for a while"
         case Reason.RECOVERED:
             return f"all has been well for {needs.good_s:g} s"
         case Reason.START:

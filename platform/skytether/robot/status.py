@@ -82,6 +82,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
         "errors": dict(driver.errors),
         "overruns": status.overruns,
         "stalls": driver.stalls,
+        "silence_limit_ms": _ms(driver.silence_limit_s),
         "log_lines_dropped": status.log_lines_dropped,
     }
 

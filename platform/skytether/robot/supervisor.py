@@ -48,6 +48,13 @@ class Objection(StrEnum):
     ANGULAR_ACCELERATION = "angular_acceleration"
 
 
+DEFAULT_GAP_S = 0.15
+_BLIND_M = 0.1
+"""How far the robot may go on a command that has no successor, where nothing else is configured."""
+_MOST_SILENCE_S = 0.5
+"""And for how long, however slow it is: a person sees nothing happen."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """What the robot's wheels may do, whoever drives. The defaults are the walker's (thesis section 2.5.1).
@@ -60,7 +67,7 @@ class Limits:
         angular_acceleration: Of ordinary changes, both ways [rad/s^2].
         linear_braking: When no valid command is there [m/s^2].
         angular_braking: When no valid command is there [rad/s^2].
-        max_gap_s: Longest time that a command from the cloud is repeated when no newer one arrives [s].
+        max_gap_s: Longest time that a command is repeated when no newer one arrives [s]; see also `silence_s`.
         max_local_age_s: Oldest readings that a command of the robot's own fallback may be made from [s].
         clock_tolerance_s: How far in the future a time may lie: readers of one clock in several threads [s].
         period_s: Of the control loop; used to brake with when the clock fails [s].
@@ -78,12 +85,23 @@ class Limits:
     angular_acceleration: float = 2.0
     linear_braking: float = 2.0
     angular_braking: float = 4.0
-    max_gap_s: float = 0.15
+    max_gap_s: float = DEFAULT_GAP_S
     max_local_age_s: float = 0.1
     clock_tolerance_s: float = 0.01
     period_s: float = 0.01
     max_step_s: float = 0.05
     watchdog_s: float = 0.1
+
+    @property
+    def silence_s(self) -> float:
+        """Longest time that a command from the cloud may be repeated, however irregular the cloud is [s].
+
+        It is `max_gap_s`, if that is another than the default; else the time in which the robot goes 0.1 m at its
+        fastest, between 0.15 and 0.5 s. How long it is in fact follows from how regularly commands come (`accrual`).
+        """
+        if self.max_gap_s != DEFAULT_GAP_S:
+            return self.max_gap_s
+        return min(max(_BLIND_M / max(self.linear_max, -self.linear_min), DEFAULT_GAP_S), _MOST_SILENCE_S)
 
     def __post_init__(self) -> None:
         """Refuse limits that would not limit.
