@@ -14,6 +14,10 @@ from math import ceil, exp, log
 
 LEAST_PERIODS = 2.5
 """No silence shorter than that is suspected: one message may be lost, and the next be half a period late."""
+_ORDINARY_S = 0.03
+"""Nor one that is less than that longer than two periods: pauses of a computer without real-time scheduling."""
+_LOST = 3
+"""Messages that were lost, to tell a cut from a pause: who pauses sends nothing, and loses nothing."""
 _CHANCE = 1e-6
 """Of a gap that is longer than the limit, by the tail: once in three hours at 100 Hz."""
 _WINDOW = 400
@@ -53,11 +57,16 @@ class Accrual:
         """Longest gap of each minute that had any, with the minute's beginning; oldest first."""
         self._limit_s = min(max(first_s, LEAST_PERIODS * (period_s or 0.0)), most_s)
 
-    def arrived(self, at: float) -> None:
-        """A message came [monotonic s]."""
+    def arrived(self, at: float, lost: int = 0) -> None:
+        """A message came.
+
+        Args:
+            at: When [monotonic s].
+            lost: Messages between it and the one before that did not come.
+        """
         gap = at - self._last if self._last is not None else 0.0
         self._last = at
-        if not 0 < gap <= self._most_s:  # a longer one was an outage, and says nothing about ordinary days
+        if lost >= _LOST or not 0 < gap <= self._most_s:  # an outage, which says nothing about ordinary days
             return
         self._seen += 1
         self._begin = at if self._begin is None else self._begin
@@ -85,4 +94,9 @@ class Accrual:
         excess = sum(gap - begin for gap in gaps[first:]) / (len(gaps) - first)
         tail = begin + excess * log(_TAIL / _CHANCE)
         again = max(_AGAIN * gap * exp(-(now - at) * log(2) / _HALVED_S) for at, gap in self._longest)
-        return min(max(LEAST_PERIODS * period, tail, again), self._most_s)
+        return min(max(least_s(period), tail, again), self._most_s)
+
+
+def least_s(period_s: float) -> float:
+    """The silence that is suspected first, of a sender that is as regular as a clock [s]."""
+    return max(LEAST_PERIODS * period_s, 2 * period_s + _ORDINARY_S)

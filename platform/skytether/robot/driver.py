@@ -162,6 +162,8 @@ class Driver:
         self._command_timeout_s = needs.command_timeout_s
         self._arrivals = Accrual(None, limits.silence_s, needs.command_timeout_s)
         self._quiet = inf
+        self._command_before = (0, 0)
+        """Handshake and sequence of the newest that was admitted."""
         self._notices = Notices(_log)
         self._choice: Choice = arbiter.start(self._needs, now)
         self._supervised = Supervised()
@@ -316,7 +318,10 @@ class Driver:
             command = replace(command, received_at=now, sent_at=command.sent_at - late)
         objection = self._admit(command, now)
         if objection is None:
-            self._arrivals.arrived(command.received_at)
+            before = self._command_before
+            lost = command.sequence - before[1] - 1 if before[0] == command.epoch else 0
+            self._command_before = command.epoch, command.sequence
+            self._arrivals.arrived(command.received_at, lost)
             self._quiet = min(max(0.0, now - command.received_at), _LOOKED_TICKS * self._limits.period_s)
             if self._first_command_at is None:
                 self._first_command_at = command.received_at

@@ -32,6 +32,7 @@ from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.lab.link import LinkConditions, LinkEmulator
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
+from skytether.robot.accrual import least_s
 from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.command import Command, Source
 from skytether.robot.supervisor import Limits
@@ -187,7 +188,9 @@ def _measure(rate: float, n: int, chance: random.Random, on_cut: Callable[[float
         cut_to_local_p99_ms=round(float(p99), 1),
         cut_to_local_max_ms=round(max(times), 1),
         jitter_ms=round(jitter, 1),
-        bound_ms=round(min(3000 / rate + 1.25 * jitter, 1000 * most_s(rate)) + _TICKS_MS, 1),
+        bound_ms=round(
+            min(max(3000 / rate + 1.25 * jitter, 1000 * least_s(1 / rate)), 1000 * most_s(rate)) + _TICKS_MS, 1
+        ),
         velocity_jump_max_m_s=round(max(jumps), 4),
     )
 
