@@ -39,6 +39,10 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("GET", f"{API}/robots", None, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/robots", {"name": "tmp"}, (401, 401, 403, 403, 201)),
     ("DELETE", f"{API}/robots/tmp", None, (401, 401, 403, 403, 204)),
+    ("POST", f"{API}/robots/walker/stop", {"reason": "fire"}, (401, 401, 403, 403, 200)),
+    ("POST", f"{API}/robots/stop", {"reason": "fire"}, (401, 401, 403, 403, 200)),
+    ("GET", f"{API}/robots/walker/stop", None, (401, 401, 200, 403, 200)),
+    ("POST", f"{API}/robots/walker/stop/0a/acknowledge", None, (401, 401, 404, 403, 403)),
     ("GET", f"{API}/tokens", None, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/tokens", {"name": "tmp", "scopes": ["read"]}, (401, 401, 403, 403, 201)),
     ("POST", f"{API}/tokens/none/rotate", {}, (401, 401, 403, 403, 404)),
@@ -108,7 +112,7 @@ def test_every_route_is_in_the_list(people: People) -> None:
         for method in methods
     }
     parameters = {"lab": "{site}", "tmp": "{}", "toy": "{service}", "new": "{service}", "ID": "{instance}"}
-    parameters["none"] = "{token}"
+    parameters |= {"none": "{token}", "walker": "{robot}", "0a": "{order}"}
     parameters["ENDED"] = "{instance}"
     listed = set()
     for method, path, *_ in ROUTES:

@@ -36,6 +36,8 @@ from .rest import (
     Site,
     SiteCreate,
     State,
+    StopOrder,
+    StopRobot,
     Token,
     TokenCreate,
     TokenCreated,
@@ -371,6 +373,24 @@ class Client:
     def delete_robot(self, name: str) -> None:
         """Revoke a robot's token and end what it holds."""
         self._request("DELETE", _at("robots", name))
+
+    def stop_robot(self, name: str, reason: str) -> StopOrder:
+        """Order a robot to stop; the order that it has not acknowledged yet, if there is one."""
+        return self._one(StopOrder, "POST", _at("robots", name, "stop"), StopRobot(reason=reason))
+
+    def stop_robots(self, reason: str) -> list[StopOrder]:
+        """Order all registered robots to stop."""
+        response = self._request("POST", "/robots/stop", StopRobot(reason=reason))
+        return [_parse(StopOrder, document) for document in _json(response)]
+
+    def stop_order(self, name: str) -> StopOrder | None:
+        """The last order to a robot to stop."""
+        document = _json(self._request("GET", _at("robots", name, "stop")))
+        return None if document is None else _parse(StopOrder, document)
+
+    def acknowledge_stop(self, name: str, order: str) -> StopOrder:
+        """A robot says that it stands; with its own token only."""
+        return self._one(StopOrder, "POST", _at("robots", name, _at("stop", order, "acknowledge").removeprefix("/")))
 
     # Everything
 

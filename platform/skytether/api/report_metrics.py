@@ -88,6 +88,7 @@ def _of_robots(samples: Iterable[Sample]) -> Sums:
 def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
     """What is so now."""
     rtt, source, load, battery, delay, jitter = Sums(), Sums(), Sums(), Sums(), Sums(), Sums()
+    up, stopped, troubles = Sums(), Sums(), Sums()
     for (robot, service, site), report in reports:
         rtt.put((robot, service, site), report.rtt_s)
         if report.control_source in SOURCES:
@@ -95,6 +96,10 @@ def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
                 source.put((robot, service, name), float(name == report.control_source))
         load.put((robot,), report.load)
         battery.put((robot,), report.battery)
+        if report.gate is not None:
+            up.put((robot,), float(report.gate.answers))
+            stopped.put((robot,), float(bool(report.gate.stopped)))
+            troubles.put((robot,), float(report.gate.troubles))
         for topic in report.topics:
             labels = (robot, service, topic.topic, str(topic.priority), topic.direction)
             delay.put((*labels, "0.5"), topic.delay_p50_s)
@@ -103,6 +108,9 @@ def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
     yield gauge("path_rtt_seconds", "Round trip between robot and service", INSTANCE, rtt)
     yield gauge("robot_load_ratio", "Share of the robot's processors that is busy", ("robot",), load)
     yield gauge("robot_battery_ratio", "Charge of the robot's battery", ("robot",), battery)
+    yield gauge("gate_up", "1 while the gate before the robot's wheels answers", ("robot",), up)
+    yield gauge("gate_stopped", "1 while the robot stands until a person resets it", ("robot",), stopped)
+    yield gauge("gate_troubles", "What the gate says is wrong", ("robot",), troubles)
     yield gauge("control_source", "1 for who drives, 0 for who does not", ("robot", "service", "source"), source)
     labelled = ("robot", "service", *_TOPIC)
     yield gauge("topic_one_way_delay_seconds", "From publish to delivery", (*labelled, "quantile"), delay)

@@ -204,6 +204,20 @@ class TopicReport(Strict):
     jitter_s: float | None = None
 
 
+class GateReport(Strict):
+    """The gate before the robot's wheels, as the agent beside it sees it."""
+
+    answers: bool = False
+    stopped: Annotated[str, Field(max_length=200)] = ""
+    """Why the robot stands until a person beside it resets it; empty: it does not."""
+    hand: Annotated[str, Field(max_length=32)] = ""
+    """Who drives, as the gate says: ``agent``, ``joystick``, another source, or ``nobody``."""
+    zone: Annotated[str, Field(max_length=32)] = ""
+    """What lies ahead: ``free``, ``slow``, ``stop`` or ``unknown``."""
+    troubles: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Sentences that the gate has to say about what is wrong now."""
+
+
 class Report(Strict):
     """What the robot tells the orchestrator with each renewal; it feeds /metrics."""
 
@@ -224,6 +238,8 @@ class Report(Strict):
     """Charge, 0 to 1."""
     overruns: _Count | None = None
     """Ticks of the control loop that came more than a period late."""
+    gate: GateReport | None = None
+    """None: the robot's wheels are behind no gate."""
 
 
 class Migrate(Strict):
@@ -304,6 +320,26 @@ class RobotUse(Strict):
     memory_mb: int = 0
 
 
+class StopRobot(Strict):
+    """Stop a robot from afar."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=200)]
+    """For the person who stands before it."""
+
+
+class StopOrder(Strict):
+    """An order to stop. The robot stands until a person beside it resets it; nobody can reset it from afar."""
+
+    id: str
+    robot: str
+    reason: str
+    by: str
+    """Who gave it, as the audit names them."""
+    at: datetime
+    acknowledged_at: datetime | None = None
+    """When the robot said that it stands; None: it has not said so yet."""
+
+
 class Robot(RobotBase):
     """A registered robot."""
 
@@ -312,6 +348,10 @@ class Robot(RobotBase):
     use: RobotUse = RobotUse()
     quota: RobotUse = RobotUse()
     """The most that it may have of each."""
+    stop: StopOrder | None = None
+    """The last order to stop; None: there was none."""
+    gate: GateReport | None = None
+    """As the robot reported with its last renewal; None: it holds no instance, or has no gate."""
 
 
 class RobotCreated(Robot):

@@ -16,6 +16,8 @@ from .waiting import until_running
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
+    from skytether.api.rest import GateReport, StopOrder
+
 service_app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
 site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
 instance_app = typer.Typer(help="What runs, for whom.", no_args_is_help=True)
@@ -27,6 +29,7 @@ InstanceId = Annotated[str, typer.Argument(help="Its id.", autocompletion=names.
 Wait = Annotated[bool, typer.Option(help="Wait until it runs, and show how far it is.")]
 Timeout = Annotated[float, typer.Option("--timeout-s", min=0.1, help="How long to wait.")]
 _RESUMED = "the orchestrator was away: connected again, the last lines once more"
+_LONGEST_REASON = 200
 _TIMEOUT_S = 600.0
 """A large image is pulled in that time."""
 
@@ -291,10 +294,56 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
             f"{r.use.instances} of {r.quota.instances}",
             f"{r.use.cpu:g} of {r.quota.cpu:g}",
             f"{r.use.memory_mb} of {r.quota.memory_mb}",
+            _gate(r.gate),
+            _stop(r.stop),
         )
         for r in found
     ]
-    print_table(("robot", "may ask for", "registered", "last seen", "instances", "cores", "memory MiB"), rows)
+    head = ("robot", "may ask for", "registered", "last seen", "instances", "cores", "memory MiB", "gate", "stop from afar")
+    print_table(head, rows)
+
+
+@robot_app.command("stop-afar")
+def stop_afar(
+    name: Annotated[str | None, typer.Argument(help="Its name.", autocompletion=names.robots)] = None,
+    everyone: Annotated[bool, typer.Option("--all", help="All registered robots.")] = False,
+    reason: Annotated[str, typer.Option(help="For the person who stands before it.")] = "somebody asked for it",
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Order a robot to stop, from anywhere. Only a person beside it can reset it, with `skytether robot reset`.
+
+    It obeys if its robot.yaml says `stop_from_afar: true`, within seconds of hearing of it; `skytether robot list` says
+    when it did. Asking again changes nothing.
+    """
+    if everyone == (name is not None):
+        fail("name one robot, or say --all", 2)
+    if not 1 <= len(reason) <= _LONGEST_REASON:
+        fail(f"--reason: 1 to {_LONGEST_REASON} characters", 2)
+    with connected(url, token_file) as client:
+        orders = [client.stop_robot(name, reason)] if name is not None else client.stop_robots(reason)
+    if json:
+        print_json([plain(order) for order in orders])
+        return
+    rows = [(order.robot, order.reason, or_dash(order.at), or_dash(order.acknowledged_at)) for order in orders]
+    print_table(("robot", "reason", "ordered", "acknowledged"), rows)
+
+
+def _stop(order: StopOrder | None) -> str:
+    if order is None:
+        return "-"
+    if order.acknowledged_at is None:
+        return f"ordered {or_dash(order.at)}, not acknowledged: {order.reason}"
+    return f"acknowledged {or_dash(order.acknowledged_at)}: {order.reason}"
+
+
+def _gate(gate: GateReport | None) -> str:
+    if gate is None:
+        return "-"
+    if not gate.answers:
+        return "does not answer"
+    return f"stopped: {gate.stopped}" if gate.stopped else f"{gate.hand or 'nobody'} drives, ahead {gate.zone}"
 
 
 @robot_app.command("add")

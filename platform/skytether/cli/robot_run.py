@@ -224,6 +224,8 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         task=TaskConfig(task.policy(), task.addresses, task.probe_s),
         fresh_token=lambda: load_token(settings, folder),
         status_port=settings.status_port,
+        gate=None if settings.safety is None else settings.safety.place(),
+        stop_from_afar=settings.safety is not None and settings.safety.stop_from_afar,
     )
 
 

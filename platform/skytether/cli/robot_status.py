@@ -53,6 +53,7 @@ def _tables(found: dict[str, Any]) -> list[Table]:
         ("task", task["why"] if task else "the service is always asked for"),
         ("service", _instance(instance)),
         ("link", _link(link)),
+        ("gate", _gate(found.get("gate"))),
         ("processors", _share(found["robot_load"])),
         ("battery", _share(found["battery"])),
         ("trouble", found["trouble"] or "none"),
@@ -89,6 +90,17 @@ def _link(link: dict[str, Any]) -> str:
         return "not connected"
     rtt = "-" if link["rtt_ms"] is None else f"{link['rtt_ms']:.1f} ms"
     return f"round trip {rtt}, lost {_share(link['loss'])}, late {_share(link['late'])}"
+
+
+def _gate(gate: dict[str, Any] | None) -> str:
+    if gate is None:
+        return "none: the agent drives the wheels itself"
+    if not gate["answers"]:
+        return "does not answer"
+    if gate["stopped"]:
+        return f"stopped: {gate['stopped']}"
+    troubles = f", {gate['troubles']} troubles (skytether robot gate-status)" if gate["troubles"] else ""
+    return f"{gate['hand'] or 'nobody'} drives, ahead {gate['zone'] or 'unknown'}{troubles}"
 
 
 def _velocity(velocity: dict[str, float]) -> str:

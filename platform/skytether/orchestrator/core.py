@@ -32,6 +32,7 @@ from .runtimes.base import Runtime
 from .security import SecretFileError, Secrets
 from .settings import Settings
 from .sites import Sites, load_runtime
+from .stops import Stops
 from .store import Store
 from .strain import Strain
 from .throttle import Throttle
@@ -88,6 +89,7 @@ class Orchestrator:
         self.quotas = Quotas(self.store, settings.quotas)
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
+        self.stops = Stops(self.store, clock)
         self.reconciler = Reconciler(
             self.store,
             secrets,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, text, update
@@ -16,7 +16,7 @@ from skytether.api.rest import Scope, SiteCreate
 from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import Lock, lock_of
-from .models import facts, robots, services, sites, tokens
+from .models import facts, robots, services, sites, stops, tokens
 from .security import TokenHash
 
 
@@ -28,6 +28,18 @@ class RobotRow:
     services: tuple[str, ...]
     created_at: float
     last_seen_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StopRow:
+    """The last order to a robot to stop."""
+
+    robot: str
+    id: str
+    at: float
+    reason: str
+    by: str
+    acknowledged_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +200,38 @@ class Database:
         with self._writing() as connection:
             connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
 
+    def stops(self) -> dict[str, StopRow]:
+        """The last order to each robot to stop."""
+        with self._reader.connect() as connection:
+            return {row.robot: _stop(row) for row in connection.execute(select(stops))}
+
+    def stop(self, robot: str) -> StopRow | None:
+        with self._reader.connect() as connection:
+            row = connection.execute(select(stops).where(stops.c.robot == robot)).one_or_none()
+        return _stop(row) if row else None
+
+    def order_stops(self, orders: Iterable[StopRow]) -> None:
+        """An order that was not acknowledged stays instead of a new one; robots that are gone are left out."""
+        with self._writing() as connection:
+            known = set(connection.scalars(select(robots.c.name)))
+            for order in orders:
+                if order.robot not in known:
+                    continue
+                connection.execute(
+                    delete(stops).where(stops.c.robot == order.robot, stops.c.acknowledged_at.is_not(None))
+                )
+                waits = select(stops.c.robot).where(stops.c.robot == order.robot)
+                if connection.execute(waits).one_or_none() is None:
+                    connection.execute(insert(stops).values(**asdict(order)))
+
+    def acknowledge_stop(self, robot: str, id_: str, now: float) -> StopRow | None:
+        """The first time counts; None: that is not the robot's last order."""
+        mine = (stops.c.robot == robot) & (stops.c.id == id_)
+        with self._writing() as connection:
+            connection.execute(update(stops).where(mine, stops.c.acknowledged_at.is_(None)).values(acknowledged_at=now))
+            row = connection.execute(select(stops).where(mine)).one_or_none()
+        return _stop(row) if row else None
+
     # Tokens
 
     def tokens(self) -> list[TokenRow]:
@@ -255,6 +299,10 @@ class Database:
 
 def _robot(row: Row[Any]) -> RobotRow:
     return RobotRow(row.name, tuple(row.services), row.created_at, row.last_seen_at)
+
+
+def _stop(row: Row[Any]) -> StopRow:
+    return StopRow(row.robot, row.id, row.at, row.reason, row.by, row.acknowledged_at)
 
 
 def _token(row: Row[Any]) -> TokenRow:

@@ -58,6 +58,18 @@ robots = Table(
     Column("last_seen_at", Float),
 )
 
+stops = Table(
+    "stops",
+    metadata,
+    Column("robot", String(63), ForeignKey("robots.name", ondelete="CASCADE"), primary_key=True),
+    Column("id", String(32), nullable=False),
+    Column("at", Float, nullable=False),
+    Column("reason", String(200), nullable=False),
+    Column("by", String(80), nullable=False),
+    Column("acknowledged_at", Float),
+    comment="The last order to each robot to stop",
+)
+
 tokens = Table(
     "tokens",
     metadata,

@@ -13,8 +13,10 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from math import nan
+from pathlib import Path
 from random import Random
 from types import TracebackType
 from typing import Any
@@ -39,6 +41,8 @@ from .link import Quality
 from .log_queue import log_queue
 from .notices import Notices
 from .resolver import Resolver
+from .safety.afar import StopFromAfar
+from .safety.watch import GateWatch
 from .service_manager import ServiceManager, Terms, terms
 from .session import Endpoint, LiveSession
 from .snapshot import AgentStatus, report
@@ -88,6 +92,8 @@ class AgentConfig:
             site the orchestrator chooses by ``measurements``.
         fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
         status_port: Port on loopback of ``/status`` and ``/metrics``; 0: any free one; None: there are none.
+        gate: Folder of the gate before the wheels; None: there is none.
+        stop_from_afar: Whether the orchestrator may stop the robot, by the gate.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
     """
 
@@ -112,6 +118,8 @@ class AgentConfig:
     task: TaskConfig | None = None
     fresh_token: Callable[[], str] | None = None
     status_port: int | None = None
+    gate: Path | None = None
+    stop_from_afar: bool = False
     route: Callable[[str, int], Address] = lambda host, port: (host, port)
 
 
@@ -197,6 +205,12 @@ class Agent:
             renew_s=config.renew_s,
             random=random,
         )
+        self._gate = None if config.gate is None else GateWatch(config.gate)
+        self._afar = (
+            StopFromAfar(speaks, config.robot, config.gate, clock=clock)
+            if config.gate is not None and config.stop_from_afar
+            else None
+        )
         self._token = config.token
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
@@ -227,9 +241,16 @@ class Agent:
         warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
         self._serve()
-        targets = [self._control, self._ask, self._watch, *([self._decide] if self._tasks else [])]
-        for target in targets:
-            thread = threading.Thread(target=target, name=f"agent{target.__name__}", daemon=True)
+        targets: dict[str, Callable[[], object]] = {
+            "control": self._control,
+            "ask": self._ask,
+            "watch": self._watch,
+            **({"decide": partial(self._tasks.run, self._stop)} if self._tasks else {}),
+            **({"gate": partial(self._gate.run, self._stop)} if self._gate else {}),
+            **({"afar": partial(self._afar.run, self._stop)} if self._afar else {}),
+        }
+        for name, target in targets.items():
+            thread = threading.Thread(target=target, name=f"agent_{name}", daemon=True)
             self._threads.append(thread)
             thread.start()
 
@@ -294,6 +315,7 @@ class Agent:
             loss=self._driver.quality.loss,
             overruns=self._overruns,
             log_lines_dropped=log_queue.dropped,
+            gate=self._gate.report if self._gate else None,
             late=self._driver.quality.late,
             decision=self._tasks.decision if self._tasks else None,
             load=self._tasks.robot.load if self._tasks else nan,
@@ -312,6 +334,7 @@ class Agent:
             load=robot.load,
             battery=robot.battery,
             overruns=self._overruns,
+            gate=self._gate.report if self._gate else None,
         )
 
     def _control(self) -> None:
@@ -332,10 +355,6 @@ class Agent:
 
     def _ask(self) -> None:
         self._asker.run(self._stop)
-
-    def _decide(self) -> None:
-        if self._tasks is not None:
-            self._tasks.run(self._stop)
 
     def _request(self, measured: Mapping[str, rest.Measurement]) -> rest.InstanceCreate:
         config = self._config

@@ -27,6 +27,7 @@ from .service_manager import Terms
 from .session import LiveSession
 from .stall import StallWatch
 from .supervisor import Limits, Objection, Supervised
+from .told import TellsBack, Told, rebase
 
 _log = logging.getLogger(__name__)
 
@@ -104,6 +105,7 @@ class DriverStatus:
         last_command_at: Of the newest.
         readings: Messages read from the base, by topic.
         silence_limit_s: A longer silence of the cloud hands over, as was learned of its commands.
+        told: What the gate told the wheels last; None: there is none, or it does not say.
         stalls: Times that the loop stood still for longer than `Limits.watchdog_s`, or the computer slept.
     """
 
@@ -119,6 +121,7 @@ class DriverStatus:
     last_command_at: float | None
     readings: Mapping[str, int]
     silence_limit_s: float
+    told: Told | None
     stalls: int
 
 
@@ -154,6 +157,8 @@ class Driver:
         self.quality = Quality()
         self._base = base
         self._fallback = fallback
+        self._tells_back = base if isinstance(base, TellsBack) else None
+        self._told: Told | None = None
         self._watching = fallback if isinstance(fallback, Watching) else None
         self._own_limits = self._limits = limits
         """As configured, and with what was learned of the commands' gaps."""
@@ -210,6 +215,7 @@ class Driver:
             # Time in which nobody could look proves no silence: what came meanwhile may wait in the socket still.
             self._quiet += min(max(0.0, now - self._now), _LOOKED_TICKS * self._limits.period_s)
             self._take_readings(now)
+            self._take_told(now)
             self._take_commands(now)
             self._choose(now)
             velocity = self._drive(now)
@@ -249,6 +255,7 @@ class Driver:
             first_command_at=self._first_command_at,
             last_command_at=held.received_at if held and isfinite(held.received_at) else None,
             readings=dict(self._read),
+            told=self._told,
             silence_limit_s=self._arrivals.limit_s,
             stalls=self._stalls,
         )
@@ -282,6 +289,13 @@ class Driver:
                         session.publish(topic, message)
                     except Exception as error:  # costs the cloud a reading; the robot's own control goes on
                         self._caught("publish", error)
+
+    def _take_told(self, now: float) -> None:
+        if self._tells_back is None:
+            return
+        self._told = self._tells_back.told(now)
+        if self._told is not None:
+            self._supervised = rebase(self._limits, self._supervised, self._told)
 
     def _change_over(self) -> list[LiveSession]:
         """Make before break: while the cloud drives, another session takes over with its first command.
@@ -367,7 +381,11 @@ class Driver:
             if wanted is not None:
                 (linear, angular), read_at = wanted
                 self._admit(Command(source, linear, angular, 0, self._ticks, read_at, 0.0, now), now)
-        return self._supervise(source, now)
+        velocity = self._supervise(source, now)
+        if self._told is not None and self._told.stopped:  # the wheels stand, and whoever resets wants them to
+            self._supervised = replace(self._supervised, velocity=STANDSTILL)
+            return STANDSTILL
+        return velocity
 
     def _supervise(self, source: Source, now: float) -> Velocity:
         self._supervised, objections = supervisor.step(

@@ -34,6 +34,7 @@ class AgentStatus:
         load: Share of the robot's processors that is busy; NaN: not known.
         battery: Charge, 0 to 1; None: not known.
         others: Who else publishes what the wheels listen to.
+        gate: What the gate says of itself; None: there is none.
     """
 
     driver: DriverStatus
@@ -51,6 +52,7 @@ class AgentStatus:
     load: float = nan
     battery: float | None = None
     others: Others = NOBODY
+    gate: rest.GateReport | None = None
 
 
 def report(
@@ -62,6 +64,7 @@ def report(
     load: float = nan,
     battery: float | None = None,
     overruns: int | None = None,
+    gate: rest.GateReport | None = None,
 ) -> rest.Report:
     """Say for the orchestrator's metrics what bridge and control loop counted.
 
@@ -73,6 +76,7 @@ def report(
         load: Share of the robot's processors that is busy; NaN: not known.
         battery: Charge, 0 to 1.
         overruns: Of the control loop.
+        gate: What the gate says of itself; None: there is none.
     """
     present = {(topic.topic, topic.direction): topic for topic in (stats.topics if stats else ())}
     return rest.Report(
@@ -97,6 +101,7 @@ def report(
         load=_known(load),
         battery=battery,
         overruns=overruns,
+        gate=gate,
     )
 
 

@@ -71,6 +71,10 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
         },
         "other_publishers": {"names": list(status.others.names), "noticed": status.others.noticed},
         "velocity": {"linear_m_s": driver.velocity.linear, "angular_rad_s": driver.velocity.angular},
+        "gate": None if status.gate is None else status.gate.model_dump(),
+        "told": None
+        if driver.told is None
+        else {"linear_m_s": driver.told.velocity.linear, "angular_rad_s": driver.told.velocity.angular},
         "robot_load": _known(status.load),
         "battery": status.battery,
         "seconds": {str(source): round(seconds, 2) for source, seconds in driver.seconds.items()},

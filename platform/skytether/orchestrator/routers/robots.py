@@ -1,21 +1,30 @@
-"""``/robots``: who may ask. For operators only."""
+"""``/robots``: who may ask, and orders to stop. For operators only, but for a robot's own order."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from fastapi import APIRouter, Response
 
-from skytether.api.rest import Robot, RobotCreate, RobotCreated, RobotUse
+from skytether.api.rest import GateReport, Robot, RobotCreate, RobotCreated, RobotUse, StopOrder, StopRobot
 
 from ..core import Orchestrator
-from ..database import RobotRow
+from ..database import RobotRow, StopRow
 from ..instances import utc
 from ..quotas import use_by_robot
-from .deps import PREFIX, Core, Reader, RobotsOperator, made, says
+from ..records import Record
+from .deps import PREFIX, Caller, Core, Reader, RobotsOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))
 
 
-def _show(core: Orchestrator, row: RobotRow, use: RobotUse | None = None) -> Robot:
+def _show(
+    core: Orchestrator,
+    row: RobotRow,
+    use: RobotUse | None = None,
+    stop: StopRow | None = None,
+    gate: GateReport | None = None,
+) -> Robot:
     seen = utc(row.last_seen_at) if row.last_seen_at is not None else None
     most = core.settings.quotas
     return Robot(
@@ -25,14 +34,35 @@ def _show(core: Orchestrator, row: RobotRow, use: RobotUse | None = None) -> Rob
         last_seen_at=seen,
         use=use or RobotUse(),
         quota=RobotUse(instances=most.robot_instances, cpu=most.robot_cpu, memory_mb=most.robot_memory_mb),
+        stop=None if stop is None else _order(stop),
+        gate=gate,
     )
+
+
+def _order(row: StopRow) -> StopOrder:
+    acknowledged = utc(row.acknowledged_at) if row.acknowledged_at is not None else None
+    return StopOrder(
+        id=row.id, robot=row.robot, reason=row.reason, by=row.by, at=utc(row.at), acknowledged_at=acknowledged
+    )
+
+
+def _gates(core: Orchestrator, live: Iterable[Record]) -> dict[str, GateReport]:
+    """By robot, as it was last reported."""
+    robots = {record.id: record.robot for record in live}
+    return {
+        robots[instance]: GateReport.model_validate(report["gate"])
+        for instance, report in core.store.reports().items()
+        if instance in robots and report.get("gate") is not None
+    }
 
 
 @router.get("")
 def list_robots(core: Core, _: Reader) -> list[Robot]:
-    """All registered robots."""
-    use = use_by_robot(core.store.live())
-    return [_show(core, row, use.get(row.name)) for row in core.store.robots()]
+    """All registered robots, with what they use, their last order to stop and what they said of their gates."""
+    live = core.store.live()
+    use, gates, stops = use_by_robot(live), _gates(core, live), core.store.stops()
+    rows = core.store.robots()
+    return [_show(core, row, use.get(row.name), stops.get(row.name), gates.get(row.name)) for row in rows]
 
 
 @router.post("", status_code=201, responses=says(409, 422))
@@ -48,3 +78,33 @@ def delete_robot(core: Core, _: RobotsOperator, robot: str) -> None:
     """Revoke a robot's tokens and end what it holds."""
     core.access.revoke(robot)
     core.instances.end_all(robot)
+
+
+@router.post("/stop", responses=says(422))
+def stop_robots(core: Core, caller: RobotsOperator, asked: StopRobot) -> list[StopOrder]:
+    """Order all robots to stop. One that has not acknowledged an order yet keeps that one."""
+    rows = core.stops.order(caller, [row.name for row in core.store.robots()], asked.reason)
+    return [_order(row) for row in rows.values()]
+
+
+@router.post("/{robot}/stop", responses=says(404, 422))
+def stop_robot(core: Core, caller: RobotsOperator, robot: str, asked: StopRobot) -> StopOrder:
+    """Order a robot to stop; only a person beside it can reset it.
+
+    It obeys if its own configuration allows it, within some seconds of hearing of it, and acknowledges. While it has
+    not, asking again changes nothing.
+    """
+    return _order(core.stops.order(caller, [robot], asked.reason)[robot])
+
+
+@router.get("/{robot}/stop", responses=says(404))
+def get_stop(core: Core, caller: Caller, robot: str) -> StopOrder | None:
+    """The last order to a robot to stop. Robots ask for their own, every two seconds if they obey such orders."""
+    row = core.stops.last(caller, robot)
+    return None if row is None else _order(row)
+
+
+@router.post("/{robot}/stop/{order}/acknowledge", responses=says(404))
+def acknowledge_stop(core: Core, caller: Caller, robot: str, order: str) -> StopOrder:
+    """The robot says that it stands. With the robot's own token only; the first time counts."""
+    return _order(core.stops.acknowledge(caller, robot, order))

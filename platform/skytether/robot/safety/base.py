@@ -8,8 +8,12 @@ from skytether.control.admittance import Velocity
 from skytether.messages import Message, Twist
 from skytether.robot.command import UNUSED_AXES, unused_axes
 from skytether.robot.driver import Base
+from skytether.robot.told import Told
 
 from .client import GateLink
+
+_FRESH_S = 0.2
+"""The gate answers each command, within a turn of its loop: older answers are of a gate that is gone or frozen."""
 
 
 class GatedBase:
@@ -41,3 +45,13 @@ class GatedBase:
                 f"a velocity along {UNUSED_AXES} cannot be asked of the gate: the wheels do not have these"
             )
         self._link.send(Velocity(twist.linear.x, twist.angular.z))
+
+    def told(self, _now: float) -> Told | None:
+        """What the gate told the wheels last, if it has answered lately."""
+        state = self._link.state()
+        if state is None:
+            return None
+        age = self._link.now() - state.at
+        if not 0 <= age <= _FRESH_S:
+            return None
+        return Told(state.told, age, state.stopped, state.hand)

@@ -68,6 +68,10 @@ class GateLink:
                 self._state = unpack_state(data) or self._state
         return self._state
 
+    def now(self) -> float:
+        """Now by the clock of guard and gate [s]."""
+        return self._clock()
+
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()

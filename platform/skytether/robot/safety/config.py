@@ -118,6 +118,8 @@ class SafetyConfig(SourcesConfig):
     """Tighter limits, zones and outlines that hold at times, by name."""
     mode: ModeSource = ModeSource()
     """Who says which of them hold."""
+    stop_from_afar: bool = False
+    """Whether the orchestrator may stop this robot; nobody can reset it from afar."""
     rate_hz: Annotated[float, Field(ge=10, le=500)] = 50.0
     """Of the gate's loop."""
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
