@@ -74,13 +74,17 @@ class LogQueue:
 
     def _run(self, handlers: list[logging.Handler], propagate: bool, leave: threading.Event) -> None:
         told = self.dropped
-        while (record := self._lines.get()) is not None and not leave.is_set():
-            _handle(record, handlers, propagate)
-            if (dropped := self.dropped) != told and self._lines.empty():
+        while not leave.is_set():
+            record = self._lines.get()
+            if record is not None:
+                _handle(record, handlers, propagate)
+            if (dropped := self.dropped) != told and (record is None or self._lines.empty()):
                 told, lines = dropped, dropped - told
                 text = f"{lines} lines of the log were dropped: nobody read them"
                 told_of = logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None)
                 _handle(told_of, handlers, propagate)
+            if record is None:
+                return
 
 
 class _Into(QueueHandler):
