@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,8 +18,14 @@ import numpy as np
 import pytest
 import yaml
 
-from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, decode, encode
-from skytether.robot.safety.client import GateError, ask
+from skytether.api.client import Client
+from skytether.api.rest import RobotCreate
+from skytether.lab.embedded import EmbeddedOrchestrator
+from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, Wrench, WrenchStamped, decode, encode
+from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.safety import afar
+from skytether.robot.safety.base import GatedBase
+from skytether.robot.safety.client import GateError, GateLink, ask
 
 pytestmark = pytest.mark.slow
 
@@ -401,3 +408,78 @@ def _alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def test_an_agent_that_was_frozen_gives_no_pulse(robot):
+    """What it had in mind before is not driven for a moment and then taken back: the velocity goes up from zero."""
+    for _ in range(3):
+        robot.drives()
+        robot.agent.send_signal(signal.SIGSTOP)
+        robot.stands()
+        robot.told.clear()
+        robot.agent.send_signal(signal.SIGCONT)
+        robot.drives()
+        linear = [velocity for velocity, _ in list(robot.told)]
+        moving = linear[next(i for i, velocity in enumerate(linear) if velocity > 0) :]
+        assert 0.0 not in moving[: next(i for i, velocity in enumerate(moving) if velocity > 0.15)]
+        # 1 m/s^2 at 50 Hz; the guard may count up to guard_s where the machine is busy.
+        assert moving[0] <= 0.1
+        assert max(after - before for before, after in pairwise(moving)) <= 0.1
+
+
+class Pushed:
+    """Wheels that are the gate's, and somebody who pushes."""
+
+    topics = {"force": WrenchStamped}
+
+    def read(self, now):
+        return [("force", WrenchStamped(wrench=Wrench(force=Vector3(x=24.0))))]
+
+    def write(self, twist):
+        raise AssertionError("the wheels are the gate's")
+
+
+def test_a_robot_without_an_instance_is_stopped_from_afar_once(robot, tmp_path):
+    """The order outlives the orchestrator, its robot acknowledges it, and after a reset it does not stop again."""
+    robot.drives()
+    robot.agent.terminate()
+    robot.agent.wait()
+    (tmp_path / "state").mkdir()
+    with EmbeddedOrchestrator(tmp_path / "state") as orchestrator:
+        with Client(orchestrator.url, orchestrator.operator_token) as operator:
+            token = operator.create_robot(RobotCreate(name="walker", services=())).token
+            order = operator.stop_robot("walker", "smoke in the hall")
+        orchestrator.kill()
+        config = AgentConfig(
+            robot="walker",
+            url=orchestrator.url,
+            token=token,
+            service="virtual-trail",
+            fallback="admittance",
+            gate=robot.folder,
+            stop_from_afar=True,
+        )
+        with (
+            closing(GateLink(robot.folder)) as link,
+            Agent(config, GatedBase(Pushed(), link)) as agent,
+            Client(orchestrator.url, orchestrator.operator_token) as operator,
+        ):
+            robot.drives()
+            time.sleep(2 * afar.PERIOD_S)
+            robot.drives()  # an orchestrator that is away stops nobody
+            orchestrator.start()
+            wait(lambda: "smoke in the hall" in robot.status()["stopped"], "the order to be obeyed", robot)
+            robot.stands()
+            wait(lambda: operator.robots()[0].stop.acknowledged_at is not None, "the acknowledgement", robot)
+            wait(lambda: "smoke in the hall" in agent.status().gate.stopped, "the gate's state at the agent", robot)
+            wait(lambda: agent.status().driver.told.stopped != "", "the gate's answer at the control loop", robot)
+            assert agent.status().driver.velocity == (0.0, 0.0)
+            assert agent.report().gate.stopped == agent.status().gate.stopped
+            assert operator.stop_robot("walker", "once more").id != order.id
+            wait(lambda: operator.robots()[0].stop.acknowledged_at is not None, "the second acknowledgement", robot)
+            ask(robot.folder, {"do": "reset"}, 30)
+            robot.start()
+            robot.drives()
+            time.sleep(2 * afar.PERIOD_S)
+            robot.drives()
+            assert robot.status()["stopped"] == ""
