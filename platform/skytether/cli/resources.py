@@ -299,7 +299,17 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
         )
         for r in found
     ]
-    head = ("robot", "may ask for", "registered", "last seen", "instances", "cores", "memory MiB", "gate", "stop from afar")
+    head = (
+        "robot",
+        "may ask for",
+        "registered",
+        "last seen",
+        "instances",
+        "cores",
+        "memory MiB",
+        "gate",
+        "stop from afar",
+    )
     print_table(head, rows)
 
 
