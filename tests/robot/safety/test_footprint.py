@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skytether.robot.safety.footprint import Footprint, Outlines, circle, polygon
@@ -131,12 +131,17 @@ def _seen(point: tuple[float, float], linear: float, angular: float, t: float) -
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=3, max_size=8), st.floats(0.0, 0.5))
+@example([(0.0, 0.0), (0.0, 1.0), (-7.5e-12, 1.0), (-1.0, 0.5)], 0.5)
+@example([(0.0, 0.0), (0.0, 1.0), (-2e-6, 1.0)], 0.5)
 def test_more_room_around_is_the_same_as_so_much_room_at_once(corners, more):
     try:
         outline = polygon(corners)
     except ValueError:
         return
-    grown, whole = Outlines(outline, 0.1)(more), outline.inflated(0.1 + more)
-    # Neither has a corner outside of the other.
-    assert grown.outside(whole.vertices).max() <= 1e-6
-    assert whole.outside(grown.vertices).max() <= 1e-6
+    grown = Outlines(outline, 0.1)(more)
+    room = (0.1 + more) / math.cos(math.pi / 8)
+    turns = [(i + 0.5) * math.pi / 4 for i in range(8)]
+    whole = polygon((x + room * math.cos(t), y + room * math.sin(t)) for x, y in outline.vertices for t in turns)
+    # Neither has a corner outside of the other, but for the micrometre of `polygon`.
+    assert grown.outside(whole.vertices).max() <= 2e-6
+    assert whole.outside(grown.vertices).max() <= 2e-6

@@ -56,8 +56,8 @@ class Footprint:
         """The outline with room of at least ``margin`` [m] around; at corners up to 8 % more."""
         if margin == 0:
             return self
-        octagon = _regular(margin, 8)
-        return polygon((x + dx, y + dy) for x, y in self.vertices for dx, dy in octagon)
+        corners, ways = _sums(self.vertices, _OCTAGON)
+        return Footprint(corners + margin * ways)
 
     def outside(self, points: Points) -> NDArray[np.float64]:
         """How far each point is outside of the nearest edge's line [m]: negative inside, where it is the depth."""
@@ -153,11 +153,7 @@ class Outlines:
     def __init__(self, outline: Footprint, margin: float) -> None:
         self.least = outline.inflated(margin)
         self._margin = margin
-        octagon = np.array(_regular(1.0, 8))
-        sums = outline.vertices[:, None, :] + margin * octagon[None, :, :]
-        found = [int(np.hypot(*(sums.reshape(-1, 2) - v).T).argmin()) for v in self.least.vertices]
-        self._corners = outline.vertices[[i // 8 for i in found]]
-        self._ways = octagon[[i % 8 for i in found]]
+        self._corners, self._ways = _sums(outline.vertices, _OCTAGON)
 
     def __call__(self, more: float) -> Footprint:
         """With so much more room [m], 0 or above."""
@@ -165,12 +161,13 @@ class Outlines:
 
 
 def polygon(corners: Iterable[tuple[float, float]]) -> Footprint:
-    """The convex hull of corners in any order [m] (Andrew's monotone chain).
+    """The convex hull of corners in any order [m] (Andrew's monotone chain), to a micrometre.
 
     Raises:
         ValueError: A number is not finite, or there is no area.
     """
-    points = sorted({(float(x), float(y)) for x, y in corners})
+    # Corners that rounding alone holds apart have edges of no direction.
+    points = sorted({(round(float(x), 6), round(float(y), 6)) for x, y in corners})
     if not all(isfinite(x) and isfinite(y) for x, y in points):
         raise ValueError("footprint: corners must be finite numbers")
     lower, upper = _chain(points), _chain(points[::-1])
@@ -195,6 +192,31 @@ def _regular(radius: float, sides: int) -> list[tuple[float, float]]:
     """A regular polygon around a circle."""
     outer = radius / cos(pi / sides)
     return [(outer * cos(tau * (i + 0.5) / sides), outer * sin(tau * (i + 0.5) / sides)) for i in range(sides)]
+
+
+_OCTAGON: Points = np.array(_regular(1.0, 8))
+
+
+def _sums(one: Points, two: Points) -> tuple[Points, Points]:
+    """Which corners of two convex polygons meet in a corner of their Minkowski sum, in its order; both counter-clockwise.
+
+    Each corner of the sum lies between two edges that follow each other when all edges are sorted by direction. So the
+    pairs are the same however large either polygon is.
+    """
+    starts = [int(np.lexsort((each[:, 0], each[:, 1]))[0]) for each in (one, two)]
+    edges = []
+    for which, (each, start) in enumerate(zip((one, two), starts, strict=True)):
+        along = np.roll(each, -1, axis=0) - each
+        turned = np.roll(np.arctan2(along[:, 1], along[:, 0]) % tau, -start)
+        edges += [(float(direction), which) for direction in turned]
+    edges.sort()
+    at, pairs = starts[:], []
+    for (direction, which), (following, _) in zip(edges, [*edges[1:], (inf, 0)], strict=True):
+        at[which] += 1
+        if following - direction > _EDGE:
+            pairs.append((at[0] % len(one), at[1] % len(two)))
+    first, second = zip(*pairs, strict=True)
+    return one[list(first)], two[list(second)]
 
 
 def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
