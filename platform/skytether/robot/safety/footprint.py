@@ -198,7 +198,7 @@ _OCTAGON: Points = np.array(_regular(1.0, 8))
 
 
 def _sums(one: Points, two: Points) -> tuple[Points, Points]:
-    """Which corners of two convex polygons meet in a corner of their Minkowski sum, in its order; both counter-clockwise.
+    """Which corners of two convex polygons (counter-clockwise) meet in a corner of their Minkowski sum, in its order.
 
     Each corner of the sum lies between two edges that follow each other when all edges are sorted by direction. So the
     pairs are the same however large either polygon is.
