@@ -22,6 +22,8 @@ from skytether.messages import (
     Header,
     JointState,
     LaserScan,
+    Marker,
+    MarkerArray,
     Message,
     OccupancyGrid,
     Odometry,
@@ -62,6 +64,8 @@ def untouched_store(encoding: Encoding) -> Typestore:
     store = get_typestore(Stores.ROS2_JAZZY if encoding == "cdr" else Stores.ROS1_NOETIC)
     if encoding == "ros1":
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+        store.register(get_types_from_msg("float32 u\nfloat32 v", "visualization_msgs/msg/UVCoordinate"))
+        store.register(get_types_from_msg("string filename\nuint8[] data", "visualization_msgs/msg/MeshFile"))
     for name, parts in BOTH.items():
         store.register(service_types(name, *parts, hashed=False))
     return store
@@ -128,13 +132,15 @@ def test_bytes_of_rosbags_come_back_identical(cls: type[Message], encoding: Enco
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("cls", all_types(), ids=lambda cls: cls.__name__)
 def test_fields_are_the_definitions_fields(cls: type[Message], encoding: Encoding) -> None:
-    """Same names in the same order, besides the three that only one of the two generations has."""
-    theirs = [name for name, _ in untouched_store(encoding).fielddefs[cls.TYPE][1]]
+    """Same names in the same order, besides those that only one of the two generations has."""
+    theirs = [name for name, _ in untouched_store(encoding).fielddefs[cls.TYPE][1] if name != "seq"]
     ours = [field.name for field in dataclasses.fields(cls)]
+    assert [name for name in ours if name in theirs] == theirs
+    more = {"Header": {"seq"}}
     if encoding == "ros1":
-        theirs = [name for name in theirs if name != "seq"]
-    assert ours[: len(theirs)] == theirs
-    assert ours[len(theirs) :] == {"Header": ["seq"], "Range": ["variance"][encoding == "cdr" :]}.get(cls.__name__, [])
+        more |= {"Range": {"variance"}}
+        more |= {"Marker": {"texture_resource", "texture", "uv_coordinates", "mesh_file"}}
+    assert set(ours) - set(theirs) == more.get(cls.__name__, set())
 
 
 @pytest.mark.data
@@ -200,6 +206,12 @@ def test_range_has_a_variance_in_ros2_only() -> None:
     assert decode(Range, encode(reading, "ros1"), "ros1") == Range(range=1.0)
 
 
+def test_a_marker_has_textures_in_ros2_only() -> None:
+    marker = Marker(text="stopped", mesh_use_embedded_materials=True, texture_resource="file:///wood.png")
+    assert decode(Marker, encode(marker)) == marker
+    assert decode(Marker, encode(marker, "ros1"), "ros1") == dataclasses.replace(marker, texture_resource="")
+
+
 @pytest.mark.parametrize(
     "message",
     [
@@ -241,6 +253,7 @@ def test_hashes_are_those_that_ros_uses() -> None:
     assert type_hash(Twist, "ros1") == "9f195f881246fdfa2798d1d3eebca84a"
     assert type_hash(Odometry, "ros1") == "cd5e73d190d741a2f92e81eda573aca7"
     assert type_hash(TFMessage, "ros1") == "94810edda583a504dfda3829e70d7eec"
+    assert type_hash(MarkerArray, "ros1") == "d155b9ce5188fbaf89745847fd5882d7"
     assert type_hash(Twist, "cdr") == "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
 
 

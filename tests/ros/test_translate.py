@@ -21,7 +21,7 @@ SPECS = (
     {"name": "path", "type": TWIST, "direction": "out", "reliable": True, "depth": 3},
     {"name": "stop", "kind": "call", "type": "std_srvs/srv/Trigger", "direction": "in"},
     {"name": "reset", "kind": "call", "type": "std_srvs/srv/Trigger", "direction": "out"},
-    {"name": "marker", "type": "visualization_msgs/msg/Marker", "direction": "in"},
+    {"name": "marker", "type": "shape_msgs/msg/SolidPrimitive", "direction": "in"},
     {"name": "ask", "kind": "call", "type": "my_msgs/srv/Ask", "direction": "in"},
 )
 
@@ -99,7 +99,7 @@ def test_what_cannot_be_translated_is_named_once_and_left_out(both):
         ends.port.notify(Connected(table(theirs)))
     assert sorted(ends.port.refusals) == ["ask/request", "ask/response", "marker"]
     assert len(ends.said) == 3
-    assert any("visualization_msgs/msg/Marker cannot be turned" in sentence for sentence in ends.said)
+    assert any("shape_msgs/msg/SolidPrimitive cannot be turned" in sentence for sentence in ends.said)
     ends.comes("marker", b"x")
     assert ends.delivered == []
     ends.graph.answer("ask", bytes)

@@ -54,10 +54,12 @@ from .srv import (
     TriggerRequest,
     TriggerResponse,
 )
-from .std import Bool, Duration, Float32, Float64, Header, String, Time
+from .std import Bool, ColorRGBA, Duration, Float32, Float64, Header, String, Time
+from .visualization import Marker, MarkerArray, MeshFile, UVCoordinate
 
 __all__ = [
     "Bool",
+    "ColorRGBA",
     "CompressedImage",
     "DecodeError",
     "Duration",
@@ -77,6 +79,9 @@ __all__ = [
     "Joy",
     "LaserScan",
     "MapMetaData",
+    "Marker",
+    "MarkerArray",
+    "MeshFile",
     "Message",
     "OccupancyGrid",
     "Odometry",
@@ -105,6 +110,7 @@ __all__ = [
     "Twist",
     "TwistStamped",
     "TwistWithCovariance",
+    "UVCoordinate",
     "Vector3",
     "Wrench",
     "WrenchStamped",

@@ -8,6 +8,7 @@ that have no class here are loaded when the first of them is needed, which takes
 from __future__ import annotations
 
 import copy
+import dataclasses
 import struct
 from collections.abc import Iterable
 from functools import cache
@@ -19,9 +20,10 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from .base import Message, all_types, type_of
-from .definitions import definitions
+from .definitions import ROS2_PARTS, definitions
 from .services import BOTH, ROS2_ONLY, service_types, without_char
 from .std import Header, Time
+from .visualization import Marker
 
 Encoding = Literal["cdr", "ros1"]
 M = TypeVar("M", bound=Message)
@@ -180,6 +182,8 @@ def typestore(encoding: Encoding) -> Typestore:
         store = get_typestore(Stores.ROS1_NOETIC)
         transforms = "geometry_msgs/TransformStamped[] transforms"
         store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
+        for name, fields in ROS2_PARTS.items():
+            store.register(get_types_from_msg(fields.replace(", ", "\n"), name))
     else:
         raise _unknown(encoding)
     for name, (request, response) in (BOTH | ROS2_ONLY if encoding == "cdr" else BOTH).items():
@@ -207,7 +211,7 @@ def _store_of(typename: str, encoding: Encoding) -> Typestore:
 def _with_ours(store: Typestore, encoding: Encoding) -> Typestore:
     ours: dict[str, Any] = {cls.TYPE: cls for cls in all_types()}
     if encoding == "ros1":
-        ours[Header.TYPE] = _ros1_header
+        ours |= {Header.TYPE: _ros1_header, Marker.TYPE: _ros1_marker}
     store.types.update(ours)
     return store
 
@@ -227,3 +231,11 @@ def _hashing_store(store: Typestore) -> Typestore:
 def _ros1_header(seq: int, stamp: Time, frame_id: str) -> Header:
     """ROS 1 has the sequence number first."""
     return Header(stamp, frame_id, seq)
+
+
+def _ros1_marker(*fields: Any) -> Marker:
+    """ROS 1 has neither textures nor files of meshes."""
+    text, mesh, embedded = fields[-3:]
+    return dataclasses.replace(
+        Marker(*fields[:-3]), text=text, mesh_resource=mesh, mesh_use_embedded_materials=embedded
+    )

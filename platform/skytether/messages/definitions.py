@@ -10,6 +10,12 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
+ROS2_PARTS = {
+    "visualization_msgs/msg/MeshFile": "string filename, uint8[] data",
+    "visualization_msgs/msg/UVCoordinate": "float32 u, float32 v",
+}
+"""What only types of ROS 2 are made of; ROS 1 has no such types, and nothing that names them."""
+
 _BOTH = {
     "builtin_interfaces/msg/Duration": "int32 sec, uint32 nanosec",
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
@@ -71,6 +77,7 @@ _BOTH = {
         "uint8 FLOAT32=7, uint8 FLOAT64=8, string name, uint32 offset, uint8 datatype, uint32 count"
     ),
     "std_msgs/msg/Bool": "bool data",
+    "std_msgs/msg/ColorRGBA": "float32 r, float32 g, float32 b, float32 a",
     "std_msgs/msg/Float32": "float32 data",
     "std_msgs/msg/Float64": "float64 data",
     "std_msgs/msg/String": "string data",
@@ -79,6 +86,8 @@ _BOTH = {
     "std_srvs/srv/Trigger_Request": "uint8 structure_needs_at_least_one_member",
     "std_srvs/srv/Trigger_Response": "bool success, string message",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/msg/TransformStamped[] transforms",
+    "visualization_msgs/msg/MarkerArray": "visualization_msgs/msg/Marker[] markers",
+    **ROS2_PARTS,
 }
 """Of types that are the same in ROS 1 and ROS 2, in the words of ``.msg`` files."""
 
@@ -89,6 +98,15 @@ _OF_ONE: dict[str, dict[str, str]] = {
             "float32 field_of_view, float32 min_range, float32 max_range, float32 range"
         ),
         "std_msgs/msg/Header": "uint32 seq, builtin_interfaces/msg/Time stamp, string frame_id",
+        "visualization_msgs/msg/Marker": (
+            "uint8 ARROW=0, uint8 CUBE=1, uint8 SPHERE=2, uint8 CYLINDER=3, uint8 LINE_STRIP=4, uint8 LINE_LIST=5, "
+            "uint8 CUBE_LIST=6, uint8 SPHERE_LIST=7, uint8 POINTS=8, uint8 TEXT_VIEW_FACING=9, uint8 MESH_RESOURCE=10, "
+            "uint8 TRIANGLE_LIST=11, uint8 ADD=0, uint8 MODIFY=0, uint8 DELETE=2, uint8 DELETEALL=3, "
+            "std_msgs/msg/Header header, string ns, int32 id, int32 type, int32 action, geometry_msgs/msg/Pose pose, "
+            "geometry_msgs/msg/Vector3 scale, std_msgs/msg/ColorRGBA color, builtin_interfaces/msg/Duration lifetime, "
+            "bool frame_locked, geometry_msgs/msg/Point[] points, std_msgs/msg/ColorRGBA[] colors, string text, "
+            "string mesh_resource, bool mesh_use_embedded_materials"
+        ),
     },
     "cdr": {
         "sensor_msgs/msg/Range": (
@@ -96,6 +114,18 @@ _OF_ONE: dict[str, dict[str, str]] = {
             "float32 field_of_view, float32 min_range, float32 max_range, float32 range, float32 variance"
         ),
         "std_msgs/msg/Header": "builtin_interfaces/msg/Time stamp, string frame_id",
+        "visualization_msgs/msg/Marker": (
+            "int32 ARROW=0, int32 CUBE=1, int32 SPHERE=2, int32 CYLINDER=3, int32 LINE_STRIP=4, int32 LINE_LIST=5, "
+            "int32 CUBE_LIST=6, int32 SPHERE_LIST=7, int32 POINTS=8, int32 TEXT_VIEW_FACING=9, int32 MESH_RESOURCE=10, "
+            "int32 TRIANGLE_LIST=11, int32 ARROW_STRIP=12, int32 ADD=0, int32 MODIFY=0, int32 DELETE=2, "
+            "int32 DELETEALL=3, "
+            "std_msgs/msg/Header header, string ns, int32 id, int32 type, int32 action, geometry_msgs/msg/Pose pose, "
+            "geometry_msgs/msg/Vector3 scale, std_msgs/msg/ColorRGBA color, builtin_interfaces/msg/Duration lifetime, "
+            "bool frame_locked, geometry_msgs/msg/Point[] points, std_msgs/msg/ColorRGBA[] colors, "
+            "string texture_resource, sensor_msgs/msg/CompressedImage texture, "
+            "visualization_msgs/msg/UVCoordinate[] uv_coordinates, string text, string mesh_resource, "
+            "visualization_msgs/msg/MeshFile mesh_file, bool mesh_use_embedded_materials"
+        ),
     },
 }
 

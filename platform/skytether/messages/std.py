@@ -69,6 +69,16 @@ class Bool(Message):
     data: bool = False
 
 
+@message("std_msgs/msg/ColorRGBA")
+class ColorRGBA(Message):
+    """A colour: red, green, blue and opacity, each 0 to 1."""
+
+    r: float = 0.0
+    g: float = 0.0
+    b: float = 0.0
+    a: float = 0.0
+
+
 @message("std_msgs/msg/Float32")
 class Float32(Message):
     """One number of single precision."""

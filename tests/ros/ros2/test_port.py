@@ -119,7 +119,7 @@ def test_a_ros1_robot_and_a_ros2_service(stage, ends):
         {**STATUS, "latched": False},
         CMD_VEL,
         RESET,
-        {"name": "marker", "type": "visualization_msgs/msg/Marker", "direction": "in"},
+        {"name": "marker", "type": "shape_msgs/msg/SolidPrimitive", "direction": "in"},
     )
     table = rows(*specs)
     planner = stage.rmw("planner")
@@ -151,7 +151,7 @@ def test_a_ros1_robot_and_a_ros2_service(stage, ends):
     assert reset(b"\0\1\0\0\0", 1)[0] == bytes([0, 1, 0, 0, 1, 0, 0, 0, 3, 0, 0, 0]) + b"ok\0"
     assert list(port.refusals) == ["marker"]
     (said,) = stage.said
-    assert said.startswith("marker: visualization_msgs/msg/Marker cannot be turned from ROS 1 into ROS 2")
+    assert said.startswith("marker: shape_msgs/msg/SolidPrimitive cannot be turned from ROS 1 into ROS 2")
     # What cannot be read is dropped and told once.
     stage.until(lambda: bridge.publish("status", b"rubbish") and len(stage.said) > 1, "nothing was said")
     assert "status: a message was dropped" in stage.said[1]
