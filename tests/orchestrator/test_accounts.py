@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -50,15 +51,34 @@ def test_no_sum_ever_goes_down_and_in_the_end_it_is_that_of_the_lives() -> None:
     assert len(account.document()["lives"]) == 8
 
 
-def test_new_series_are_refused_when_there_are_too_many_and_old_ones_go_on() -> None:
+def test_names_beyond_the_room_are_refused_and_old_ones_go_on() -> None:
     account = Account()
-    for n in range(2000):
-        account.merge("robot:a", {("fallback_transitions", f"r{n}"): 1, KEY: n})
-    assert len(account.sums()) == 1025
+    account.merge("robot:a", {KEY: 1})
+    refused = [account.merge("robot:a", {("fallback_transitions", f"r{n}"): 1, KEY: n}) for n in range(2000)]
+    assert refused == [0] * 255 + [1] * 1745
+    assert len(account.names()) == len(account.sums()) == 256
     assert sent(account) == 1999
-    account.merge("robot:b", {("fallback_transitions", "r0"): 1, ("fallback_transitions", "new"): 1})
+    more = {("fallback_transitions", "r0"): 1, ("control_objections", "new"): 1, ("instance_restarts", "lab"): 3}
+    account.merge("robot:b", more)
     assert account.sums()["fallback_transitions", "r0"] == 2
-    assert len(account.sums()) == 1025
+    assert account.sums()["instance_restarts", "lab"] == 3  # not of the robot's making
+    assert len(account.sums()) == 257
+
+
+def test_all_services_of_a_robot_share_its_names_also_over_a_restart(store: Store, tmp_path: Path) -> None:
+    few = Store(f"sqlite:///{tmp_path}/state.db", robot_names=10)
+
+    def hear(robot: str, first: int) -> int:
+        told = {(robot, f"s{n}"): n for n in range(first, first + 4)}
+        counted = {owner: [("robot:a", {("control_objections", f"r{n}"): 1})] for owner, n in told.items()}
+        return few.hear({"i1": (1.0, {})}, counted)[robot]
+
+    assert [hear("walker", first) for first in (0, 4, 8, 0)] == [0, 0, 2, 0]
+    few.close()
+    few = Store(f"sqlite:///{tmp_path}/state.db", robot_names=10)
+    assert hear("walker", 12) == 4
+    assert hear("other", 0) == 0
+    few.close()
 
 
 def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store, new_record: Any) -> None:

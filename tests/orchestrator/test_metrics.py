@@ -3,7 +3,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from copy import deepcopy
+from math import inf, nan
 from typing import Any
+
+import pytest
 
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import Refusal, Report, TopicReport
@@ -76,6 +79,7 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "gate_up",
         "gate_stopped",
         "gate_troubles",
+        "robot_names",
         "instance_start_seconds",
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
@@ -164,8 +168,35 @@ def test_no_robot_can_blow_it_up_in_the_course_of_time(new_record: NewRecord, ma
         topics = tuple(topic(f"t{n}_{i}").model_copy(update={"priority": (n + i) % 128}) for i in range(20))
         report(wild, Report(life=f"life {n % 20}", topics=topics, fallback_transitions={f"reason_{n}": 1}))
     text = metrics.text().decode()
-    assert 1000 < len(re.findall(r"^skytether_topic_messages_total", text, re.MULTILINE)) <= 1024
+    names = set(re.findall(r'topic="(\w+)"', text)) | set(re.findall(r'reason="(\w+)"', text))
+    assert len(names) == 256
+    assert sample(text, "robot_names", 'robot="walker"') == 256
     assert set(re.findall(r'priority="(\d+)"', text)) == {str(wild.spec.topics[0].priority)}
+
+
+def test_other_topics_with_each_renewal_make_no_series_without_end(new_record: NewRecord, manifest: Any) -> None:
+    wild = record_with(new_record, manifest, "*")
+    metrics, report = reported([Running(wild, None)])
+    series: set[str] = set()
+    for n in range(60):
+        measured = {"delay_p50_s": 0.1, "delay_p99_s": 0.2, "jitter_s": 0.3}
+        report(wild, Report(topics=tuple(topic(f"t{n}_{i}", **measured) for i in range(64))))
+        series |= {line.rpartition(" ")[0] for line in metrics.text().decode().splitlines() if 'topic="' in line}
+    assert len({name for one in series for name in re.findall(r'topic="(\w+)"', one)}) == 256
+    assert len(series) == 256 * (9 + 1 + 3)
+
+
+def test_numbers_that_nobody_can_have_measured_are_not_there(new_record: NewRecord, manifest: Any) -> None:
+    record = record_with(new_record, manifest, "scan")
+    metrics, report = reported([Running(record, None)])
+    for wrong in (1e308, -1e308, nan, inf, -11.0, 3601.0):
+        told = {"delay_p50_s": wrong, "delay_p99_s": wrong, "jitter_s": wrong}
+        report(record, Report(rtt_s=wrong, load=wrong, battery=wrong, topics=(topic(**told),)))
+        text = metrics.text().decode()
+        for name in ("path_rtt", "robot_load", "robot_battery", "topic_one_way", "topic_jitter"):
+            assert f"\nskytether_{name}" not in text, (name, wrong)
+    with pytest.raises(ValueError, match="sent"):
+        topic(sent=10**16)
 
 
 def test_calls_are_reported_by_their_two_topics(new_record: NewRecord, manifest: Any) -> None:

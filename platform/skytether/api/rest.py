@@ -7,7 +7,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from .manifest import Name, Needs, Strict, Tier, TopicSpec
 
@@ -171,8 +171,22 @@ class InstanceEvent(Strict):
     reason: str = ""
 
 
-MOST_COUNTED = 2**53
-"""A counter's largest value: what a double holds exactly, as Prometheus' samples are."""
+def _between(least: float, most: float) -> BeforeValidator:
+    """A number outside is taken as not measured: a broken sensor is not to cost the robot its lease."""
+
+    def plausible(value: object) -> object:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return value if not number or least <= value <= most else None  # type: ignore[operator]
+
+    return BeforeValidator(plausible)
+
+
+_Share = Annotated[float | None, _between(0, 1)]
+_Duration = Annotated[float | None, _between(0, 3600)]
+_Delay = Annotated[float | None, _between(-10, 3600)]
+"""One way; as wrong as the clocks of both ends are, and so perhaps negative."""
+MOST_COUNTED = 10**15
+"""A counter's largest value: in bytes 4 MB/s for eight years. Sums of many such are exact in a double."""
 _Count = Annotated[int, Field(ge=0, le=MOST_COUNTED)]
 _Counts = Annotated[dict[Annotated[str, Field(max_length=64)], _Count], Field(max_length=64)]
 """By reasons, of which there are few."""
@@ -198,10 +212,10 @@ class TopicReport(Strict):
     superseded: _Count = 0
     duplicate: _Count = 0
     bytes_sent: _Count = 0
-    delay_p50_s: float | None = None
+    delay_p50_s: _Delay = None
     """Delays and jitter are those of the present session."""
-    delay_p99_s: float | None = None
-    jitter_s: float | None = None
+    delay_p99_s: _Delay = None
+    jitter_s: _Duration = None
 
 
 class GateReport(Strict):
@@ -224,7 +238,7 @@ class Report(Strict):
     life: Annotated[str, Field(max_length=64)] = ""
     """Which counting it is of: another one begins at zero, and adds to what was counted before. Made up anew at each
     start of the robot's program; under the same one counters go on over all its sessions with a service."""
-    rtt_s: float | None = None
+    rtt_s: _Duration = None
     topics: Annotated[tuple[TopicReport, ...], Field(max_length=1024)] = ()
     control_source: Annotated[str, Field(max_length=16)] | None = None
     """Who drives: ``cloud``, ``fallback`` or ``stop``."""
@@ -232,9 +246,9 @@ class Report(Strict):
     """Counted by bounded reason."""
     objections: _Counts = {}
     """What the velocity supervisor found wrong with commands, counted by bounded kind."""
-    load: float | None = None
+    load: _Share = None
     """Share of the robot's processors that is busy."""
-    battery: float | None = None
+    battery: _Share = None
     """Charge, 0 to 1."""
     overruns: _Count | None = None
     """Ticks of the control loop that came more than a period late."""

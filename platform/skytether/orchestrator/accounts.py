@@ -8,12 +8,12 @@ restarted adds to what was counted before, and no sum goes down (a grow-only cou
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from functools import reduce
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial, reduce
 from math import inf
 from typing import Any
 
-from skytether.api.report_metrics import Counts
+from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import Report
 
 from .records import Record
@@ -21,8 +21,12 @@ from .runtimes.base import Observation
 
 _MOST_LIVES = {"robot": 8, "run": 64, "instance": 64}
 """Of each kind that can still count; what the one that was longest silent had counted is only a sum from then on."""
-_MOST_SERIES = 1024
-"""Of each metric, so that no robot can blow up their number in the course of time (128 topics of 8 outcomes)."""
+MOST_NAMES = 256
+"""Of one robot, unless the operator says otherwise."""
+
+
+_OF_REASONS = ("fallback_transitions", "control_objections")
+Name = tuple[str, ...]
 
 
 class Account:
@@ -40,16 +44,21 @@ class Account:
         lives = [[life, _rows(counts)] for life, counts in self._lives.items()]
         return {"past": _rows(self._past), "lives": lives}
 
-    def merge(self, life: str, counts: Counts) -> None:
+    def merge(self, life: str, counts: Counts, room: Callable[[], int] = lambda: MOST_NAMES) -> int:
         """Take what somebody has counted by now.
 
         Args:
             life: Whose counting it is, as ``of_run``, ``of_instance`` and ``of_robot`` name it; it began at zero.
             counts: By metric and labels.
+            room: How many names a robot may have made up in here; asked only if there is a new one.
+
+        Returns:
+            How many names were beyond that: their counters are dropped.
         """
         known = self._lives.pop(life, {})
+        beyond: set[Name] = set()
         if not counts.keys() <= known.keys():
-            counts = self._with_room(counts, known)
+            counts, beyond = self._with_room(counts, known, room)
         for key, value in counts.items():
             if value > known.get(key, -inf):
                 known[key] = value
@@ -58,23 +67,74 @@ class Account:
         same = [other for other in self._lives if other.partition(":")[0] == kind]
         for oldest in same[: -_MOST_LIVES[kind]]:
             self._past = _added(self._past, self._lives.pop(oldest))
+        return len(beyond)
 
-    def _with_room(self, counts: Counts, known: Counts) -> Counts:
-        """Without new ones of a metric that has too many."""
-        series = self.sums().keys() | known.keys()
-        number = Counter(key[0] for key in series)
-        room = {}
+    def _with_room(self, counts: Counts, known: Counts, room: Callable[[], int]) -> tuple[Counts, set[Name]]:
+        """Without those under new names for which there is no room, and these names."""
+        names = self.names() | _names_of(known)
+        beyond: set[Name] = set()
+        fitting = {}
+        most = -1
         for key, value in counts.items():
-            if key not in series:
-                if number[key[0]] >= _MOST_SERIES:
+            name = name_in(key)
+            if name is not None and name not in names:
+                if most < 0:
+                    most = max(0, room())
+                if len(names) >= most:
+                    beyond.add(name)
                     continue
-                number[key[0]] += 1
-            room[key] = value
-        return room
+                names.add(name)
+            fitting[key] = value
+        return fitting, beyond
+
+    def names(self) -> set[Name]:
+        """All that its robot made up, ever since."""
+        return _names_of(self._past).union(*map(_names_of, self._lives.values()))
 
     def sums(self) -> dict[tuple[str, ...], float]:
         """By metric and labels."""
         return reduce(_added, self._lives.values(), self._past)
+
+
+def merge(
+    kept: Mapping[Owner, Mapping[str, Any]], counted: Mapping[Owner, Iterable[tuple[str, Counts]]], names: int
+) -> tuple[dict[Owner, Account], Counter[str]]:
+    """Take what robots have counted by now.
+
+    Args:
+        kept: The documents of all accounts of these robots.
+        counted: By robot and service: lives and what each has counted.
+        names: That one robot may make up, whatever the service.
+
+    Returns:
+        The accounts of ``counted``, and by robot how many names were beyond that.
+    """
+    merged = {owner: Account(kept[owner]) for owner in counted}
+    beyond: Counter[str] = Counter()
+
+    def room(owner: Owner) -> int:
+        others = [other for other in kept if other[0] == owner[0] and other != owner]
+        return names - sum(len((merged.get(other) or Account(kept[other])).names()) for other in others)
+
+    for owner, account in merged.items():
+        for life, counts in counted[owner]:
+            beyond[owner[0]] += account.merge(life, counts, partial(room, owner))
+    return merged, +beyond
+
+
+def name_in(key: tuple[str, ...]) -> Name | None:
+    """What a robot made up of a counter's metric and labels; None: nothing.
+
+    Each name is worth at most a dozen series: a topic with its direction, or a reason.
+    """
+    metric, *labels = key
+    if metric.startswith("topic_"):
+        return ("topic", *labels[:3])
+    return key if metric in _OF_REASONS else None
+
+
+def _names_of(counts: Iterable[tuple[str, ...]]) -> set[Name]:
+    return {name for key in counts if (name := name_in(key)) is not None}
 
 
 def of_run(record: Record, seen: Observation) -> tuple[str, Counts]:

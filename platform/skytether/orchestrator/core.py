@@ -71,8 +71,9 @@ class Orchestrator:
         self._outdated_since: float | None = None
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
-        self.store = Store(database, named(settings.advertise))
-        self.reports = Reports(self.store)
+        self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
+        self.quotas = Quotas(self.store, settings.quotas)
+        self.reports = Reports(self.store, self.quotas.drop_names)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -81,12 +82,11 @@ class Orchestrator:
             self._site_gauges,
             self._reports,
             self._accounts,
-            lambda: self.quotas,
+            self.quotas,
         )
         self.leadership = Leadership(self.store.lock(), self._elected)
         self.catalogue = Catalogue(self.store)
         self.strain = Strain()
-        self.quotas = Quotas(self.store, settings.quotas)
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
         self.stops = Stops(self.store, clock)

@@ -7,14 +7,14 @@ renewal, at any of several orchestrators; the one that leads exports them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 
 from skytether.api.exposition import Family, Sums, counter, exposition, gauge
 from skytether.api.manifest import ANY_TOPIC
-from skytether.api.report_metrics import INSTANCE, Described, Owner, counters_of, gauges_of
+from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, counters_of, gauges_of
 from skytether.api.rest import Refusal, Report
 
 from .accounts import Account, of_instance, of_run
@@ -61,7 +61,7 @@ class Metrics:
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
         reports: Callable[[], Mapping[str, Report]] = dict,
         accounts: Callable[[], Mapping[Owner, Account]] = dict,
-        quotas: Callable[[], Quotas | None] = lambda: None,
+        quotas: Quotas | None = None,
     ) -> None:
         """All callables are asked at each scrape.
 
@@ -163,12 +163,32 @@ class Metrics:
         }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
-        if (quotas := self._quotas()) is not None:
-            yield from _of_quotas(quotas, running)
+        if self._quotas is not None:
+            yield from _of_quotas(self._quotas, running)
+        yield _names(accounts, {robot for robot, _ in counted})
         yield from counters_of(used, USED)
         yield from _sites(self._sites(), running)
         yield from counters_of(sums)
-        yield from gauges_of([((r.robot, r.service, r.site or ""), report) for r, report in reports])
+        yield from gauges_of(
+            [
+                ((r.robot, r.service, r.site or ""), _known_topics(report, sums[r.robot, r.service]))
+                for r, report in reports
+            ]
+        )
+
+
+def _known_topics(report: Report, counted: Counts) -> Report:
+    """Without topics for whose names there is no room: a gauge each time under another one is a series each time."""
+    topics = [t for t in report.topics if ("topic_bytes", t.topic, str(t.priority), t.direction) in counted]
+    return report.model_copy(update={"topics": tuple(topics)})
+
+
+def _names(accounts: Mapping[Owner, Account], robots: Container[str]) -> Family:
+    names = Sums()
+    for (robot, _), account in accounts.items():
+        if robot in robots:
+            names.add((robot,), len(account.names()))
+    return gauge("robot_names", "Names that the robot made up in its reports", ("robot",), names)
 
 
 def _memory(running: Iterable[Running]) -> Family:

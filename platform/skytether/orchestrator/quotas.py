@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +16,8 @@ from .errors import Fault, InvalidError, QuotaError, TooManyError
 from .records import Record
 from .settings import Quotas as Settings
 from .store import Store
+
+log = logging.getLogger(__name__)
 
 _COME_AGAIN = 5.0
 """Seconds until somebody who has too many streams is to try again."""
@@ -61,6 +64,8 @@ class Quotas:
         self._counting = threading.Lock()
         self._streams: Counter[str] = Counter()
         self._logs = 0
+        self._full: set[str] = set()
+        """Robots of which it was said that they have too many names."""
         self.refused: Counter[str] = Counter()
         """By quota."""
 
@@ -147,6 +152,20 @@ class Quotas:
     def limits(self) -> Mapping[str, float]:
         """Each quota by its key."""
         return {key: float(value) for key, value in self.settings.model_dump().items()}
+
+    def drop_names(self, beyond: Mapping[str, int]) -> None:
+        """By robot, names that it reported and for which there is no room."""
+        with self._counting:
+            self.refused["robot_names"] += sum(beyond.values())
+            new = sorted(beyond.keys() - self._full)
+            self._full |= beyond.keys()
+        for robot in new:
+            log.warning(
+                "robot '%s' has made up %d names of topics and reasons (quotas.robot_names): what it reports under "
+                "more gets no series",
+                robot,
+                self.settings.robot_names,
+            )
 
     def _refuse(self, key: str) -> None:
         with self._counting:

@@ -7,7 +7,7 @@ counted, so one that is lost with a program that is killed is made good by the n
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -34,8 +34,10 @@ class _Heard:
 class Reports:
     """Keeps reports for a moment. Safe from any thread."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, beyond: Callable[[Mapping[str, int]], None] = lambda _: None) -> None:
+        """``beyond``: told how many names of a robot were too many, by robot."""
         self._store = store
+        self._beyond = beyond
         self._heard: dict[str, _Heard] = {}
         """By instance."""
         self._taking = threading.Lock()
@@ -78,4 +80,6 @@ class Reports:
         counted: dict[Owner, list[tuple[str, Counts]]] = {}
         for one in heard.values():
             counted.setdefault(one.owner, []).extend(one.counted)
-        self._store.hear({instance: (one.at, one.report) for instance, one in heard.items()}, counted)
+        beyond = self._store.hear({instance: (one.at, one.report) for instance, one in heard.items()}, counted)
+        if beyond:
+            self._beyond(beyond)

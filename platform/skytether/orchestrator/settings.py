@@ -131,6 +131,9 @@ class Quotas(Group):
     """MiB of memory that they need in all."""
     robot_lease_s: Annotated[float, Field(ge=1, le=86_400)] = 3600.0
     """The longest lease that a robot may ask for: so long it holds what it has after it vanished."""
+    robot_names: Count = 256
+    """Names that a robot makes up in its reports and that get series in /metrics: topics where a manifest takes any,
+    reasons, kinds of objections. They count as long as what was counted is kept; what comes under more is dropped."""
     robot_streams: Count = 32
     """Logs and events that one robot follows at a time."""
     streams: Count = 1024

@@ -7,6 +7,7 @@ seen the last change gets None and looks again. Each change of state or reason l
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -35,7 +36,7 @@ from sqlalchemy.sql.dml import ReturningUpdate
 from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import State
 
-from .accounts import Account
+from .accounts import MOST_NAMES, Account, merge
 from .database import Database
 from .discovery import NAME
 from .models import accounts, events, idempotency, instances, reports
@@ -157,9 +158,16 @@ class KeyReusedError(Exception):
 class Store(Database):
     """The database with its instances. Safe from any thread."""
 
-    def __init__(self, url: str, name: str = NAME) -> None:
-        """``name`` is what a database server lists its connections under."""
+    def __init__(self, url: str, name: str = NAME, robot_names: int = MOST_NAMES) -> None:
+        """Open it.
+
+        Args:
+            url: SQLAlchemy's.
+            name: What a database server lists its connections under.
+            robot_names: Names that one robot may make up in all that it reports.
+        """
         super().__init__(url, name)
+        self._robot_names = robot_names
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
         self._seen: dict[str, Record] = {}
@@ -347,17 +355,21 @@ class Store(Database):
         self,
         heard: Mapping[str, tuple[float, Mapping[str, Any]]],
         counted: Mapping[Owner, Iterable[tuple[str, Counts]]],
-    ) -> None:
+    ) -> Counter[str]:
         """Keep robots' reports instead of those before; whoever leads exports them.
 
         Args:
             heard: By instance, the time [s since the epoch] and the report.
             counted: By robot and service: lives and what each has counted by now.
+
+        Returns:
+            By robot, names that were too many: what is counted under them is not kept.
         """
         rows = [{"of_instance": i, "at": at, "report": report} for i, (at, report) in sorted(heard.items())]
         with self._writing() as connection:
-            self._count(connection, counted)
+            beyond = self._count(connection, counted)
             connection.execute(_HEAR, rows)
+        return beyond
 
     def reports(self, control: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
         """The last report on each instance that has not ended; only of robots that one of these controls, if given."""
@@ -373,20 +385,17 @@ class Store(Database):
         with self._writing() as connection:
             self._count(connection, {(record.robot, record.service): counted})
 
-    def _count(self, connection: Connection, counted: Mapping[Owner, Iterable[tuple[str, Counts]]]) -> None:
+    def _count(self, connection: Connection, counted: Mapping[Owner, Iterable[tuple[str, Counts]]]) -> Counter[str]:
         owners = sorted(counted)
         kept = _kept(connection, owners)
         new = [{"of_robot": robot, "of_service": service} for robot, service in owners if (robot, service) not in kept]
         if new:
             connection.execute(_NEW_ACCOUNT, new)
             kept = _kept(connection, owners)
-        rows = []
-        for owner in owners:
-            account = Account(kept[owner])
-            for life, counts in counted[owner]:
-                account.merge(life, counts)
-            rows.append({"of_robot": owner[0], "of_service": owner[1], "account": account.document()})
+        merged, beyond = merge(kept, counted, self._robot_names)
+        rows = [{"of_robot": o[0], "of_service": o[1], "account": merged[o].document()} for o in owners]
         connection.execute(_KEEP_ACCOUNT, rows)
+        return beyond
 
     def accounts(self) -> dict[tuple[str, str], Account]:
         """What is known, by robot and service."""
