@@ -8,7 +8,7 @@ from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
 from skytether.messages import Joy, LaserScan, Range
 from skytether.robot.safety.address import address
-from skytether.robot.safety.config import SafetyConfig, default_folder
+from skytether.robot.safety.config import SafetyConfig, default_folder, default_record
 from skytether.robot.safety.coverage import Action
 
 LEAST = {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}}
@@ -209,6 +209,16 @@ def test_the_usual_folder_is_the_users_own(monkeypatch):
     assert default_folder() == Path("/run/user/1000/skytether")
     monkeypatch.setattr("os.geteuid", lambda: 0)
     assert default_folder() == Path("/run/skytether")
+
+
+def test_the_usual_record_is_where_a_person_looks_for_it(monkeypatch):
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/walker/state")
+    assert default_record() == Path("/home/walker/state/skytether/safety-record")
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/skytether:/var/lib/other")  # a unit with StateDirectory=skytether
+    of_the_unit = default_record()
+    monkeypatch.setattr("os.geteuid", lambda: 0)  # sudo skytether robot safety-log
+    assert default_record() == of_the_unit == Path("/var/lib/skytether/safety-record")
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,23 @@ def test_without_a_section_there_is_a_gate_that_stops_the_wheels_and_ends_with_t
     graph.end(agent)
 
 
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGKILL])
+def test_a_service_manager_that_signals_all_of_the_unit_lets_the_gate_brake(walker, start, first):
+    """As KillMode=control-group does: all at once, or what is left when the agent is dead."""
+    agent = start("run")
+    drives(walker)
+    gate = children_of(agent, start.folder)
+    before = len(walker.told)
+    agent.send_signal(first)
+    for process in gate:
+        process.send_signal(signal.SIGINT)
+    wait_for(lambda: walker.speed == 0.0, "the standstill")
+    assert gone(gate)
+    assert agent.wait(60) in (128 + signal.SIGINT, -first)
+    assert walker.speed == 0.0
+    assert slowest(walker.told, before - 1) < 0.15, "it brakes, it does not break off"
+
+
 def test_without_a_gate_the_last_velocity_of_a_killed_agent_is_the_last_word(walker, start):
     """Why there is one unless robot.yaml says otherwise: this row of docs/safety.md."""
     agent = start("run", safety="none")

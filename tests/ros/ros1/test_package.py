@@ -11,6 +11,8 @@ from xml.etree import ElementTree
 import pytest
 from ros1_graph import wait_for
 
+from skytether.guard import privileges
+
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "ros1" / "skytether"
 UNITS = [
@@ -98,4 +100,21 @@ def test_agent_and_gate_meet_in_one_folder():
     folders = {line for unit in UNITS for line in unit.read_text().splitlines() if "XDG_RUNTIME_DIR" in line}
     assert folders == {"Environment=XDG_RUNTIME_DIR=/run"}
     assert "RuntimeDirectory=skytether" in UNITS[1].read_text().splitlines()
+    assert all("StateDirectory=skytether" in unit.read_text().splitlines() for unit in UNITS)  # of the event record
     assert {"User=skytether"} == {line for unit in UNITS for line in unit.read_text().splitlines() if "User=" in line}
+
+
+def test_when_the_first_process_of_a_unit_dies_the_others_have_time_to_stop_the_wheels():
+    """With KillMode=mixed systemd kills all that is left of a unit as soon as its first process is gone."""
+    for unit in UNITS:
+        lines = unit.read_text().splitlines()
+        assert "KillMode=control-group" in lines
+        assert "TimeoutStopSec=20" in lines
+    # The watchdog's signal goes to all of the unit, so the gate must have stopped the wheels before.
+    assert "WatchdogSec=5" in UNITS[1].read_text().splitlines()
+
+
+def test_the_gates_unit_permits_what_guard_and_gate_ask_for():
+    lines = UNITS[1].read_text().splitlines()
+    assert f"LimitRTPRIO={privileges.GUARD}" in lines
+    assert "LimitMEMLOCK=infinity" in lines

@@ -94,5 +94,7 @@ def default_record() -> Path:
     """Where the event record is unless it is told otherwise: on a disk that a reboot leaves as it is."""
     if os.geteuid() == 0:
         return Path("/var/lib/skytether/safety-record")
-    state = os.environ.get("STATE_DIRECTORY") or os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
-    return Path(state) / "skytether" / "safety-record"
+    own = os.environ.get("STATE_DIRECTORY")  # StateDirectory= of systemd: the service's own, and nobody else's
+    if own:
+        return Path(own.split(":")[0]) / "safety-record"
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "skytether" / "safety-record"
