@@ -39,7 +39,7 @@ turns = st.lists(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(turns)
 def test_it_changes_only_while_all_is_well_or_the_robot_brakes(sequence):
     power, now, wrong_at, cut = Power(BRAKING, AFTER), 10.0, None, True

@@ -137,7 +137,7 @@ def test_a_reading_that_comes_first_after_a_long_pause_is_not_judged():
 wild = st.one_of(st.floats(), st.sampled_from([0.0, 0.02, 0.2, math.nan, math.inf, -math.inf, 1e308]))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(["told", "measure", "look"]), wild, wild, wild), max_size=60))
 def test_whatever_comes_and_whatever_the_clock_does_nothing_is_raised(events):
     motion, now = Motion(PARAMS, LIMITS, 0.1), 10.0

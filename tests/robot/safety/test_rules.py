@@ -138,15 +138,15 @@ def test_a_velocity_that_is_no_number_is_refused_and_named(bad):
 def test_before_a_wall_it_slows_down_stops_and_does_not_touch():
     bench = Bench()
     bench.wanted = (0.5, 0.0)
-    wall, x, speeds = 3.0, 0.0, []
-    for _ in range(1200):
+    wall, x, speeds = 1.5, 0.0, []
+    for _ in range(750):
         bench.points = np.array([(wall - x, dy) for dy in np.linspace(-1, 1, 9)])
         speeds.append(bench.run().velocity.linear)
         x += speeds[-1] * PERIOD
     assert max(speeds) == pytest.approx(0.5)
     assert speeds[-1] == 0.0
-    # Front at 0.3, stop zone 0.1: it stands at 2.6 m, and a few millimetres before.
-    assert 2.57 <= x <= 2.6
+    # Front at 0.3, stop zone 0.1: it stands at 1.1 m, and a few millimetres before.
+    assert 1.07 <= x <= 1.1
     assert bench.last.zone is Zone.STOP
     # Back is free, and allowed.
     bench.wanted = (-0.2, 0.0)

@@ -403,7 +403,7 @@ wishes = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(wishes)
 def test_no_change_of_source_jumps_and_nobody_drives_who_may_not(sequence):
     bench = Bench()
