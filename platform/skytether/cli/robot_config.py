@@ -17,6 +17,7 @@ from skytether.robot.arbiter import Needs
 from skytether.robot.graph_base import protected_names as graph_names
 from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
 from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
+from skytether.robot.safety.config_base import no_switches
 from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.robot.status import DEFAULT_PORT
 from skytether.robot.supervisor import Limits
@@ -258,6 +259,11 @@ class RobotConfig(Strict):
     def gate_is_assumed(self) -> bool:
         """Whether there is to be a gate that nobody has configured."""
         return "safety" not in self.model_fields_set
+
+    @field_validator("limits", mode="before")
+    @classmethod
+    def _are_numbers(cls, limits: Any) -> Any:
+        return no_switches(limits)
 
     @field_validator("limits")
     @classmethod

@@ -71,10 +71,10 @@ def test_what_is_not_written_is_plausible():
         ({"zones": {"stop_m": 1e-6}}, "zones.stop_m must be 0.02 to 2 m, not 1e-06"),
         ({"sensors": {"scan": {"max_age_s": 9}}}, "sensors.scan.max_age_s must be 0.02 to 1 s, not 9"),
         (
-            {"sensors": {"scan": {"ignore_deg": [[-180, 180]]}}},
-            "sensors.scan.ignore_deg must be 0 to 270 degrees, not 360",
+            {"sensors": {"scan": {"ignore_deg": [[-180, 150]]}}},
+            "sensors.scan.ignore_deg must be 0 to 270 degrees, not 330",
         ),
-        ({"sensors": {"scan": {"ignore_deg": [[0, 180], [180, 0]]}}}, "ignore_deg must be 0 to 270 degrees, not 360"),
+        ({"sensors": {"scan": {"ignore_deg": [[0, 180], [180, 330]]}}}, "ignore_deg must be 0 to 270 degrees, not 330"),
         ({"sensors": {"scan": {"range_max": 1e6}}}, "sensors.scan.range_max must be 0.1 to 100 m, not 1e+06"),
         (
             {"footprint": {"polygon": [[90, 1], [90, -1], [-1, 0]]}},

@@ -118,6 +118,10 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"ros1": {"cmd_vel": "1x"}}, "safety.ros1.cmd_vel: '1x' is no name of a graph"),
         ({"ros1": {}, "sensors": {"my scan": {}}}, "'my scan' is no name of a graph"),
         ({"guard_s": 0.03}, "guard_s must be two periods of rate_hz or more: 0.04"),
+        ({"limits": {"linear_max": True}}, "safety.limits: linear_max: is neither yes nor no"),
+        ({"zones": {"stop_m": True}}, "safety.zones: stop_m: is neither yes nor no"),
+        ({"estop": {"max_age_s": True}}, "safety.estop.max_age_s: is neither yes nor no"),
+        ({"sensors": {"scan": {"fov_deg": [-90, 90], "ignore_deg": [[-90, 0], [0, 90]]}}}, "it would see nothing"),
         ({"sockets": {"wheels": "wheels.sock"}}, "must be unix:PATH or udp:HOST:PORT, not 'wheels.sock'"),
     ],
 )

@@ -19,7 +19,7 @@ from skytether.ros.names import check_name, resolve
 
 from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
-from .config_base import Numbers, Topic
+from .config_base import Numbers, Topic, no_switches
 from .contact import ContactParams, feels
 from .enable_config import EnableConfig
 from .inbox import IsStop, Topics
@@ -138,6 +138,11 @@ class SafetyConfig(SourcesConfig):
 
     beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
     """Numbers that are meant to be beyond what is plausible: key below ``safety`` to reason."""
+
+    @field_validator("limits", "zones", mode="before")
+    @classmethod
+    def _are_numbers(cls, section: Any) -> Any:
+        return no_switches(section)
 
     @model_validator(mode="after")
     def _is_plausible(self) -> SafetyConfig:

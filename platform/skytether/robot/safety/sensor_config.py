@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, radians
+from math import inf, radians, tau
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -11,7 +11,7 @@ from skytether.messages import LaserScan, Message, Range
 
 from .config_base import Metres, Numbers
 from .contact import ContactKind, ContactParams
-from .coverage import Action, UnseenParams
+from .coverage import Action, UnseenParams, sector
 from .ranges import Mount
 from .sensing import RangeSensor
 from .stamps import StampRule
@@ -67,6 +67,11 @@ class SensorConfig(Numbers):
             raise ValueError(f"range_min {self.range_min} must be below range_max {self.range_max}")
         if self.fov_deg is not None and self.fov_deg[0] == self.fov_deg[1]:
             raise ValueError("fov_deg must be a sector: two angles that differ")
+        looks = sector(0.0, tau) if self.fov_deg is None else sector(*map(radians, self.fov_deg))
+        for first, last in self.ignore_deg:
+            looks &= ~sector(radians(first), radians(last))
+        if not looks.any():
+            raise ValueError("ignore_deg leaves nothing of its field of view: it would see nothing at all")
         return self
 
     def message(self) -> type[Message]:
