@@ -112,7 +112,7 @@ def test_so_it_is_whoever_asks(served: Any, path: str) -> None:
     served.operator.create_robot(RobotCreate(name="walker"))
     where = urlsplit(served.url)
     for method in ("GET", "DELETE", "POST"):
-        head = f"{method} /api/v1{path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {served.token}\r\n"
+        head = f"{method} /api/v1{path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {served.token}\r\n"
         with socket.create_connection((where.hostname or "", where.port or 0)) as raw:  # no client tidies the path
             raw.sendall(f"{head}Content-Length: 0\r\nConnection: close\r\n\r\n".encode())
             raw.settimeout(30)

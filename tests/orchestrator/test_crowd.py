@@ -48,7 +48,7 @@ class Caller:
 
     async def _once(self, method: str, path: str, document: Any, key: str) -> tuple[int, dict[str, str], bytes]:
         body = b"" if document is None else json.dumps(document).encode()
-        lines = [f"{method} /api/v1{path} HTTP/1.1", "Host: here", f"Authorization: Bearer {self._token}"]
+        lines = [f"{method} /api/v1{path} HTTP/1.1", "Host: localhost", f"Authorization: Bearer {self._token}"]
         lines += ["Connection: close", f"Content-Length: {len(body)}", "Content-Type: application/json"]
         lines += [f"Idempotency-Key: {key}"] if key else []
         reader, writer = await asyncio.open_connection(self._host, self._port)

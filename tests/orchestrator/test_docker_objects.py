@@ -9,6 +9,7 @@ import json
 import sys
 import tarfile
 from contextlib import closing
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from skytether.orchestrator.runtimes.docker.objects import (
     Seen,
     advised,
     container,
+    data_volume,
     free_gpus,
     free_port,
     grant_archive,
@@ -74,6 +76,18 @@ def test_a_container_may_do_nothing_that_it_need_not() -> None:
     assert host["SecurityOpt"] == ["no-new-privileges"]
     assert host["NetworkMode"] == "skytether"
     assert not host.keys() & {"Privileged", "CapAdd", "Binds", "PidMode", "IpcMode", "UsernsMode"}
+
+
+def test_no_two_pairs_of_robot_and_service_share_a_volume() -> None:
+    names = [f"{a}{b}{c}" for a in ("a", "b") for b in ("", "-", "-b-", "--") for c in ("", "a")]
+    volumes = set()
+    for robot, service in product(names, names):
+        grant = Grant(
+            instance="i1", service=service, robot=robot, session_id="00112233445566aa", session_key=KEY, topics=()
+        )
+        volumes.add(data_volume("me", Launch(1, spec(), grant)))
+    assert len(volumes) == len(set(names)) ** 2
+    assert data_volume("me", launch()) == "skytether-me-data-walker-toy"
 
 
 def test_limits_come_from_the_manifest() -> None:

@@ -32,7 +32,9 @@ pytestmark = pytest.mark.slow
 LEASE = 3.0
 """Seconds; an attack lasts for several of them."""
 ATTACK = 6.0
-SLOW_BODY = b"POST /api/v1/instances HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n"
+SLOW_BODY = (
+    b"POST /api/v1/instances HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n"
+)
 
 
 def address_of(program: Program) -> tuple[str, int]:
@@ -255,7 +257,7 @@ def test_instances_and_streams_that_a_robot_asks_for_starve_nobody(
         assert len(client.instances()) == 16
         assert set(hostile.statuses) <= {201, 409, 429}
         path = f"/api/v1/instances/{hostile.instance}/logs?follow=true&tail=1"
-        head = f"GET {path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {hostile.token}\r\n\r\n"
+        head = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {hostile.token}\r\n\r\n"
         streams.enter_context(many(address_of(program), 200, head.encode()))
         honest.renew_for(ATTACK)
     assert honest.refused == []

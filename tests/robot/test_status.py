@@ -92,6 +92,16 @@ def test_the_command_prints_tables_or_json(served):
     assert result.exit_code == 0
 
 
+def test_a_web_page_whose_name_was_made_this_address_reads_nothing():
+    server = StatusServer(0, lambda: {"battery": 1.0}, lambda: b"")
+    url = f"http://127.0.0.1:{server.port}"
+    for path in ("/status", "/metrics", "/"):
+        assert httpx.get(url + path, headers={"Host": f"evil.example:{server.port}"}).status_code == 421
+    for host in ("localhost", f"localhost:{server.port}", "[::1]", "192.0.2.7:80"):
+        assert httpx.get(f"{url}/status", headers={"Host": host}).status_code == 200
+    server.close()
+
+
 def test_a_status_that_cannot_be_told_harms_nobody():
     server = StatusServer(0, lambda: {"x": 1 / 0}, lambda: b"")
     assert httpx.get(f"http://127.0.0.1:{server.port}/status").status_code == 500

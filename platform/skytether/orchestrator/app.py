@@ -7,8 +7,9 @@ from fastapi.telemetry import TelemetryConfig
 
 import skytether
 
-from . import problems
+from . import docs_page, problems
 from .core import Orchestrator
+from .hosts import Hosts, own_names
 from .logs import Audit
 from .reception import Reception
 from .routers import catalog, health, instances, robots, sites, tokens
@@ -27,11 +28,14 @@ def create_app(core: Orchestrator) -> FastAPI:
         dependencies=[Depends(plain_request)],
         telemetry=_NO_TELEMETRY,
         redirect_slashes=False,  # a name that is empty is none, and not another request
+        docs_url=None,  # FastAPI's own loads scripts from a public host
+        redoc_url=None,
     )
     app.state.core = core
     problems.install(app)
-    for router in (catalog.router, sites.router, instances.router, robots.router, tokens.router, health.router):
-        app.include_router(router)
+    for part in (catalog, sites, instances, robots, tokens, health, docs_page):
+        app.include_router(part.router)
     app.add_middleware(Reception, doorman=core, limits=core.settings.limits, strain=core.strain)
     app.add_middleware(Audit)
+    app.add_middleware(Hosts, names=own_names(core.settings))
     return app

@@ -29,7 +29,7 @@ from .quotas import Quotas
 from .reconcile import Reconciler
 from .reports import PERIOD, Reports
 from .runtimes.base import Runtime
-from .security import SecretFileError, Secrets
+from .security import SecretFileError, Secrets, close_folder
 from .settings import Settings
 from .sites import Sites, load_runtime
 from .stops import Stops
@@ -63,12 +63,13 @@ class Orchestrator:
             find_runtime: Gives a runtime by its name; by entry point unless told otherwise.
 
         Raises:
-            SecretFileError: A file that holds a secret cannot be used.
+            SecretFileError: A file that holds a secret cannot be used, or others could read the state folder.
         """
-        settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        close_folder(settings.state_dir, with_database=settings.database_url is None)
         self.settings = settings
         self._clock = clock
         self._outdated_since: float | None = None
+        self._told_why = ""
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
@@ -269,13 +270,20 @@ class Orchestrator:
         try:
             self.store.ping()
         except Exception as error:  # whatever the database's driver raises
-            return f"the database does not answer: {error}"
+            self._tell_why(f"the database does not answer: {error}")
+            return "the database does not answer"  # anybody may ask: what a driver says is for the log
         if self.outdated:
             return str(OutdatedError())
         silent = time.monotonic() - self.placer.last_pass
         if silent > self.settings.timing.lock_up:
             return f"the reconciler has made no pass for {silent:.0f} s"
         return ""
+
+    def _tell_why(self, why: str) -> None:
+        """Once, however often it is asked."""
+        if why != self._told_why:
+            self._told_why = why
+            log.warning("%s", why)
 
     def scrape_targets(self, asked: str) -> list[ScrapeTargets]:
         """For Prometheus: the orchestrators over this database; ``asked``: the address that the request was sent to."""

@@ -1,6 +1,6 @@
 """Secrets: tokens, the operator's token file, and session keys derived from one secret key.
 
-Nothing here logs, and nothing that holds a secret shows it in its ``repr``.
+Nothing here logs a secret, and nothing that holds a secret shows it in its ``repr``.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import hmac
+import logging
 import os
 import secrets
 import stat
@@ -20,6 +21,8 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 TOKEN_MARK = "sky-"  # noqa: S105 (a mark by which scanners can find leaked tokens, no secret)
 PREFIX_LENGTH = len(TOKEN_MARK) + 8
+_DATABASE = ("state.db", "state.db-wal", "state.db-shm", "state.db-journal")
+log = logging.getLogger(__name__)
 
 
 class SecretFileError(Exception):
@@ -51,6 +54,27 @@ class TokenHash:
     def matches(self, token: str) -> bool:
         """Compare in constant time."""
         return hmac.compare_digest(self.digest, hashlib.sha256(token.encode()).hexdigest())
+
+
+def close_folder(folder: Path, *, with_database: bool) -> None:
+    """Make a folder that others cannot look into, or close one that is there, with the database in it.
+
+    Raises:
+        SecretFileError: It cannot be closed; the text says what to do.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for path, mode in ((folder, 0o700), *((folder / name, 0o600) for name in _DATABASE)):
+            if path.exists() and stat.S_IMODE(path.stat().st_mode) & 0o077:
+                path.chmod(mode)
+                log.warning("others could read %s: it has mode %o now", path, mode)
+        if with_database:  # SQLite makes a file as the process's umask says; empty, it is a new database
+            os.close(os.open(folder / _DATABASE[0], os.O_CREAT | os.O_RDWR, 0o600))
+    except OSError as error:
+        raise SecretFileError(
+            f"the state folder {folder} cannot be closed to others ({error.strerror}): chmod 700 it, with an owner "
+            f"who is to run the orchestrator, or give a folder within it: --state-dir {folder / 'state'}"
+        ) from error
 
 
 def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from skytether.api.hosts import is_name
 from skytether.api.manifest import Strict
 
 from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
@@ -200,6 +201,10 @@ class Settings(Group):
     """Make the site `local` (processes on this machine) when there is no site at all."""
     echo: bool = True
     """Answer UDP echoes at the same address and port, for `skytether doctor`; never more than was asked."""
+    hosts: tuple[str, ...] = ()
+    """Names by which it is asked (`Host`), beside those of its machine, `host` and `advertise`; every address and
+    `localhost` are good. `*.example.org`: all below; `*`: any, which lets web pages at the operators' browsers ask it
+    (DNS rebinding)."""
     proxies: tuple[str, ...] = ()
     """Addresses or networks of proxies in front, whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed."""
     tls: Tls = Tls()
@@ -224,6 +229,14 @@ class Settings(Group):
             except ValueError:
                 raise ValueError(f"'{proxy}' is no address and no network such as 10.0.0.0/24") from None
         return proxies
+
+    @field_validator("hosts")
+    @classmethod
+    def _names(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        for host in hosts:
+            if not is_name(host):
+                raise ValueError(f"'{host}' is no name such as cloud.example.org or *.example.org: without a port")
+        return hosts
 
     @field_validator("advertise")
     @classmethod

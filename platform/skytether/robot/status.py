@@ -16,6 +16,7 @@ from typing import Any
 
 from skytether.api import rest
 from skytether.api.exposition import Family, Sums, counter, exposition, gauge
+from skytether.api.hosts import is_own
 from skytether.api.report_metrics import of_report
 
 from .snapshot import AgentStatus
@@ -141,6 +142,10 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
+        if not all(is_own(host) for host in self.headers.get_all("Host", ())):
+            # A web page that has made its name this address (DNS rebinding) is to read nothing.
+            self.send_error(421, "ask by address, or as localhost")
+            return
         page = self.pages.get(self.path.split("?", 1)[0])
         if page is None:
             self.send_error(404, "there are /status and /metrics")

@@ -81,8 +81,13 @@ def name_of(owner: str, instance: str, attempt: int) -> str:
 
 
 def data_volume(owner: str, launch: Launch) -> str:
-    """The volume that keeps what one service writes for one robot, over all its instances."""
-    return f"skytether-{owner}-data-{launch.grant.robot}-{launch.grant.service}"
+    """The volume that keeps what one service writes for one robot, over all its instances.
+
+    Names have hyphens: between two of them a dot says where the one ends, which is part of neither. Where there is no
+    other hyphen there is nothing to mistake, and the volume has the name that it always had.
+    """
+    robot, service = launch.grant.robot, launch.grant.service
+    return f"skytether-{owner}-data-{robot}{'.' if '-' in robot + service else '-'}{service}"
 
 
 def refusal(spec: ServiceSpec, options: DockerOptions) -> str | None:
