@@ -15,6 +15,7 @@ from rig_wheels import Drives
 
 from skytether.guard.velocity import Velocity
 from skytether.messages import Bool, Twist, Vector3, decode, encode
+from skytether.robot.safety.client import stop
 
 pytestmark = pytest.mark.slow
 
@@ -153,7 +154,7 @@ def test_drives_that_nothing_stops_fail_by_name(machine):
     assert "the wheels turn without the signal" in said
 
 
-def test_a_robot_whose_gate_runs_or_that_cannot_be_measured_is_refused(machine):
+def test_a_robot_whose_gate_runs_that_is_stopped_or_that_cannot_be_measured_is_refused(machine):
     robot = machine(Drives())
     gate = subprocess.Popen(
         [sys.executable, "-m", "skytether.cli", "robot", "gate", str(robot.config)],
@@ -168,9 +169,13 @@ def test_a_robot_whose_gate_runs_or_that_cannot_be_measured_is_refused(machine):
         status, _, said = robot.commission()
         assert status == 1
         assert "a gate runs in" in said.replace("\n", " ")
+        stop(robot.folder, "somebody fell", PATIENCE_S)
     finally:
         gate.terminate()
         gate.wait(PATIENCE_S)
+    status, _, said = robot.commission()
+    assert status == 1
+    assert "the robot is stopped: somebody fell" in said.replace("\n", " ")
     document = yaml.safe_load(robot.config.read_text())
     del document["safety"]["odometry"]
     robot.config.write_text(yaml.safe_dump(document))

@@ -65,6 +65,7 @@ def test_acknowledged_is_kept(tmp_path):
     keeper = Keeper(path, BOOT, pytest.fail)
     latch = Latch(keeper)
     assert latch.reason == FIRST_ACT
+    assert not latch.stop(FIRST_ACT)
     assert not latch.kept
     keeper.start()
     wait(lambda: latch.kept)
@@ -76,6 +77,15 @@ def test_acknowledged_is_kept(tmp_path):
     assert not latch.stop("the first reason is kept")
     wait(lambda: latch.kept)
     assert Keeper(path, BOOT, pytest.fail).before() == "released (before the guard was started again)"
+
+
+def test_what_somebody_asks_for_goes_before_the_first_act(tmp_path):
+    """Who resets a machine that was just started, `robot run` say, does not reset what a person stopped it for."""
+    latch = Latch(Keeper(str(tmp_path / "latch"), BOOT, pytest.fail))
+    before = latch.generation
+    assert latch.stop("somebody fell")
+    assert latch.reason == "somebody fell"
+    assert not latch.reset(before)
 
 
 def test_what_cannot_be_kept_is_said(tmp_path):

@@ -72,7 +72,7 @@ def commission(
     document = {
         "at": datetime.now(UTC).isoformat(timespec="seconds"),
         "robot": str(config),
-        "passed": not stopped and all(step.ok is not False for step in done),
+        "passed": not stopped and any(step.ok for step in done) and all(step.ok is not False for step in done),
         "ended": stopped,
         "steps": [{"step": s.name, "ok": s.ok, "says": s.says, **s.measured} for s in done],
         "proposal": work.proposal,

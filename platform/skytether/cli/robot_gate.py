@@ -105,7 +105,7 @@ class OwnGate:
         with contextlib.suppress(GateError):
             stopped = ask(self._folder, {"do": "status"}, _ASK_S)["stopped"]
             if stopped == FIRST_ACT:
-                ask(self._folder, {"do": "reset"}, _ASK_S)
+                ask(self._folder, {"do": "reset", "only": FIRST_ACT}, _ASK_S)
             if start and stopped in ("", FIRST_ACT):
                 ask(self._folder, {"do": "start"}, _ASK_S)
 

@@ -156,10 +156,11 @@ class Latch:
         keeper.keep(self.generation, self.reason)
 
     def stop(self, reason: str) -> bool:
-        """In effect at once. The first reason is kept. True if it was not stopped before."""
-        if self.reason:
+        """In effect at once. The first reason is kept, but for `FIRST_ACT`, which is nobody's. True if this is new."""
+        reason = clean(reason) or "somebody asked for it"
+        if self.reason not in ("", FIRST_ACT) or reason == self.reason:
             return False
-        self._change(clean(reason) or "somebody asked for it")
+        self._change(reason)
         return True
 
     def reset(self, generation: int) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skytether.guard.latch import Keeper, boot_id
+from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, LaserScan, Message, encode
@@ -262,6 +262,19 @@ def test_after_a_reset_nothing_moves_until_a_person_says_start(bench):
     bench.link.send(Velocity(0.2, 0.0))
     assert bench.ask(do="start")["started"] == ["agent"]
     drive(bench)
+
+
+def test_who_resets_a_machine_that_was_started_does_not_reset_what_a_person_asked_for(bench):
+    bench.answer = bench.answer._replace(generation=1, stopped=FIRST_ACT)
+    for _ in range(2):
+        bench.turn()
+    assert bench.ask(do="status")["stopped"] == FIRST_ACT
+    bench.answer = bench.answer._replace(generation=2, stopped="somebody fell")  # by the guard's own way
+    for _ in range(2):
+        bench.turn()
+    assert bench.ask(do="status")["stopped"] == "somebody fell"
+    assert "somebody fell" in bench.ask(do="reset", only=FIRST_ACT)["refused"]
+    assert not bench.beat.reset
 
 
 def test_a_stop_is_kept_by_the_gate_where_the_guard_does_not_answer(bench):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from skytether.guard.latch import Keeper, clean
+from skytether.guard.latch import FIRST_ACT, Keeper, clean
 from skytether.guard.requests import Reply
 
 from .heartbeat import Heartbeat
@@ -58,7 +58,7 @@ class Control:
         if self.resets and not answer.stopped:
             self.resets = False
             self._gate.reset(now)
-        elif answer.stopped and not self._gate.stopped:
+        elif answer.stopped:
             self._gate.engage(answer.stopped)
 
     def handle(self, asked: Mapping[str, object]) -> Reply | Callable[[], Reply | None]:
@@ -69,7 +69,7 @@ class Control:
         if what == "stop":
             return self._stop(clean(asked.get("reason")) or "somebody asked for it")
         if what == "reset":
-            return self._reset()
+            return self._reset(str(asked.get("only", "")))
         if what == "start":
             started, refused = self._gate.start(self._clock())
             return {"refused": refused} if refused else {**self._status(), "started": started}
@@ -87,7 +87,8 @@ class Control:
         def kept() -> Reply | None:
             nonlocal change
             answer, waited = self._heartbeat.answer, self._clock() - begun
-            if answer is not None and answer.stopped and answer.kept and answer.at >= begun:
+            known = answer is not None and answer.stopped not in ("", FIRST_ACT)
+            if answer is not None and known and answer.kept and answer.at >= begun:
                 return self._status()
             if waited < _GUARD_KEEPS_S:
                 return None
@@ -104,8 +105,10 @@ class Control:
 
         return kept
 
-    def _reset(self) -> Reply | Callable[[], Reply | None]:
+    def _reset(self, only: str) -> Reply | Callable[[], Reply | None]:
         now = self._clock()
+        if only and self._gate.stopped != only:
+            return {"refused": f"the robot is not stopped because '{only}', but: {self._gate.stopped or 'not at all'}"}
         if refused := self._gate.refuses_reset(now):
             return {"refused": refused}
         answer = self._heartbeat.answer

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import nan
 
+from skytether.guard.latch import FIRST_ACT
+
 _TOLERANCE_S = 0.05
 """How far ahead of now something may have been heard."""
 
@@ -42,8 +44,8 @@ class Latch:
 
 
 def engage(before: Latch, reason: str) -> Latch:
-    """Stop until reset. The first reason is kept."""
-    return before if before.reason else replace(before, reason=reason)
+    """Stop until reset. The first reason is kept, but for `FIRST_ACT`: what somebody asks for goes before it."""
+    return before if before.reason not in ("", FIRST_ACT) else replace(before, reason=reason)
 
 
 def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:

@@ -12,7 +12,8 @@ from typing import IO
 
 from skytether.guard.clock import now as boottime
 from skytether.guard.enable import Line, open_line
-from skytether.guard.loop import LOCK_FILE
+from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
+from skytether.guard.loop import LATCH_FILE, LOCK_FILE
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool
 
@@ -44,6 +45,7 @@ class HardwareRig:
         self._config, self._odometry = config, config.odometry
         self._period = 1 / config.rate_hz
         self._lock = _take_folder(config)
+        self._refuse_a_stopped_robot()
         self._motion: deque[tuple[float, Velocity]] = deque(maxlen=_READINGS)
         self._button: tuple[bool, float] | None = None
         self._on, self._high = True, False
@@ -108,6 +110,14 @@ class HardwareRig:
         for part in (self._wheels, self._sensors, self._line, self._lock):
             if part is not None:
                 part.close()
+
+    def _refuse_a_stopped_robot(self) -> None:
+        """An emergency stop holds without a gate, too; that nobody has reset the machine yet is none."""
+        keeper = Keeper(os.path.join(self._config.place(), LATCH_FILE), boot_id(), lambda _: None)
+        stopped = keeper.before()
+        if stopped and stopped != FIRST_ACT:
+            self._lock.close()
+            raise CommissionError(f"the robot is stopped: {stopped}; start its gate and say: skytether robot reset")
 
     def _hear_all(self) -> None:
         """Wait until odometry and button are heard, and the robot stands."""
