@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import httpx
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from .bounded import WHOLE, BoundedTransport, EndlessError
 from .manifest import Manifest
 from .rest import (
     CHANGE,
@@ -56,6 +57,12 @@ _RESUME_S = 30.0
 _RESUME_PAUSE_S = 0.2
 _END_SEEN_S = 1.0
 """By when an orchestrator has seen that a run has ended [s]."""
+_STEPS = 4
+"""An answer may take so many times as long as one step of its request: connect, send, and two to receive."""
+_LARGEST = 1 << 26
+"""Bytes of an answer: the instances of ten thousand robots are less."""
+_LONGEST = 4096
+"""Characters of what an orchestrator says is wrong; some are lists of what a manifest lacks."""
 _AWAY = (502, 503, 504)
 """Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
 _REPEATABLE = ("/renew", "/migrate", "/session")
@@ -94,15 +101,22 @@ class Client:
     """
 
     def __init__(
-        self, base_url: str, token: str | None = None, *, timeout: float = 10.0, ca_file: Path | str | None = None
+        self,
+        base_url: str,
+        token: str | None = None,
+        *,
+        timeout: float = 10.0,
+        ca_file: Path | str | None = None,
+        largest: int = _LARGEST,
     ) -> None:
         """One orchestrator, or several.
 
         Args:
             base_url: ``https://host:port``; of several, with commas between them.
             token: An operator's or a robot's.
-            timeout: Seconds for each step of a request: connect, send, receive.
+            timeout: Seconds for each step of a request: connect, send, receive; all of it takes four of them at most.
             ca_file: PEM file of the authority that the orchestrator's certificate is by; None: the system's.
+            largest: Bytes of an answer that is not followed as it comes.
 
         Raises:
             ApiError: The token holds characters that no token has, or the file holds no certificate.
@@ -112,11 +126,13 @@ class Client:
         """Which of them answered last."""
         if token and not (token.isascii() and token.isprintable()):
             raise ApiError(Problem(title="No valid token", status=401, detail="what was given as token is none"))
+        self._whole = {WHOLE: _STEPS * timeout}
+        # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
+        verify = None if all(url.startswith("http://") for url in self._urls) else _trust(ca_file)
         self._http = httpx.Client(
-            headers={"Authorization": f"Bearer {token}"} if token else {},
+            headers={"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {token}"} if token else {}),
             timeout=timeout,
-            # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
-            verify=False if all(url.startswith("http://") for url in self._urls) else _trust(ca_file),
+            transport=BoundedTransport(verify, largest),
             # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
             trust_env=False,
         )
@@ -467,6 +483,7 @@ class Client:
             at, last = (first + turn) % count, turn == count
             try:
                 asked = self._http.build_request(method, self._urls[at] + path, **request)
+                asked.extensions |= {} if stream else self._whole
                 response = self._http.send(asked, stream=stream)
             except (httpx.ConnectError, httpx.ConnectTimeout):
                 if last or alone:
@@ -502,6 +519,8 @@ class Client:
         asked = f"{at.scheme}://{at.netloc.decode('ascii')}"
         if "WRONG_VERSION_NUMBER" in str(error):
             return Unreachable(f"{asked} does not speak TLS: write http:// instead of https://, or correct the port")
+        if isinstance(error, EndlessError):
+            return Unreachable(f"{asked} is no orchestrator: {error}")
         if isinstance(error, httpx.RemoteProtocolError) and at.scheme == "http":
             return Unreachable(
                 f"{asked} closes the connection without an answer: if it has a certificate, write https:// instead of "
@@ -536,7 +555,7 @@ def _trust(ca_file: Path | str | None) -> ssl.SSLContext:
 def _json(response: httpx.Response) -> Any:
     try:
         return response.json()
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # deeper than Python calls
         raise ApiError(_strange("no JSON")) from error
 
 
@@ -550,6 +569,7 @@ def _parse(model: type[_Model], document: Any) -> _Model:
 def _problem(response: httpx.Response) -> Problem:
     try:
         problem = Problem.model_validate_json(response.content)
+        problem = problem.model_copy(update={"title": _plain(problem.title), "detail": _plain(problem.detail)})
         if problem.status != 401:
             return problem
         # The orchestrator speaks of headers; who uses this client gave a token, or forgot to.
@@ -558,6 +578,11 @@ def _problem(response: httpx.Response) -> Problem:
     except ValidationError:
         detail = f"the answer was HTTP {response.status_code}: is this the address of an orchestrator?"
         return Problem(title=response.reason_phrase, status=response.status_code, detail=detail)
+
+
+def _plain(text: str) -> str:
+    """What may be shown: no codes that a terminal obeys, and no more than somebody reads."""
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text[:_LONGEST])
 
 
 def _strange(what: str) -> Problem:

@@ -137,6 +137,10 @@ class TopicSpec(Strict):
         return self
 
 
+Topics = Annotated[tuple[TopicSpec, ...], Field(max_length=1000)]
+"""Of one service: a robot sets each of them up, and checks it, beside driving."""
+
+
 class Needs(Strict):
     """What a site and a link must offer before an instance may run there."""
 
@@ -195,7 +199,7 @@ class ServiceSpec(Strict):
     """Names in the graph of the service's topics, calls and actions, where they are not those of its namespaces."""
     params: dict[str, Any] = {}
     """JSON schema (2020-12) of the parameters; ``additionalProperties`` is false unless it says otherwise."""
-    topics: tuple[TopicSpec, ...] = ()
+    topics: Topics = ()
     needs: Needs = Needs()
     limits: Limits = Limits()
 

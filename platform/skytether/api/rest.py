@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
-from .manifest import Name, Needs, Strict, Tier, TopicSpec
+from .manifest import Name, Needs, Strict, Tier, Topics
 
 
 class State(StrEnum):
@@ -119,7 +119,7 @@ class Session(Strict):
     host: str | None = None
     """Where the service's end can be reached (the advertised, not the bound address); None until it is up."""
     port: int | None = None
-    topics: tuple[TopicSpec, ...] = ()
+    topics: Topics = ()
     needs: Needs = Needs()
 
 

@@ -105,7 +105,9 @@ def log_to_console() -> None:
 class _ConsoleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            text = self.format(record)
+            # Some of it others wrote: a terminal obeys no code of theirs, and no second line looks like one of ours.
+            text = self.format(record).replace("\n", "\n    ")
+            text = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
             console.print(f"[yellow]{record.levelname.lower()}:[/] {escape(text)}", soft_wrap=True)
         except Exception:
             self.handleError(record)

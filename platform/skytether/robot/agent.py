@@ -56,6 +56,9 @@ from .wheels_watch import NOBODY, WatchesWheels
 
 _log = logging.getLogger(__name__)
 
+_LARGEST_ANSWER = 1 << 20
+"""Bytes of an answer of the orchestrator: a session of a thousand topics is less, and the control loop waits for no
+reader of more."""
 _WATCH_S = 0.1
 """Between looks at the bridge's counters."""
 _JOIN_S = 2.0
@@ -182,7 +185,13 @@ class Agent:
         self._own_client = (
             None
             if client
-            else Client(config.url, config.token, timeout=config.request_timeout_s, ca_file=config.ca_file)
+            else Client(
+                config.url,
+                config.token,
+                timeout=config.request_timeout_s,
+                ca_file=config.ca_file,
+                largest=_LARGEST_ANSWER,
+            )
         )
         speaks: Any = client or self._own_client
         self._tasks = (

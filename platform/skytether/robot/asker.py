@@ -33,6 +33,8 @@ _IDLE_S = 0.5
 """Between looks whether the service is wanted again."""
 _MOVING_S = 0.05
 """Between looks at an instance that is to take over."""
+_LONGEST = 1000
+"""Characters of a trouble: the orchestrator's reasons are part of it."""
 _MOVE_S = 20.0
 """An instance elsewhere that is not running by then is given up; the one that runs is kept."""
 
@@ -299,5 +301,5 @@ class Asker:
         return self._say(sentence, self._backoff.next())
 
     def _say(self, sentence: str, delay: float) -> float:
-        self._trouble = sentence
+        self._trouble = sentence[:_LONGEST]
         return delay
