@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from math import inf
-from typing import Any
+from typing import Any, cast
 
 import httpcore
 import httpx
@@ -60,8 +60,8 @@ class BoundedTransport(httpx.HTTPTransport):
             response.close()
             raise EndlessError("an answer came packed, which was not asked for")
         bounded = WHOLE in request.extensions or response.is_error
-        assert isinstance(response.stream, httpx.SyncByteStream)
-        response.stream = _Body(response.stream, self._largest if bounded else inf, lambda: self._until.the(end))
+        body = cast("httpx.SyncByteStream", response.stream)
+        response.stream = _Body(body, self._largest if bounded else inf, lambda: self._until.the(end))
         return response
 
 
