@@ -27,7 +27,8 @@ def main() -> None:
         sys.exit(2)
     ended: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda got, _: ended.append(got))
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            signal.signal(number, lambda got, _: ended.append(got))
     try:
         guard = Guard(settings, log, refused)
     except GuardError as error:

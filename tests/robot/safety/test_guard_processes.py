@@ -134,6 +134,15 @@ def test_a_guard_that_is_told_to_end_brakes_first(robot, number):
     assert not robot.alive("gate")
 
 
+def test_under_nohup_a_terminal_that_is_closed_stops_no_robot(tmp_path):
+    with PlayedRobot(tmp_path, before=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)) as robot:
+        robot.go()
+        robot.signal("guard", signal.SIGHUP)
+        time.sleep(1.0)
+        assert robot.alive("guard")
+        robot.wait(robot.drives, "the robot drives on")
+
+
 @pytest.mark.parametrize("order", [("guard", "gate"), ("gate", "guard")])
 def test_a_service_manager_that_signals_all_at_once_ends_no_one_before_the_wheels_stand(robot, order):
     stage = Stage(robot)

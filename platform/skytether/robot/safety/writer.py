@@ -140,7 +140,8 @@ def main() -> None:
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
     warm([Twist], "cdr" if config.ros1 is None else "ros1")
-    privileges.take(privileges.WRITER)
+    for sentence in privileges.take(privileges.WRITER):
+        _log.info("%s", sentence)
     wheels = open_wheels(config, "guard")
     writer = Writer(config, guard, wheels)
     gc.collect()
