@@ -6,12 +6,15 @@ import yaml
 
 from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
-from skytether.messages import Joy, LaserScan, Range
+from skytether.messages import Joy, LaserScan, PointCloud2, Range
 from skytether.robot.safety.address import address
+from skytether.robot.safety.clouds import CloudMount
 from skytether.robot.safety.config import SafetyConfig, default_folder, default_record
 from skytether.robot.safety.coverage import Action
 
 LEAST = {"footprint": {"radius": 0.3}, "sensors": {"scan": {}}}
+
+CLOUDS = {"kind": "points", "x": 0.25, "z": 0.4, "max_z_m": 1.0, "range_max": 4.0}
 
 
 @pytest.fixture
@@ -65,6 +68,30 @@ def test_everything_can_be_written_and_goes_to_the_gate_unchanged(load):
     assert config.place() == Path("/run/walker")
 
 
+def test_a_depth_camera_as_it_is_mounted_goes_to_the_gate_unchanged(load):
+    angles = {"yaw_deg": 90, "pitch_deg": 20, "roll_deg": 180, "slope_deg": 5}
+    depth = CLOUDS | angles | {"optical": True, "min_z_m": 0.08, "min_points": 500, "fov_deg": [-40, 40], "frame_id": "d"}
+    config = load({"footprint": {"radius": 0.3}, "sensors": {"depth": depth}})
+    assert SafetyConfig.model_validate_json(config.model_dump_json()) == config
+    assert config.kinds() == {"depth": PointCloud2}
+    sensor = config.rules().sensors["depth"]
+    assert sensor.frame == "d"
+    assert sensor.mount == CloudMount(
+        x=0.25,
+        z=0.4,
+        yaw=math.pi / 2,
+        pitch=math.radians(20),
+        roll=math.pi,
+        slope=math.tan(math.radians(5)),
+        optical=True,
+        min_z=0.08,
+        max_z=1.0,
+        range_max=4.0,
+        min_points=500,
+        fov=(math.radians(-40), math.radians(40)),
+    )
+
+
 def test_the_robots_own_limits_hold_unless_the_section_has_some(load):
     assert load(LEAST, limits={"linear_max": 0.4}).rules().limits.linear_max == 0.4
     assert load(LEAST | {"limits": {"linear_max": 0.2}}, limits={"linear_max": 0.4}).rules().limits.linear_max == 0.2
@@ -110,9 +137,20 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"footprint": {}}, "safety.footprint: give either polygon or radius"),
         ({"footprint": {"radius": 0}}, "safety.footprint.radius: input should be greater than 0"),
         ({"footprint": {"polygon": [[0, 0], [1, 0], [2, 0]]}}, "three corners that are not on one line"),
-        ({"sensors": {"scan": {"kind": "lidar"}}}, "safety.sensors.scan.kind: input should be 'laser' or 'sonar'"),
+        ({"sensors": {"scan": {"kind": "lidar"}}}, "safety.sensors.scan.kind: input should be 'laser', 'sonar' or 'points'"),
         ({"sensors": {"scan": {"yaw": 90}}}, "safety.sensors.scan.yaw: unknown key, did you mean 'yaw_deg'?"),
         ({"sensors": {"scan": {"on_unknown": "free"}}}, "on_unknown: input should be 'stop' or 'slow'"),
+        ({"sensors": {"scan": {"z": 0.4}}}, "sensors.scan: z means nothing without kind: points"),
+        ({"sensors": {"scan": {"max_z_m": 1}}}, "sensors.scan: max_z_m means nothing without kind: points"),
+        ({"sensors": {"depth": {**CLOUDS, "z": 0}}}, "z is needed with kind: points (height of the sensor"),
+        ({"sensors": {"depth": {**CLOUDS, "max_z_m": 0}}}, "max_z_m is needed with kind: points (height of the robot)"),
+        ({"sensors": {"depth": {**CLOUDS, "range_max": 0}}}, "range_max is needed with kind: points (a cloud does not"),
+        ({"sensors": {"depth": {**CLOUDS, "min_z_m": 1.2}}}, "min_z_m 1.2 must be below max_z_m 1.0"),
+        ({"sensors": {"depth": {**CLOUDS, "upside_down": True}}}, "upside_down means nothing with kind: points"),
+        ({"sensors": {"depth": {**CLOUDS, "no_echo_is_free": True}}}, "no_echo_is_free means nothing with kind: points"),
+        ({"sensors": {"depth": {**CLOUDS, "z": 4}}}, "sensors.depth.z must be 0.02 to 3 m, not 4"),
+        ({"sensors": {"depth": {**CLOUDS, "max_z_m": 1800}}}, "sensors.depth.max_z_m must be 0.1 to 3 m, not 1800"),
+        ({"sensors": {"depth": {**CLOUDS, "slope_deg": 20}}}, "sensors.depth.slope_deg must be 0 to 10 degrees"),
         ({"joystick": {"topic": "scan"}}, "safety: the topic 'scan' cannot be two things"),
         ({"sockets": {}, "ros1": {}}, "safety: there are sockets and ros1"),
         ({"ros1": {"cmd_vel": "1x"}}, "safety.ros1.cmd_vel: '1x' is no name of a graph"),

@@ -115,7 +115,7 @@ class Cover:
         yaw: Direction of its x axis in the base frame [rad].
         sense: -1 if its angles count to the right (mounted head over), else 1.
         reach: How far it looks into each cell, in its own angles [m]; 0: not at all, inf: as far as it measures.
-        near: What is nearer to it than this it does not see [m].
+        near: What is nearer to it than this it does not see [m]; one for all cells, or of each.
     """
 
     x: float
@@ -123,7 +123,7 @@ class Cover:
     yaw: float
     sense: float
     reach: NDArray[np.float64]
-    near: float = 0.0
+    near: float | NDArray[np.float64] = 0.0
 
     def looks_at(self, points: Points) -> NDArray[np.bool_]:
         """Which of the points (base frame, shape (n, 2), m) are where it looks."""
@@ -131,7 +131,7 @@ class Cover:
         angles = self.sense * (np.arctan2(dy, dx) - self.yaw)
         cells = np.floor(angles / _CELL).astype(np.int64) % CELLS
         away = np.hypot(dx, dy)
-        found: NDArray[np.bool_] = (away < self.reach[cells]) & (away >= self.near)
+        found: NDArray[np.bool_] = (away < self.reach[cells]) & (away >= np.broadcast_to(self.near, CELLS)[cells])
         return found
 
 

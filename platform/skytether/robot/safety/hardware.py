@@ -14,12 +14,14 @@ from skytether.guard import wheels
 from skytether.guard.mailbox import bind
 from skytether.guard.protocol import Told
 from skytether.guard.velocity import Velocity
-from skytether.messages import Message
+from skytether.messages import Message, PointCloud2
 
 from .inbox import Inbox, Topics
 
 _LARGEST = 256 * 1024
 """Bytes of one reading; more is cut off and then no message."""
+_LARGEST_CLOUD = 16 << 20
+"""The same where one of them is a cloud of points."""
 _EACH_TURN = 64
 """Readings taken in one turn of the loop; the rest waits in the socket's buffer, whose size the kernel bounds."""
 _STOPS_EACH_TURN = 1024
@@ -123,6 +125,7 @@ class SocketSensors:
     ) -> None:
         self._topics = topics
         self._trouble = trouble
+        self._largest = _LARGEST_CLOUD if PointCloud2 in topics.kinds.values() else _LARGEST
         self._inbox = Inbox(topics, "cdr", trouble)
         self._readings = bind(readings)
         try:
@@ -147,7 +150,7 @@ class SocketSensors:
         self._stops.close()
 
     def _fill(self, source: socket.socket, most: int, *, stops: bool) -> None:
-        for data in receive(source, _LARGEST, most):
+        for data in receive(source, self._largest, most):
             name, _, payload = data.partition(b"\0")
             topic = name[:64].decode("utf-8", errors="replace")
             if topic not in self._topics.kinds:

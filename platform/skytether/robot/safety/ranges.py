@@ -1,4 +1,4 @@
-"""From one message of a range sensor to points around the robot, or to the admission that it does not see. Pure.
+"""From one message of a laser or a sonar to points around the robot, or to the admission that it does not see. Pure.
 
 Readings follow REP 117: from ``range_min`` to ``range_max`` there is something, from ``range_max`` on or +inf there is
 nothing, below ``range_min`` or -inf there is something too close to be measured, NaN is no reading. A zero is no
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skytether.messages import LaserScan, Message, Range
 
-from .coverage import Cells, between, no_cells, sector, widest
+from .coverage import CELLS, Cells, between, no_cells, sector, widest
 from .footprint import Footprint, Points
 
 MAX_RAYS = 20_000
@@ -101,6 +101,7 @@ class View:
         edge: Ends of the rays that saw nothing within reach, base frame, shape (n, 2) [m]: the edge of what is known.
         looks: Cells of its own angles that were looked into, past all that is too close.
         spans: Cells that the message says it is about, looked into or not.
+        near: Of each cell, what is nearer than this is not seen [m].
     """
 
     sight: Sight
@@ -109,6 +110,7 @@ class View:
     edge: Points = field(default_factory=lambda: _NO_POINTS)
     looks: Cells = field(default_factory=no_cells)
     spans: Cells = field(default_factory=no_cells)
+    near: NDArray[np.float64] = field(default_factory=lambda: np.zeros(CELLS))
 
 
 def view(mount: Mount, outline: Footprint, message: Message, before: Cells | None = None) -> View:
@@ -124,7 +126,7 @@ def view(mount: Mount, outline: Footprint, message: Message, before: Cells | Non
         return _of_scan(mount, outline, message, before)
     if isinstance(message, Range):
         return _of_cone(mount, outline, message, before)
-    return _nonsense(f"a {message.TYPE} is no message of a range sensor")
+    return nonsense(f"a {message.TYPE} is no message of a range sensor")
 
 
 def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | None) -> View:
@@ -132,7 +134,7 @@ def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | 
     near, far = mount.range_min or scan.range_min, mount.range_max or scan.range_max
     wrong = _wrong_angles(mount, scan, ranges.size)
     if wrong or not 0 <= near < far:
-        return _nonsense(wrong or f"range_min {near}, range_max {far}")
+        return nonsense(wrong or f"range_min {near}, range_max {far}")
     step = abs(scan.angle_increment)
     angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size, dtype=np.float64)
     if scan.angle_increment < 0:
@@ -148,13 +150,13 @@ def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | 
     answered = ~none | mount.no_echo_is_free
     if (none | close).all():
         said = "everything is too close to be measured" if close.any() else "no reading at all (only zeros and NaN)"
-        return View(Sight.BLIND, _too_close(mount, outline, angles[close], near), said, spans=spans)
+        return View(Sight.BLIND, too_close(mount, outline, angles[close], near), said, spans=spans)
     seen = ~none & ~close & (ranges < far)
     points = np.concatenate(
-        (_place(mount, ranges[seen], angles[seen]), _too_close(mount, outline, angles[close], near))
+        (place(mount, ranges[seen], angles[seen]), too_close(mount, outline, angles[close], near))
     )
     free = answered & ~close & ~seen
-    edge = _place(mount, np.full(int(free.sum()), far), angles[free])
+    edge = place(mount, np.full(int(free.sum()), far), angles[free])
     looks = between(angles[answered & ~close], step, mount.max_gap)
     gap = widest(_required(mount, spans, before) & ~ignored & ~between(angles[answered], step, mount.max_gap))
     if gap > mount.max_gap:
@@ -186,18 +188,18 @@ def _of_cone(mount: Mount, outline: Footprint, message: Range, before: Cells | N
     near, far = mount.range_min or message.min_range, mount.range_max or message.max_range
     width, value = message.field_of_view, message.range
     if not (0 <= near <= far and isfinite(far) and far > 0 and 0 <= width <= pi):
-        return _nonsense(f"min_range {near}, max_range {far}, field_of_view {width}")
+        return nonsense(f"min_range {near}, max_range {far}, field_of_view {width}")
     angles = np.linspace(-width / 2, width / 2, _CONE_POINTS, dtype=np.float64)
     spans = sector(-width / 2, width / 2)
     if isnan(value) or value == 0:
         return View(Sight.BLIND, _NO_POINTS, "no reading at all (only zeros and NaN)", spans=spans)
     points, edge, looks = _NO_POINTS, _NO_POINTS, spans
     if value < near or value <= near == far:
-        points, looks = _too_close(mount, outline, angles, near), no_cells()
+        points, looks = too_close(mount, outline, angles, near), no_cells()
     elif value < far:
-        points = _place(mount, np.full(_CONE_POINTS, value), angles)
+        points = place(mount, np.full(_CONE_POINTS, value), angles)
     else:
-        edge = _place(mount, np.full(_CONE_POINTS, far), angles)
+        edge = place(mount, np.full(_CONE_POINTS, far), angles)
     missing = _required(mount, spans, before) & ~spans
     gap = widest(missing)
     if gap > mount.max_gap:
@@ -226,12 +228,12 @@ def _within(angles: NDArray[np.float64], first: float, last: float) -> NDArray[n
     return found
 
 
-def _too_close(mount: Mount, outline: Footprint, angles: NDArray[np.float64], near: float) -> Points:
+def too_close(mount: Mount, outline: Footprint, angles: NDArray[np.float64], near: float) -> Points:
     """What is nearer than can be measured may be anywhere up to there: at the robot's outline at the nearest."""
     if not len(angles):
         return _NO_POINTS
     ways = outline.ways_out((mount.x, mount.y), _bearings(mount, angles))
-    return np.concatenate((_place(mount, ways, angles), _place(mount, np.maximum(ways, near), angles)))
+    return np.concatenate((place(mount, ways, angles), place(mount, np.maximum(ways, near), angles)))
 
 
 def _bearings(mount: Mount, angles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -239,11 +241,13 @@ def _bearings(mount: Mount, angles: NDArray[np.float64]) -> NDArray[np.float64]:
     return mount.yaw + mount.sense * angles
 
 
-def _place(mount: Mount, ranges: NDArray[np.float64], angles: NDArray[np.float64]) -> Points:
+def place(mount: Mount, ranges: NDArray[np.float64], angles: NDArray[np.float64]) -> Points:
+    """Points by their distance and own angle, in the base frame."""
     along, across = ranges * np.cos(angles), mount.sense * ranges * np.sin(angles)
     c, s = cos(mount.yaw), sin(mount.yaw)
     return np.column_stack((mount.x + c * along - s * across, mount.y + s * along + c * across))
 
 
-def _nonsense(detail: str) -> View:
+def nonsense(detail: str) -> View:
+    """Nothing can be taken from a message."""
     return View(Sight.NONSENSE, _NO_POINTS, detail)

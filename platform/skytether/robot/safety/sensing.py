@@ -1,6 +1,6 @@
 """What the robot's own range sensors see, all of them together. Pure: time is an argument.
 
-What one message says is `ranges`', what its stamp says is `stamps`'; how fast the robot may go among what is seen is
+What one message says is `ranges`' and `clouds`', what its stamp says is `stamps`'; how fast the robot may go among what is seen is
 `zones`', and where nothing looks `coverage`'s.
 
 Each sensor has a contract: a field of view, a frame, an order of its stamps. What is not configured of it is learned
@@ -18,6 +18,7 @@ import numpy as np
 
 from skytether.messages import Header, Message
 
+from .clouds import CloudMount, view_of_cloud
 from .coverage import Action, Cells, Cover
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint, Points
@@ -31,7 +32,7 @@ _MOST_TOLERANCE_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class RangeSensor:
-    """A laser or a sonar.
+    """A laser, a sonar, a depth camera or a 3D lidar.
 
     Attributes:
         mount: Where it is, how far it is to be believed, where it must look.
@@ -59,7 +60,7 @@ class Part:
         edge: Where its sight ends on rays that saw nothing, the same way.
         age: Of the measurement [s].
         cover: Where it looks.
-        far: How far it measures [m]; 0: not known, as nothing was beyond.
+        far: How far it measures in all directions [m]; 0: not known, as nothing was beyond.
     """
 
     points: Points
@@ -158,7 +159,10 @@ class Sensing:
         if dated.wrong:
             self._known[topic] = replace(before, stamps=dated.stamps)
             return f"sensor:{topic}:{dated.wrong}", f"{topic}: {_SAYS[dated.wrong]}, which counts as silence"
-        seen = view(sensor.mount, self._outline, message, before.spans)
+        if isinstance(sensor.mount, CloudMount):
+            seen = view_of_cloud(sensor.mount, self._outline, message, before.spans)
+        else:
+            seen = view(sensor.mount, self._outline, message, before.spans)
         spans = before.spans
         if seen.sight is not Sight.NONSENSE:
             spans = seen.spans if spans is None else spans | seen.spans
@@ -204,8 +208,8 @@ class Sensing:
 def _part(mount: Mount, seen: View, age: float, now: float, reckoning: DeadReckoning) -> Part:
     points, edge = (reckoning.now_at(these, now - age, now) for these in (seen.points, seen.edge))
     reach = np.where(seen.looks, inf, 0.0)
-    far = float(np.hypot(seen.edge[0, 0] - mount.x, seen.edge[0, 1] - mount.y)) if len(seen.edge) else 0.0
-    return Part(points, edge, age, Cover(mount.x, mount.y, mount.yaw, mount.sense, reach), far)
+    far = float(np.hypot(seen.edge[:, 0] - mount.x, seen.edge[:, 1] - mount.y).min()) if len(seen.edge) else 0.0
+    return Part(points, edge, age, Cover(mount.x, mount.y, mount.yaw, mount.sense, reach, seen.near), far)
 
 
 def _action(sensor: RangeSensor, sight: Sight) -> Action:
@@ -215,7 +219,7 @@ def _action(sensor: RangeSensor, sight: Sight) -> Action:
 
 
 _SAYS: Mapping[str, str] = {
-    "repeated": "sends the same scan again",
-    "older": "sends a scan older than one before, or its clock was set back",
-    "unstamped": "sends a scan without a stamp",
+    "repeated": "sends the same reading again",
+    "older": "sends a reading older than one before, or its clock was set back",
+    "unstamped": "sends a reading without a stamp",
 }

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from math import inf, radians, tau
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from math import inf, radians, tan, tau
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from skytether.messages import LaserScan, Message, Range
+from skytether.messages import LaserScan, Message, PointCloud2, Range
 
+from .clouds import CloudMount
 from .config_base import Metres, Numbers
 from .contact import ContactKind, ContactParams
 from .coverage import Action, UnseenParams, sector
@@ -21,17 +23,43 @@ Sector = tuple[Degrees, Degrees]
 """From, and counter-clockwise to; the second below the first goes over the seam."""
 
 
-class SensorConfig(Numbers):
-    """A laser or a sonar, as it is mounted, and what its messages must be."""
+_MESSAGES: Mapping[str, type[Message]] = {"laser": LaserScan, "sonar": Range, "points": PointCloud2}
+_OF_POINTS = ("z", "pitch_deg", "roll_deg", "optical", "min_z_m", "max_z_m", "slope_deg", "min_points")
+_NOT_OF_POINTS = ("upside_down", "max_step_deg", "min_rays", "no_echo_is_free")
+_NEEDED_OF_POINTS = {
+    "z": "height of the sensor above the floor",
+    "max_z_m": "height of the robot",
+    "range_max": "a cloud does not say how far its sensor measures",
+}
 
-    kind: Literal["laser", "sonar"] = "laser"
-    """sensor_msgs/msg/LaserScan or sensor_msgs/msg/Range."""
+
+class SensorConfig(Numbers):
+    """A laser, a sonar, a depth camera or a 3D lidar, as it is mounted, and what its messages must be."""
+
+    kind: Literal["laser", "sonar", "points"] = "laser"
+    """sensor_msgs/msg/LaserScan, sensor_msgs/msg/Range or sensor_msgs/msg/PointCloud2."""
     x: Metres = 0.0
     """Forward of the base's origin [m]."""
     y: Metres = 0.0
     """Left of it [m]."""
     yaw_deg: Degrees = 0.0
     """Where its middle looks; positive to the left."""
+    z: Annotated[float, Field(ge=0)] = 0.0
+    """Of ``points``: height above the floor [m]."""
+    pitch_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
+    """Of ``points``: how far it looks down."""
+    roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """Of ``points``: positive: its left side is up; 180: head over."""
+    optical: bool | None = None
+    """Of ``points``: its clouds have z forward, x to the right; null: if their frame_id ends in ``_optical_frame``."""
+    min_z_m: Annotated[float, Field(gt=0)] = 0.05
+    """Of ``points``: what is lower is floor [m]."""
+    max_z_m: Annotated[float, Field(ge=0)] = 0.0
+    """Of ``points``: what is higher does not stop the robot [m]."""
+    slope_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
+    """Of ``points``: the floor may rise by this from the sensor on, and is floor."""
+    min_points: Annotated[int, Field(ge=1, le=500_000)] = 100
+    """Of ``points``: readings of a cloud at least."""
     upside_down: bool = False
     range_min: Annotated[float, Field(ge=0)] = 0.0
     """[m]; 0: as its messages say."""
@@ -58,7 +86,7 @@ class SensorConfig(Numbers):
     on_unknown: Literal["stop", "slow"] = "stop"
     """When it is blind, silent or makes no sense."""
     on_empty: Literal["stop", "slow", "free"] = "slow"
-    """When a laser reports nothing within reach in any direction."""
+    """When a laser or a depth camera reports nothing within reach in any direction."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> SensorConfig:
@@ -74,26 +102,56 @@ class SensorConfig(Numbers):
             raise ValueError("ignore_deg leaves nothing of its field of view: it would see nothing at all")
         return self
 
+    @model_validator(mode="after")
+    def _fits_its_kind(self) -> SensorConfig:
+        points = self.kind == "points"
+        for name in _NOT_OF_POINTS if points else _OF_POINTS:
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(f"{name} means nothing {'with' if points else 'without'} kind: points")
+        for name, what in _NEEDED_OF_POINTS.items() if points else ():
+            if not getattr(self, name):
+                raise ValueError(f"{name} is needed with kind: points ({what})")
+        if points and not self.min_z_m < self.max_z_m:
+            raise ValueError(f"min_z_m {self.min_z_m} must be below max_z_m {self.max_z_m}")
+        return self
+
     def message(self) -> type[Message]:
         """Type of its messages."""
-        return LaserScan if self.kind == "laser" else Range
+        return _MESSAGES[self.kind]
 
     def sensor(self) -> RangeSensor:
         """The sensor as the rules take it."""
-        mount = Mount(
-            x=self.x,
-            y=self.y,
-            yaw=radians(self.yaw_deg),
-            upside_down=self.upside_down,
-            range_min=self.range_min,
-            range_max=self.range_max,
-            ignore=tuple((radians(first), radians(last)) for first, last in self.ignore_deg),
-            fov=None if self.fov_deg is None else (radians(self.fov_deg[0]), radians(self.fov_deg[1])),
-            max_gap=radians(self.max_gap_deg),
-            max_step=radians(self.max_step_deg),
-            min_rays=self.min_rays,
-            no_echo_is_free=self.no_echo_is_free,
-        )
+        common: dict[str, Any] = {
+            "x": self.x,
+            "y": self.y,
+            "yaw": radians(self.yaw_deg),
+            "range_min": self.range_min,
+            "range_max": self.range_max,
+            "ignore": tuple((radians(first), radians(last)) for first, last in self.ignore_deg),
+            "fov": None if self.fov_deg is None else (radians(self.fov_deg[0]), radians(self.fov_deg[1])),
+            "max_gap": radians(self.max_gap_deg),
+        }
+        mount: Mount
+        if self.kind == "points":
+            mount = CloudMount(
+                **common,
+                z=self.z,
+                pitch=radians(self.pitch_deg),
+                roll=radians(self.roll_deg),
+                optical=self.optical,
+                min_z=self.min_z_m,
+                max_z=self.max_z_m,
+                slope=tan(radians(self.slope_deg)),
+                min_points=self.min_points,
+            )
+        else:
+            mount = Mount(
+                **common,
+                upside_down=self.upside_down,
+                max_step=radians(self.max_step_deg),
+                min_rays=self.min_rays,
+                no_echo_is_free=self.no_echo_is_free,
+            )
         return RangeSensor(
             mount,
             self.max_age_s,
