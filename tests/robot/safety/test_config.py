@@ -70,7 +70,9 @@ def test_everything_can_be_written_and_goes_to_the_gate_unchanged(load):
 
 def test_a_depth_camera_as_it_is_mounted_goes_to_the_gate_unchanged(load):
     angles = {"yaw_deg": 90, "pitch_deg": 20, "roll_deg": 180, "slope_deg": 5}
-    depth = CLOUDS | angles | {"optical": True, "min_z_m": 0.08, "min_points": 500, "fov_deg": [-40, 40], "frame_id": "d"}
+    depth = (
+        CLOUDS | angles | {"optical": True, "min_z_m": 0.08, "min_points": 500, "fov_deg": [-40, 40], "frame_id": "d"}
+    )
     config = load({"footprint": {"radius": 0.3}, "sensors": {"depth": depth}})
     assert SafetyConfig.model_validate_json(config.model_dump_json()) == config
     assert config.kinds() == {"depth": PointCloud2}
@@ -137,7 +139,10 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"footprint": {}}, "safety.footprint: give either polygon or radius"),
         ({"footprint": {"radius": 0}}, "safety.footprint.radius: input should be greater than 0"),
         ({"footprint": {"polygon": [[0, 0], [1, 0], [2, 0]]}}, "three corners that are not on one line"),
-        ({"sensors": {"scan": {"kind": "lidar"}}}, "safety.sensors.scan.kind: input should be 'laser', 'sonar' or 'points'"),
+        (
+            {"sensors": {"scan": {"kind": "lidar"}}},
+            "safety.sensors.scan.kind: input should be 'laser', 'sonar' or 'points'",
+        ),
         ({"sensors": {"scan": {"yaw": 90}}}, "safety.sensors.scan.yaw: unknown key, did you mean 'yaw_deg'?"),
         ({"sensors": {"scan": {"on_unknown": "free"}}}, "on_unknown: input should be 'stop' or 'slow'"),
         ({"sensors": {"scan": {"z": 0.4}}}, "sensors.scan: z means nothing without kind: points"),
@@ -147,7 +152,10 @@ def test_mistakes_in_other_sections_do_not_stop_the_gate(load):
         ({"sensors": {"depth": {**CLOUDS, "range_max": 0}}}, "range_max is needed with kind: points (a cloud does not"),
         ({"sensors": {"depth": {**CLOUDS, "min_z_m": 1.2}}}, "min_z_m 1.2 must be below max_z_m 1.0"),
         ({"sensors": {"depth": {**CLOUDS, "upside_down": True}}}, "upside_down means nothing with kind: points"),
-        ({"sensors": {"depth": {**CLOUDS, "no_echo_is_free": True}}}, "no_echo_is_free means nothing with kind: points"),
+        (
+            {"sensors": {"depth": {**CLOUDS, "no_echo_is_free": True}}},
+            "no_echo_is_free means nothing with kind: points",
+        ),
         ({"sensors": {"depth": {**CLOUDS, "z": 4}}}, "sensors.depth.z must be 0.02 to 3 m, not 4"),
         ({"sensors": {"depth": {**CLOUDS, "max_z_m": 1800}}}, "sensors.depth.max_z_m must be 0.1 to 3 m, not 1800"),
         ({"sensors": {"depth": {**CLOUDS, "slope_deg": 20}}}, "sensors.depth.slope_deg must be 0 to 10 degrees"),
@@ -233,7 +241,7 @@ def test_the_example_of_the_documentation_is_a_configuration(load):
     text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
     example = yaml.safe_load(text.split("```yaml")[1].split("```")[0])
     rules = load(example["safety"]).rules()
-    assert set(rules.sensors) == {"scan", "sonar_left"}
+    assert set(rules.sensors) == {"scan", "sonar_left", "camera/depth/points"}
 
 
 def test_addresses():

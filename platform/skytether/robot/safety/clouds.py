@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from math import atan, cos, degrees, inf, pi, sin, tau
+from math import atan, cos, degrees, pi, sin, tau
 
 import numpy as np
 from numpy.typing import NDArray
@@ -252,7 +252,9 @@ def _judge(mount: CloudMount, seen: _Seen, points: Points, before: Cells | None)
     if gap > mount.max_gap:
         return View(Sight.BLIND, points, f"no reading over {degrees(gap):.0f} degrees", edge, looks, spans, near)
     if not seen.within:
-        return View(Sight.EMPTY, points, f"nothing nearer than {mount.range_max:g} m anywhere", edge, looks, spans, near)
+        return View(
+            Sight.EMPTY, points, f"nothing nearer than {mount.range_max:g} m anywhere", edge, looks, spans, near
+        )
     return View(Sight.CLEAR, points, "", edge, looks, spans, near)
 
 
@@ -341,4 +343,3 @@ def _ignored(mount: CloudMount) -> Cells:
 def _cells(angles: NDArray[np.floating]) -> NDArray[np.intp]:
     found: NDArray[np.intp] = np.floor(angles * (1 / _CELL)).astype(np.intp) % CELLS
     return found
-

@@ -152,9 +152,7 @@ def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | 
         said = "everything is too close to be measured" if close.any() else "no reading at all (only zeros and NaN)"
         return View(Sight.BLIND, too_close(mount, outline, angles[close], near), said, spans=spans)
     seen = ~none & ~close & (ranges < far)
-    points = np.concatenate(
-        (place(mount, ranges[seen], angles[seen]), too_close(mount, outline, angles[close], near))
-    )
+    points = np.concatenate((place(mount, ranges[seen], angles[seen]), too_close(mount, outline, angles[close], near)))
     free = answered & ~close & ~seen
     edge = place(mount, np.full(int(free.sum()), far), angles[free])
     looks = between(angles[answered & ~close], step, mount.max_gap)

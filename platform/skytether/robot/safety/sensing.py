@@ -1,7 +1,7 @@
 """What the robot's own range sensors see, all of them together. Pure: time is an argument.
 
-What one message says is `ranges`' and `clouds`', what its stamp says is `stamps`'; how fast the robot may go among what is seen is
-`zones`', and where nothing looks `coverage`'s.
+What one message says is `ranges`' and `clouds`', what its stamp says is `stamps`'; how fast the robot may go among what
+is seen is `zones`', and where nothing looks `coverage`'s.
 
 Each sensor has a contract: a field of view, a frame, an order of its stamps. What is not configured of it is learned
 from its messages: a field of view only ever grows, a frame is that of the first. A message that breaks the contract
