@@ -16,6 +16,7 @@ from collections.abc import Callable
 from .child import Child
 from .clock import now as boottime
 from .enable import Enable, Power, WriterLine, open_line
+from .folder import objection
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
 from .mailbox import bind
@@ -348,11 +349,16 @@ class Guard:
 
 
 def _take_folder(folder: str) -> int:
+    before = os.umask(0o022)  # nobody else may write into it, whatever this process was started with
     try:
         os.makedirs(folder, exist_ok=True)
-        lock = os.open(os.path.join(folder, LOCK_FILE), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        if why := objection(folder):
+            raise GuardError(f"cannot trust the folder {folder} for the gate's sockets: {why}")
+        lock = os.open(os.path.join(folder, LOCK_FILE), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         raise GuardError(f"cannot use the folder {folder} for the gate's sockets: {error.strerror}") from error
+    finally:
+        os.umask(before)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

@@ -12,6 +12,8 @@ import socket
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
+from .folder import peer
+
 _CLIENTS = 16
 """At the same time; people are few, and each needs a moment."""
 _EACH_TURN = 4
@@ -76,6 +78,9 @@ class Requests:
                 client, _ = self._listener.accept()
             except OSError:  # nobody more
                 return
+            if peer(client) not in (0, os.geteuid()):  # the path's mode says so too: two locks are better than one
+                client.close()
+                continue
             client.setblocking(False)
             if len(self._clients) >= _CLIENTS:
                 idle = [known for known, pending in self._clients.items() if pending is None]

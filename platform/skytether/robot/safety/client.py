@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import select
 import socket
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.guard.clock import now as boottime
+from skytether.guard.folder import objection, peer, sender, trusted
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.velocity import Velocity
 
@@ -21,6 +23,8 @@ _LONGEST_REASON = 500
 """Characters that are sent; fewer are kept."""
 _GUARD_S = 1.0
 _LARGEST_STATE = 512
+_ANCILLARY = socket.CMSG_SPACE(12)
+"""Of a sender's credentials."""
 _MOST_STATES = 600
 """Taken in one call; the kernel keeps as many as net.unix.max_dgram_qlen says, 10 or 512."""
 
@@ -38,6 +42,7 @@ class GateLink:
     """
 
     def __init__(self, folder: Path, clock: Callable[[], float] = boottime) -> None:
+        self._folder = str(folder)
         self._address = str(folder / COMMAND_SOCKET)
         self._clock = clock
         self._epoch = time.monotonic_ns()
@@ -45,14 +50,21 @@ class GateLink:
         self._state: GateState | None = None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+        self._trusted: tuple[int, ...] = ()
+        """Who may be the gate; empty: its folder has not been looked at."""
         self._socket.bind("")  # the kernel gives it a name, for the gate to answer to
 
     def send(self, velocity: Velocity) -> None:
         """Ask the gate for a velocity.
 
         Raises:
-            OSError: There is no gate, or its queue is full.
+            OSError: There is no gate, its queue is full, or anybody could be it.
         """
+        if not self._trusted:
+            if why := objection(self._folder):
+                raise PermissionError(errno.EPERM, why)
+            self._trusted = trusted(self._folder)
         self.state()  # what is not taken in time would leave no room for newer ones
         self._sequence += 1
         self._socket.sendto(pack_command(self._epoch, self._sequence, self._clock(), velocity), self._address)
@@ -61,10 +73,11 @@ class GateLink:
         """The newest that the gate answered; None: nothing yet. Its ``at`` says how old it is. Never waits."""
         for _ in range(_MOST_STATES):
             try:
-                data, sender = self._socket.recvfrom(_LARGEST_STATE)
+                data, ancillary, _, name = self._socket.recvmsg(_LARGEST_STATE, _ANCILLARY)
             except OSError:  # nothing waits
                 break
-            if sender == self._address:  # the name of our socket is open to everybody, the gate's is not
+            # The name of our socket is open to everybody; the gate's is not, but for who has folders of his own.
+            if name == self._address and sender(ancillary) in self._trusted:
                 self._state = unpack_state(data) or self._state
         return self._state
 
@@ -89,7 +102,7 @@ def listens(folder: Path) -> bool:
             return True
         except OSError:
             return False
-    return True
+        return not _stranger(folder, link)
 
 
 def ask(folder: Path, request: dict[str, Any], timeout: float = 3.0) -> dict[str, Any]:
@@ -130,11 +143,16 @@ def stop(folder: Path, reason: str = "", timeout: float = 3.0) -> dict[str, Any]
         link.setblocking(False)
         try:
             link.connect(str(path))
-            link.send(request)
-            links[link] = path
+            link.send(request)  # in any case: to be asked to stop harms nobody
         except OSError as error:
             link.close()
             errors.append(_explained(path, error))
+            continue
+        if why := _stranger(folder, link):
+            link.close()
+            errors.insert(0, GateError(f"a stop was asked for, but whoever took it may not be the gate: {why}"))
+        else:
+            links[link] = path
     noted: dict[str, Any] | None = None
     end = time.monotonic() + timeout
     try:
@@ -163,10 +181,20 @@ def _ask(path: Path, request: dict[str, Any], timeout: float) -> dict[str, Any]:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
             link.settimeout(timeout)
             link.connect(str(path))
+            if why := _stranger(path.parent, link):
+                raise GateError(f"whoever listens at {path} may not be the gate: {why}")
             link.send(json.dumps(request).encode())
             return _checked(path, link.recv(_LARGEST_ANSWER))
     except (OSError, ValueError) as error:
         raise _explained(path, error) from error
+
+
+def _stranger(folder: Path, link: socket.socket) -> str:
+    """Why the other end may not be the gate or the guard; empty: it is."""
+    if why := objection(str(folder)):
+        return why
+    user = peer(link)
+    return "" if user in trusted(str(folder)) else f"it is the user {user}, to whom {folder} does not belong"
 
 
 def _checked(path: Path, data: bytes) -> dict[str, Any]:

@@ -125,7 +125,8 @@ class SafetyConfig(SourcesConfig):
     guard_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
     """The guard brakes when the gate has said nothing for this long, and the gate when the guard has not."""
     folder: Path | None = None
-    """Of the gate's sockets; null: ``/run/skytether`` for root, else ``$XDG_RUNTIME_DIR/skytether``."""
+    """Of the gate's sockets, where only its owner may write; null: ``/run/skytether`` for root, else
+    ``$XDG_RUNTIME_DIR/skytether``, or ``skytether/gate`` in the user's state folder where there is none."""
     record: Path | None = None
     """Of the event record; null: ``record`` in a ``folder`` that is given, else ``/var/lib/skytether/safety-record``
     for root, and the user's state folder for others."""

@@ -81,13 +81,19 @@ def unpack_command(data: bytes, source: StrEnum, now: float) -> Command | None:
 
 
 def default_folder() -> Path:
-    """Where the sockets of a gate are unless it is told otherwise; ``SKYTETHER_GATE_FOLDER`` tells everybody."""
+    """Where the sockets of a gate are unless it is told otherwise; ``SKYTETHER_GATE_FOLDER`` tells everybody.
+
+    Never below a folder that all users share: another one could have been there before, and take a stop in our stead.
+    """
     named = os.environ.get("SKYTETHER_GATE_FOLDER")
     if named:
         return Path(named)
     if os.geteuid() == 0:
         return Path("/run/skytether")
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/skytether-{os.geteuid()}") / "skytether"  # noqa: S108
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}")
+    if os.environ.get("XDG_RUNTIME_DIR") or runtime.is_dir():
+        return runtime / "skytether"
+    return _state_folder() / "gate"
 
 
 def default_record() -> Path:
@@ -97,4 +103,8 @@ def default_record() -> Path:
     own = os.environ.get("STATE_DIRECTORY")  # StateDirectory= of systemd: the service's own, and nobody else's
     if own:
         return Path(own.split(":")[0]) / "safety-record"
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "skytether" / "safety-record"
+    return _state_folder() / "safety-record"
+
+
+def _state_folder() -> Path:
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "skytether"
