@@ -92,6 +92,35 @@ def show_config(
     typer.echo(page() if markdown else example(), nl=False)
 
 
+audit_app = typer.Typer(help="Who did what.", no_args_is_help=True)
+app.add_typer(audit_app, name="audit")
+
+
+@audit_app.callback()
+def _audit_group() -> None:
+    """Who did what."""
+
+
+@audit_app.command("verify")
+def verify_audit(
+    file: Annotated[Path, typer.Argument(help="The file that logs.audit_file names.")],
+    last: Annotated[str | None, typer.Option(help="A hash noted earlier, or elsewhere, that must be in it.")] = None,
+) -> None:
+    """Look whether a line of an audit file was changed, taken away or put in; those that were full before it included.
+
+    That its end was cut off shows only by a hash that was noted elsewhere: give it with --last.
+    """
+    from skytether.orchestrator.audit import AuditError, verify
+
+    try:
+        checked = verify(file, last)
+    except AuditError as error:
+        fail(str(error))
+    since = "" if checked.first == 1 else f", from number {checked.first} on: the files before are elsewhere"
+    console.print(f"{checked.lines} lines are as they were written{since}", markup=False)
+    console.print(f"last hash: {checked.last_hash}", markup=False, soft_wrap=True)
+
+
 StateDir = Annotated[
     Path | None, typer.Option(help="Folder of the orchestrator's state.  [default: ~/.local/state/skytether]")
 ]

@@ -5,22 +5,33 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
-from logging.handlers import RotatingFileHandler
 from typing import Any
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from .settings import Logs
+from .audit import ChainFile, Journal, Sink
+from .settings import Logs, syslog_address
+from .throttle import Throttle
 
 AUDIT = "skytether.audit"
+NOBODY = "nobody"
 audit = logging.getLogger(AUDIT)
+strangers = logging.getLogger("skytether.strangers")
 
 _TEXT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 _CHATTY = ("alembic", "asyncio", "httpx", "sqlalchemy", "uvicorn")
 """At level debug too; SQLAlchemy would tell what is in every row."""
-_AUDIT_BYTES, _AUDIT_FILES = 10_000_000, 5
+_PATH = 256
+"""Characters of a path that are written."""
+_STRANGERS_PER_S, _STRANGERS_AT_ONCE = 10.0, 100
+"""Lines of all who have shown no good token."""
+_REFUSED_PER_S, _REFUSED_AT_ONCE = 0.5, 60
+"""Lines on what one owner of a token was refused."""
 _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)
 _CREATED = 201
@@ -55,26 +66,49 @@ def set_up(logs: Logs) -> None:
     """Send this process's log where the settings say.
 
     Raises:
-        OSError: The audit file cannot be written.
+        OSError: The audit file cannot be written, or a sink is not there; it names which.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if logs.format == "json" else TextFormatter(_TEXT))
     logging.basicConfig(level=logs.level.upper(), handlers=[handler], force=True)
     for chatty in _CHATTY:
         logging.getLogger(chatty).setLevel(logging.WARNING)
-    if logs.audit_file is not None:
-        file = RotatingFileHandler(logs.audit_file, maxBytes=_AUDIT_BYTES, backupCount=_AUDIT_FILES)
-        file.setFormatter(JsonFormatter())
-        audit.addHandler(file)
+    for sink in _sinks(logs):
+        sink.setFormatter(JsonFormatter())
+        audit.addHandler(sink)
         audit.propagate = False
     audit.setLevel(logging.INFO)
 
 
-class Audit:
-    """ASGI middleware: a line for each request that changes something or was refused. No bodies, no queries."""
+def _sinks(logs: Logs) -> Iterator[logging.Handler]:
+    if logs.audit_file is not None:
+        yield ChainFile(logs.audit_file)
+    if logs.audit_syslog is not None:
+        yield _sink(logs.audit_syslog, lambda text: Sink(syslog_address(text)))
+    if logs.audit_journald:
+        yield _sink("journald", lambda _: Journal())
 
-    def __init__(self, app: ASGIApp) -> None:
+
+def _sink(name: str, make: Callable[[str], logging.Handler]) -> logging.Handler:
+    try:
+        return make(name)
+    except OSError as error:
+        error.filename = name
+        raise
+
+
+class Audit:
+    """ASGI middleware: a line for each request that changes something or was refused. No bodies, no queries.
+
+    Whoever has shown no good token could fill any disk with such lines, or hide among them what somebody did: theirs go
+    to another log, few of them. And who is refused again and again is told of a few times a minute.
+    """
+
+    def __init__(self, app: ASGIApp, clock: Callable[[], float] = time.monotonic) -> None:
+        """``clock``: monotonic seconds."""
         self._app = app
+        self._strangers = _Few(_STRANGERS_PER_S, _STRANGERS_AT_ONCE, clock)
+        self._refused = _Few(_REFUSED_PER_S, _REFUSED_AT_ONCE, clock)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -96,12 +130,35 @@ class Audit:
                 self._note(scope, status, made)
 
     def _note(self, scope: Scope, status: int, made: str) -> None:
-        who = scope.get("state", {}).get("who", "nobody")
+        who = scope.get("state", {}).get("who", NOBODY)
         address = scope["client"][0] if scope.get("client") else ""
-        fields = {"who": who, "address": address, "method": scope["method"], "path": scope["path"], "status": status}
+        path = scope["path"] if len(scope["path"]) <= _PATH else f"{scope['path'][:_PATH]}..."
+        fields = {"who": who, "address": address, "method": scope["method"], "path": path, "status": status}
+        few = self._strangers if who == NOBODY else self._refused if status in _REFUSED else None
+        if few is not None:
+            left_out = few.take(who)
+            if left_out is None:
+                return
+            if left_out:
+                fields["left_out"] = left_out
         if made:
             fields["made"] = made  # which robot, token or instance: their names are in the body
         if scope["path"].endswith("/renew") and status == 200:
             return  # every robot, every two seconds: the lease in the database says it
         text = " ".join(str(value) for value in fields.values())
-        audit.info("%s", text, extra={"fields": fields})
+        (strangers if who == NOBODY else audit).info("%s", text, extra={"fields": fields})
+
+
+class _Few:
+    """So many lines of each, and how many were left out before the next."""
+
+    def __init__(self, per_s: float, at_once: int, clock: Callable[[], float]) -> None:
+        self._throttle = Throttle(per_s, at_once, clock)
+        self._left_out: Counter[str] = Counter()
+
+    def take(self, who: str) -> int | None:
+        """How many were left out since the last that was written; None: this one is, too."""
+        if self._throttle.wait(who):
+            self._left_out[who] += 1
+            return None
+        return self._left_out.pop(who, 0)

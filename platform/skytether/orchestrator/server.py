@@ -70,7 +70,8 @@ def run(settings: Settings) -> None:
     try:
         logs.set_up(settings.logs)
     except OSError as error:
-        raise StartError(f"cannot write {settings.logs.audit_file}: {error.strerror}", usage=True) from error
+        where = error.filename or settings.logs.audit_file
+        raise StartError(f"cannot write the audit to {where}: {error.strerror}", usage=True) from error
     _allow_connections()
     with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
         try:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from skytether.api.hosts import is_name
+from skytether.api.hosts import is_ip, is_name
 from skytether.api.manifest import Strict
 
 from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
@@ -162,6 +162,22 @@ class Tls(Group):
         return self
 
 
+def syslog_address(text: str) -> str | tuple[str, int]:
+    """Of a socket: its path, or IP address and port.
+
+    Raises:
+        ValueError: It is none.
+    """
+    kind, _, rest = text.partition(":")
+    host, _, port = rest.rpartition(":")
+    if kind == "unix" and rest.startswith("/"):
+        return rest
+    host = host.removeprefix("[").removesuffix("]")
+    if kind == "udp" and is_ip(host) and port.isdigit() and 0 < int(port) < 65_536:
+        return host, int(port)
+    raise ValueError("must be unix:/PATH or udp:ADDRESS:PORT, with an IP address: no name server is waited for")
+
+
 class Logs(Group):
     """What is written to standard error, and who did what."""
 
@@ -170,8 +186,22 @@ class Logs(Group):
     level: Literal["debug", "info", "warning", "error"] = "info"
     """The least important level that is written."""
     audit_file: Path | None = None
-    """File for one JSON object a line of each request that changes something or was refused; it is moved to
-    `NAME.1` to `NAME.5` at 10 MB. None: these go to the log, from the logger `skytether.audit`."""
+    """File for one JSON object a line of each request that changes something or was refused, mode 0600, each line with
+    the hash of the one before (`skytether orchestrator audit verify`). At 10 MB it becomes `NAME.000001` and so on, of
+    which none is ever deleted here. None, and no `audit_syslog` or `audit_journald`: these go to the log, from the
+    logger `skytether.audit`. Requests of who has shown no good token are no part of it: they go to the log, from
+    `skytether.strangers`, at most ten a second."""
+    audit_syslog: str | None = None
+    """`unix:/dev/log` or `udp:ADDRESS:PORT`: the same lines to a syslog, as facility authpriv."""
+    audit_journald: bool = False
+    """True: the same lines to journald of this machine."""
+
+    @field_validator("audit_syslog")
+    @classmethod
+    def _reachable(cls, address: str | None) -> str | None:
+        if address is not None:
+            syslog_address(address)
+        return address
 
 
 class Settings(Group):
