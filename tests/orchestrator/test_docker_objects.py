@@ -8,13 +8,14 @@ import io
 import json
 import sys
 import tarfile
-from contextlib import closing
+from contextlib import closing, nullcontext
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from docker.errors import ImageNotFound
 from pydantic import ValidationError
 
 from skytether.api.grant import Grant
@@ -24,7 +25,7 @@ from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
-from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials
+from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials, ensure_image
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
@@ -88,6 +89,59 @@ def test_no_two_pairs_of_robot_and_service_share_a_volume() -> None:
         volumes.add(data_volume("me", Launch(1, spec(), grant)))
     assert len(volumes) == len(set(names)) ** 2
     assert data_volume("me", launch()) == "skytether-me-data-walker-toy"
+
+
+class Registry:
+    """An engine that has no image, and on which somebody else's comes for whatever name is pulled."""
+
+    def __init__(self, *here: str) -> None:
+        self.here = set(here)
+        self.pulled: list[str] = []
+
+    def asked(self) -> Any:
+        return nullcontext()
+
+    def api(self, timeout_s: float | None = None) -> Any:
+        return self
+
+    def inspect_image(self, image: str) -> dict[str, str]:
+        if image not in self.here:
+            raise ImageNotFound("none")
+        return {"Id": f"id of {image}"}
+
+    def pull(self, image: str, **_: Any) -> list[dict[str, str]]:
+        self.pulled.append(image)
+        self.here.add(image)
+        return []
+
+
+DIGEST = f"@sha256:{'0' * 64}"
+
+
+@pytest.mark.parametrize("pull", ["missing", "always"])
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("guard", ["skytether/guard:1", "registry.example/guard:1", "guard"])
+def test_the_guards_image_is_never_pulled_by_a_name(guard: str, pull: str, pinned: bool) -> None:
+    engine: Any = Registry()
+    asked = options(guard_image=guard, pull=pull, pinned=pinned)
+    with pytest.raises(RuntimeFailure, match="is not pulled by this name"):
+        ensure_image(engine, asked, guard, print, by_digest=True)
+    assert engine.pulled == []
+    engine.here.add(guard)
+    assert ensure_image(engine, asked, guard, print, by_digest=True) == f"id of {guard}"
+    assert engine.pulled == []
+    assert ensure_image(engine, asked, guard + DIGEST, print, by_digest=True)
+
+
+@pytest.mark.parametrize("image", ["skytether/virtual-trail:1", "docker.io/skytether/recorder", "skytether/x"])
+def test_our_own_names_are_never_pulled_and_others_are(image: str) -> None:
+    engine: Any = Registry()
+    with pytest.raises(RuntimeFailure, match="make images"):
+        ensure_image(engine, options(pull="always"), image, print)
+    assert engine.pulled == []
+    for owned in (image + DIGEST, "registry.example/skytether/x:1", "example/toy:1"):
+        assert ensure_image(engine, options(), owned, print)
+        assert engine.pulled.pop() == owned
 
 
 def test_limits_come_from_the_manifest() -> None:

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from docker.auth import AuthConfig, load_config, resolve_authconfig, resolve_repository_name
+from docker.auth import INDEX_NAME, AuthConfig, load_config, resolve_authconfig, resolve_repository_name
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
 
 from skytether.api.pull import Pull
@@ -17,6 +17,8 @@ from ..base import RuntimeFailure
 from .engine import Engine, explain
 from .options import DockerOptions
 
+_UNOWNED = "skytether/"
+"""What the names of our own images begin with, as `make images` builds them."""
 _PULL_SILENCE_S = 120.0
 """A registry that sends nothing for so long is given up."""
 
@@ -72,7 +74,20 @@ def check_credentials(path: str) -> None:
         raise RuntimeFailure(f"registry_auth {path} has no 'auths': make it with `docker login`")
 
 
-def ensure_image(engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None]) -> str:
+def is_pulled(image: str) -> bool:
+    """Whether a registry may be asked for a name: not for those of our own images, which nobody owns in any registry.
+
+    Whoever registered the name there first would run code on all engines. A digest says what comes, whoever sends it.
+    """
+    if "@sha256:" in image:
+        return True
+    registry, name = resolve_repository_name(image)
+    return not (registry == INDEX_NAME and name.startswith(_UNOWNED))
+
+
+def ensure_image(
+    engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None], *, by_digest: bool = False
+) -> str:
     """The id of an image that is on the engine, after a pull if need be.
 
     Args:
@@ -80,15 +95,22 @@ def ensure_image(engine: Engine, options: DockerOptions, image: str, tell: Calla
         options: The site's: when to pull, and with which credentials.
         image: As the manifest names it.
         tell: Called with each step of a pull.
+        by_digest: Pull it only if its name holds its digest, whatever the name.
 
     Raises:
         EngineGoneError: The engine does not answer.
         RuntimeFailure: The image is missing and cannot be pulled.
     """
-    if options.pull != "always":
+    may_pull = "@sha256:" in image if by_digest else is_pulled(image)
+    if options.pull != "always" or not may_pull:
         found = _find(engine, image)
         if found is not None:
             return found
+        if not may_pull:
+            raise RuntimeFailure(
+                f"image '{image}' is not on the engine, and is not pulled by this name, which anybody may have in a "
+                "registry: build it (`make images`), or name it with its digest (NAME@sha256:...)"
+            )
         if options.pull == "never":
             raise RuntimeFailure(f"image '{image}' is not on the engine, and the site's option 'pull' is never")
     _pull(engine, options, image, tell)

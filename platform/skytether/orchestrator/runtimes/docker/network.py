@@ -109,10 +109,10 @@ def _labels(engine: Engine, network: str) -> dict[str, str] | None:
 
 def _guard(engine: Engine, options: DockerOptions) -> None:
     try:
-        image = ensure_image(engine, options, options.guard_image, lambda _: None)
+        image = ensure_image(engine, options, options.guard_image, lambda _: None, by_digest=True)
     except RuntimeFailure as error:
         raise type(error)(
-            f"the network of the instances cannot be closed off: {error}; `make images` builds it "
+            f"the network of the instances cannot be closed off: {error} "
             "(option 'guard_image'), or name a network of your own (option 'network')"
         ) from error
     said, status = run_guard(engine, image, rules(options.network))
@@ -130,6 +130,9 @@ def run_guard(engine: Engine, image: str, script: str) -> tuple[str, int]:
         "HostConfig": {
             "NetworkMode": "host",
             "ReadonlyRootfs": True,
+            "PidsLimit": 16,
+            "Memory": 64 << 20,
+            "IpcMode": "none",
             "CapDrop": ["ALL"],
             "CapAdd": ["NET_ADMIN"],
             "SecurityOpt": ["no-new-privileges"],

@@ -64,7 +64,8 @@ class DockerOptions(Strict):
     """Numbers of the groups that own these files on the engine's machine (``stat -c %g /dev/video0``): a service that
     asks for a device is in them, and may open it where it is not open to all."""
     pull: Literal["missing", "always", "never"] = "missing"
-    """When to fetch a service's image from its registry."""
+    """When to fetch a service's image from its registry. `skytether/...` without a registry is never fetched but by its
+    digest: these are built here (`make images`), and anybody may have the name elsewhere."""
     pinned: bool = False
     """Take only images that are named with their digest, NAME@sha256:..."""
     registry_auth: str | None = None
@@ -73,7 +74,7 @@ class DockerOptions(Strict):
     """The instances' network. It is made if it is not there, and closed off: robots reach instances, these reach
     nobody. One that somebody else made is used as it is."""
     guard_image: Annotated[str, Field(min_length=1)] = "skytether/guard:1"
-    """Runs once to close the network off."""
+    """Runs once, as root with NET_ADMIN, to close the network off. Never pulled, unless it is named with its digest."""
     environment: dict[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], str] = {}
     """More variables for the services. No secrets: whoever may ask the engine sees them."""
     owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
