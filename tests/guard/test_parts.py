@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from skytether.guard import record, settings
 from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
-from skytether.guard.protocol import Told
 from skytether.guard.requests import Requests
 from skytether.guard.velocity import Velocity
 from skytether.guard.wheels import SocketWheels
@@ -201,15 +200,15 @@ def test_a_driver_that_ends_and_comes_back_is_a_failed_write(tmp_path):
     path = str(tmp_path / "wheels.sock")
     wheels = SocketWheels(path)
     with pytest.raises(OSError, match="No such file"):
-        wheels.write(Velocity(0.1, 0.0), Told(), 1.0)
+        wheels.write(Velocity(0.1, 0.0))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as first:
         first.bind(path)
-        assert wheels.write(Velocity(0.1, 0.0), Told(), 1.0) == Told(Velocity(0.1, 0.0), 1.0)
+        wheels.write(Velocity(0.1, 0.0))
     os.unlink(path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as second:
         second.bind(path)  # the next is there before anything was written again
         with pytest.raises(OSError, match="refused"):
-            wheels.write(Velocity(0.1, 0.0), Told(), 1.0)
-        wheels.write(Velocity(0.2, 0.0), Told(), 1.0)
+            wheels.write(Velocity(0.1, 0.0))
+        wheels.write(Velocity(0.2, 0.0))
         assert len(second.recv(100)) == 52
     wheels.close()

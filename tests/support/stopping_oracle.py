@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from skytether.guard.protocol import Beat
+from skytether.guard.teller import repeat_s
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.messages import Header, LaserScan, Time
@@ -109,7 +110,7 @@ class Drive:
         self._aim = STANDSTILL
         self._events: list[tuple[float, int, str, Any]] = []
         self._count = self._commands = 0
-        self._looked = self.now
+        self._due = self.now
         self._felt = self._heard = 0.0
 
     def run(self, seconds: float) -> Iterator[None]:
@@ -192,18 +193,17 @@ class Drive:
         self._look()
 
     def _do_guard(self, _: None) -> None:
-        """The guard waits a period at most for the gate."""
-        if self.now - self._looked >= self.rules.stages.period_s:
+        """The guard waits for the gate until it has to speak by itself, and is late by up to a period then."""
+        if self.now >= self._due:
             self._look()
-            self._at(self.now + self._period(), "guard")
-        else:
-            self._at(max(self._looked + self._period(), self.now + _SOON_S), "guard")
+        late = self.rules.stages.period_s * self.faults.jitter * self.random.uniform(0, 1)
+        self._at(max(self._due + late, self.now + _SOON_S), "guard")
 
     def _look(self) -> None:
-        self._looked = self.now
         velocity, _ = self.watch.want(self.now)
         self.watch.wrote(velocity, self.now)
         stages = self.rules.stages
+        self._due = self.watch.due(self.now, repeat_s(stages.period_s, stages.guard_s))
         self._felt = max(self._felt, self.now + self._drawn(stages.writer_s) + self._drawn(stages.wheels_s))
         self._at(self._felt, "feel", velocity)
 

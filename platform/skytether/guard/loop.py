@@ -13,6 +13,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from . import board
+from .board import Board, Role
 from .child import Child
 from .clock import now as boottime
 from .enable import Enable, Power, WriterLine, open_line
@@ -25,6 +27,7 @@ from .record import Record
 from .requests import Reply, Requests
 from .settings import Settings
 from .systemd import Systemd
+from .teller import Teller, repeat_s
 from .velocity import STANDSTILL
 from .watch import Watch
 from .wheels import SocketWheels, WriterWheels
@@ -45,8 +48,8 @@ _MOST_PACKETS = 64
 """Taken from the gate in one turn; one that says more has gone mad, and the rest waits."""
 _LAST_STOPS = 5
 """Said at the end."""
-_SLACK = 1.25
-"""Periods without a word of the gate after which the wheels are told anew."""
+_AT_MOST = 4
+"""Turns in a period, however often the gate says something."""
 
 
 class GuardError(Exception):
@@ -86,7 +89,14 @@ class Guard:
         except OSError as error:
             raise GuardError(f"cannot have {settings.estop} for stops: {error.strerror}") from error
         self._watch = Watch(settings.bounds, settings.period_s, settings.patience_s)
-        self._wheels = WriterWheels() if settings.wheels is None else SocketWheels(settings.wheels)
+        self._board_file = board.make()
+        self._board = Board(self._board_file)
+        self._wheels: WriterWheels | Teller
+        if settings.wheels is None:
+            self._wheels = WriterWheels()
+        else:
+            way = SocketWheels(settings.wheels)
+            self._wheels = Teller(way, self._watch, self._board, Role.FIRST, settings.period_s, clock)
         self._enable = self._enable_signal()
         self._systemd = Systemd()
         self._gate: Child | None = None
@@ -142,16 +152,20 @@ class Guard:
         if now < self._last:  # it went back
             self._due = now
         if now < self._due:
-            waited = self._requests.sockets()
-            if self._gate is not None and not self._gate.gone and now >= self._last + self._settings.period_s / 4:
+            waited, rests = self._requests.sockets(), self._last + self._settings.period_s / _AT_MOST - now
+            wait = min(self._due - now, self._settings.period_s)
+            if self._gate is not None and not self._gate.gone and rests <= 0:
                 waited.append(self._gate.socket)
-            select.select(waited, [], [], max(0.0, min(self._due - now, self._settings.period_s)))
+            elif rests > 0:
+                wait = min(wait, rests)
+            select.select(waited, [], [], max(0.0, wait))
         self._requests.turn()
-        now = self._clock()
         beat = self._hear()
+        now = self._clock()  # after it: what is said later than now would be from the future
         if beat or now >= self._due:
-            self._tell(now)
-            self._last, self._due = now, now + _SLACK * self._settings.period_s
+            told = self._tell(now)
+            self._last = now
+            self._due = self._next(now) if told else now + self._settings.period_s / 2
             if beat:
                 self._answer_gate(now)
                 self._ready = True
@@ -195,26 +209,33 @@ class Guard:
         if beat.stopped and beat.seen == self._latch.generation:
             self._stop("gate", beat.stopped)
 
-    def _tell(self, now: float) -> None:
-        if (told := self._wheels.hear()) is not None:
-            self._watch.learn(told)
-        velocity, wrong = self._watch.want(now, bool(self._latch.reason))
+    def _next(self, now: float) -> float:
+        """When the wheels are told something again, if the gate says nothing."""
+        repeat = repeat_s(self._settings.period_s, self._settings.patience_s)
+        return self._watch.due(now, repeat, bool(self._latch.reason))
+
+    def _tell(self, now: float) -> bool:
+        """Tell the wheels. False: not yet."""
+        stopped, told = bool(self._latch.reason), True
+        wrong = self._watch.target(now, stopped)[1]
         if wrong and self._gate is not None and self._gate.heard_at is not None and not self._ends:
             self._trouble(wrong.split()[0], "brake", f"the gate {wrong}; the guard stops the wheels", now)
-        if self._clock() - now > self._settings.period_s:
-            return  # this process stood still in between: hear first what the gate told the wheels meanwhile
         try:
-            told = self._wheels.write(velocity, self._watch.told, now)
-            if told is not None:
-                self._watch.wrote(*told)
+            if isinstance(self._wheels, WriterWheels):
+                self._wheels.hear()
+                self._watch.learn(self._board.newest())
+                self._wheels.write(*self._watch.asks(now, stopped))
+            else:
+                self._wheels.look()
+                told = self._wheels.tell(now, stopped)
             self._troubles.pop("wheels", None)
         except OSError as error:  # tried again in a moment; a motor drive that hears nothing stops by itself
-            self._watch.failed(now)
             sentence = f"the wheels cannot be told anything: {error.strerror or error}"
             self._troubles["wheels"] = sentence
             self._trouble("wheels", "wheels", sentence, now)
         if self._enable is not None:
             self._toggle(self._enable, now, well=not wrong and not self._latch.reason and not self._ends)
+        return told
 
     def _toggle(self, enable: Enable, now: float, *, well: bool) -> None:
         """Let the enable signal change, as long as all is well and the wheels are told what they are to do."""
@@ -229,17 +250,12 @@ class Guard:
 
     def _answer_gate(self, now: float) -> None:
         latch = self._latch
-        take = self._settings.wheels is None and now - self._writer_heard() > self._settings.patience_s
-        answer = Answer(now, self._watch.told, latch.generation, take, latch.kept, latch.reason)
+        answer = Answer(now, latch.generation, latch.kept, latch.reason)
         if self._gate is not None:
             try:
                 self._gate.socket.send(pack_answer(answer))
             except OSError:  # it does not read; it will hang or have ended
                 return
-
-    def _writer_heard(self) -> float:
-        heard = self._wheels.heard_at if isinstance(self._wheels, WriterWheels) else None
-        return self._started if heard is None else heard
 
     def _look_after(self, now: float) -> None:
         """Start what is not there, end what hangs."""
@@ -248,7 +264,7 @@ class Guard:
         if self._settings.writer:
             writer = self._kept_alive("writer", self._writer, self._settings.writer, now)
             if writer is not self._writer and isinstance(self._wheels, WriterWheels):
-                self._wheels.link = writer.socket if writer is not None else None
+                self._wheels.lead_to(writer.socket if writer is not None else None)
             self._writer = writer
             if writer is not None and isinstance(self._wheels, WriterWheels) and self._wheels.heard_at is not None:
                 writer.heard_at = max(writer.heard_at or 0.0, self._wheels.heard_at)
@@ -258,8 +274,8 @@ class Guard:
             if now - self._tried.get(name, -_AGAIN_S) < _AGAIN_S:
                 return None
             self._tried[name] = now
-            inherited = (self._estop.fileno(),) if name == "gate" and self._estop is not None else ()
-            return Child(name, command, self._settings.config, now, inherited)
+            more = (self._estop.fileno(),) if name == "gate" and self._estop is not None else ()
+            return Child(name, command, self._settings.config, now, (self._board_file, *more))
         why = child.ended(now)
         if not why:
             return child

@@ -1,6 +1,6 @@
 """Bytes between guard, gate and writer: whole packets on socket pairs, and a velocity for the wheels. Pure.
 
-All times are `clock.now` [s]. What was told carries when it was: whoever reads it later knows how much of it counts.
+All times are `clock.now` [s]. What the wheels were told is not in here, but on the board (`board.Board`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ NOTE_BYTES = 400
 STOP_SOCKET = "stop.sock"
 """In the gate's folder: the guard's own way to stop the robot; one request and one answer, both JSON."""
 
-_BEAT = struct.Struct("<4sddddddIB")
-_ANSWER = struct.Struct("<4sddddIB")
+_BEAT = struct.Struct("<4sdddIB")
+_ANSWER = struct.Struct("<4sdIB")
 _TWIST = struct.Struct("<4s6d")
-_BEAT_MAGIC, _ANSWER_MAGIC, _NOTE_MAGIC = b"SkB2", b"SkA2", b"SkN2"
-_ENABLE = (b"SkE2\x00", b"SkE2\x01")
+_BEAT_MAGIC, _ANSWER_MAGIC, _NOTE_MAGIC = b"SkB3", b"SkA3", b"SkN3"
+_ENABLE = (b"SkE3\x00", b"SkE3\x01")
 _LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
-_TAKE, _KEPT = 1, 2
 
 
 class Told(NamedTuple):
@@ -41,8 +40,6 @@ class Beat(NamedTuple):
     at: float
     velocity: Velocity
     """Wanted."""
-    wrote: Told = Told()
-    """What the sender itself told the wheels last, while the receiver did not."""
     seen: int = 0
     """The newest generation of the emergency stop that the sender knows."""
     reset: bool = False
@@ -55,11 +52,8 @@ class Answer(NamedTuple):
     """What the guard answers, and a writer the guard."""
 
     at: float
-    told: Told
     generation: int = 0
     """Counts the changes of the emergency stop."""
-    take: bool = False
-    """The guard's own way to the wheels is gone: the gate is to stop them by its own."""
     kept: bool = True
     """The emergency stop is on disk as it is."""
     stopped: str = ""
@@ -68,9 +62,7 @@ class Answer(NamedTuple):
 
 def pack_beat(beat: Beat) -> bytes:
     """For the guard or a writer."""
-    head = _BEAT.pack(
-        _BEAT_MAGIC, beat.at, *beat.velocity, *beat.wrote.velocity, beat.wrote.at, beat.seen & 0xFFFFFFFF, beat.reset
-    )
+    head = _BEAT.pack(_BEAT_MAGIC, beat.at, *beat.velocity, beat.seen & 0xFFFFFFFF, beat.reset)
     return head + cut(beat.stopped, REASON_BYTES)
 
 
@@ -78,16 +70,13 @@ def unpack_beat(data: bytes) -> Beat | None:
     """None: the bytes are none."""
     if not _BEAT.size <= len(data) <= _BEAT.size + REASON_BYTES or data[:4] != _BEAT_MAGIC:
         return None
-    _, at, linear, angular, own_linear, own_angular, own_at, seen, reset = _BEAT.unpack_from(data)
-    wrote = Told(Velocity(own_linear, own_angular), own_at)
-    return Beat(at, Velocity(linear, angular), wrote, seen, reset == 1, _text(data[_BEAT.size :]))
+    _, at, linear, angular, seen, reset = _BEAT.unpack_from(data)
+    return Beat(at, Velocity(linear, angular), seen, reset == 1, _text(data[_BEAT.size :]))
 
 
 def pack_answer(answer: Answer) -> bytes:
     """For the gate or the guard."""
-    flags = (_TAKE if answer.take else 0) | (_KEPT if answer.kept else 0)
-    told = answer.told
-    head = _ANSWER.pack(_ANSWER_MAGIC, answer.at, *told.velocity, told.at, answer.generation & 0xFFFFFFFF, flags)
+    head = _ANSWER.pack(_ANSWER_MAGIC, answer.at, answer.generation & 0xFFFFFFFF, answer.kept)
     return head + cut(answer.stopped, REASON_BYTES)
 
 
@@ -95,9 +84,8 @@ def unpack_answer(data: bytes) -> Answer | None:
     """None: the bytes are none."""
     if not _ANSWER.size <= len(data) <= _ANSWER.size + REASON_BYTES or data[:4] != _ANSWER_MAGIC:
         return None
-    _, at, linear, angular, told_at, generation, flags = _ANSWER.unpack_from(data)
-    told = Told(Velocity(linear, angular), told_at)
-    return Answer(at, told, generation, flags & _TAKE != 0, flags & _KEPT != 0, _text(data[_ANSWER.size :]))
+    _, at, generation, kept = _ANSWER.unpack_from(data)
+    return Answer(at, generation, kept == 1, _text(data[_ANSWER.size :]))
 
 
 def pack_note(text: str) -> bytes:

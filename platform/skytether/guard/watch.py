@@ -33,9 +33,8 @@ class Watch:
         self._beat: Beat | None = None
 
     def hear(self, beat: Beat) -> None:
-        """Take in what is wanted, and what the sender told the wheels itself."""
+        """Take in what is wanted."""
         self._beat = beat
-        self.learn(beat.wrote)
 
     def forget(self) -> None:
         """Whoever said what is wanted is gone."""
@@ -64,7 +63,7 @@ class Watch:
         Returns:
             The velocity, and what is wrong with the one who says what is wanted (empty: nothing).
         """
-        wrong = self._wrong(now)
+        target, wrong = self.target(now, stopped)
         gap = now - self.told.at
         if 0 <= gap <= self._patience_s:
             base, step = self.told.velocity, gap
@@ -72,9 +71,38 @@ class Watch:
             base, step = STANDSTILL, self._period_s
         else:  # the clock went back, or is no number
             return brake(self._bounds, self.told.velocity, self._period_s), wrong or "has a clock that went back"
+        return toward(self._bounds, base, target, step), wrong
+
+    def target(self, now: float, stopped: bool = False) -> tuple[Velocity, str]:
+        """Where the wheels are to get, however far that is; see `want`."""
+        wrong = self._wrong(now)
         if wrong or stopped or self._beat is None:
-            return brake(self._bounds, base, step), wrong
-        return toward(self._bounds, base, self._clipped(self._beat.velocity), step), ""
+            return STANDSTILL, wrong
+        return self._clipped(self._beat.velocity), ""
+
+    def asks(self, now: float, stopped: bool = False) -> tuple[Velocity, float]:
+        """What a writer is asked for: where the wheels are to get, and when that was wanted [s].
+
+        Not a step towards it: two who hold the limits one after the other, each from the time of its own last turn, get
+        less of it than one.
+        """
+        target, wrong = self.target(now, stopped)
+        if wrong or stopped or self._beat is None:
+            return target, now
+        return target, self._beat.at
+
+    def due(self, now: float, repeat_s: float, stopped: bool = False) -> float:
+        """When the wheels are to be told something again, if nobody wants anything new until then [s].
+
+        Args:
+            now: They were told something just now [s].
+            repeat_s: They are not left without a word for longer.
+            stopped: See `want`.
+        """
+        target, wrong = self.target(now, stopped)
+        if wrong or self._beat is None or target != self.told.velocity:
+            return now + self._period_s
+        return min(now + repeat_s, self._beat.at + self._patience_s + _ROUNDING)
 
     def _clipped(self, velocity: Velocity) -> Velocity:
         """Without what rounding has put beyond the limits."""

@@ -3,37 +3,12 @@
 from __future__ import annotations
 
 import socket
-from typing import Protocol
 
-from .protocol import LARGEST, Answer, Beat, Told, pack_beat, pack_twist, unpack_answer
+from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
 from .velocity import Velocity
 
 Address = str | tuple[str, int]
 """A path, or a numeric host and a port: names are looked up before the guard starts."""
-
-
-class Wheels(Protocol):
-    """Where velocities go."""
-
-    def write(self, velocity: Velocity, wrote: Told, now: float) -> Told | None:
-        """Tell the wheels.
-
-        Args:
-            velocity: Wanted.
-            wrote: What the guard knows that they were told last.
-            now: [s]
-
-        Returns:
-            What they were told by this; None: that is known later, by `hear`.
-
-        Raises:
-            OSError: It did not get there.
-        """
-        ...
-
-    def hear(self) -> Told | None:
-        """What they were told, as known since the last call; None: nothing new."""
-        ...
 
 
 class SocketWheels:
@@ -49,7 +24,7 @@ class SocketWheels:
         self._address = address
         self._socket: socket.socket | None = None
 
-    def write(self, velocity: Velocity, wrote: Told, now: float) -> Told | None:  # noqa: ARG002 - of the contract
+    def write(self, velocity: Velocity) -> None:
         """Wheels: send it."""
         if self._socket is None:
             self._socket = _connected(self._address)
@@ -59,10 +34,9 @@ class SocketWheels:
             self._socket.close()
             self._socket = None
             raise
-        return Told(velocity, now)
 
-    def hear(self) -> Told | None:
-        """Wheels: nothing comes later."""
+    def listeners(self) -> frozenset[str] | None:
+        """Wheels: not known; a driver that starts anew is a write that fails."""
         return None
 
     def close(self) -> None:
@@ -83,16 +57,26 @@ class WriterWheels:
         self.heard_at: float | None = None
         """When the writer last answered."""
 
-    def write(self, velocity: Velocity, wrote: Told, now: float) -> Told | None:
-        """Wheels: have it published."""
+    def write(self, velocity: Velocity, at: float) -> None:
+        """Have the wheels told.
+
+        Args:
+            velocity: Where they are to get; the writer gets them there, within the limits.
+            at: When that was wanted [s].
+
+        Raises:
+            OSError: The writer is not there, or hangs.
+        """
         if self.link is None:
             raise OSError("their writer is not there")
-        self.link.send(pack_beat(Beat(now, velocity, wrote)))
-        return None
+        self.link.send(pack_beat(Beat(at, velocity)))
 
-    def hear(self) -> Told | None:
-        """Wheels: what the writer said."""
-        newest: Answer | None = None
+    def lead_to(self, link: socket.socket | None) -> None:
+        """Another writer, not heard yet, or none."""
+        self.link, self.heard_at = link, None
+
+    def hear(self) -> None:
+        """Take in that the writer is alive."""
         while self.link is not None:
             try:
                 data = self.link.recv(LARGEST)
@@ -100,11 +84,9 @@ class WriterWheels:
                 break
             if not data:
                 break
-            newest = unpack_answer(data) or newest
-        if newest is None:
-            return None
-        self.heard_at = newest.at
-        return newest.told
+            answer = unpack_answer(data)
+            if answer is not None:
+                self.heard_at = answer.at
 
 
 def family_of(address: Address) -> socket.AddressFamily:

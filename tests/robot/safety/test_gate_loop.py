@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skytether.guard import board
+from skytether.guard.board import Board, Entry, Role
 from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
@@ -74,9 +76,10 @@ class Bench:
                 "rate_hz": 100,
             }
         )
-        self.loop = GateLoop(config, theirs, self.hardware, self.hardware, clock=lambda: self.now)
+        self.board = Board(board.make())
+        self.loop = GateLoop(config, theirs, self.hardware, self.hardware, self.board, clock=lambda: self.now)
         self.link = GateLink(folder, clock=lambda: self.now)
-        self.answer = Answer(self.now, Told(STANDSTILL, self.now), generation=1)
+        self.answer = Answer(self.now, generation=1)
         self.notes: list[str] = []
         for _ in range(25):  # the agent begins from a standstill
             self.link.send(STANDSTILL)
@@ -95,8 +98,8 @@ class Bench:
         except BlockingIOError:
             pass
         if answered:
-            answer = self.answer._replace(at=self.now, told=Told(told or beat.velocity, self.now))
-            self.guard.send(pack_answer(answer))
+            self.board.put(Role.FIRST, Entry(Told(told or beat.velocity, self.now)))
+            self.guard.send(pack_answer(self.answer._replace(at=self.now)))
         return beat.velocity
 
     def ask(self, **request: str) -> dict:
@@ -160,7 +163,7 @@ def drive(bench):
     assert said == pytest.approx(velocity)
 
 
-def test_a_guard_that_does_not_answer_makes_the_gate_brake_the_wheels_itself(bench):
+def test_a_guard_that_tells_the_wheels_nothing_makes_the_gate_brake_the_wheels_itself(bench):
     drive(bench)
     for _ in range(22):
         bench.link.send(Velocity(0.2, 0.0))
@@ -172,11 +175,14 @@ def test_a_guard_that_does_not_answer_makes_the_gate_brake_the_wheels_itself(ben
     steps = [before - after for before, after in pairwise(told)]
     assert all(step <= 0.02 + 1e-9 for step in steps)
     assert told[-1] == 0.0
-    assert bench.beat.wrote.velocity == STANDSTILL
-    assert any("does not answer" in note for note in bench.notes)
+    assert bench.board.newest() == Told(STANDSTILL, bench.now)
+    assert any("nobody else tells" in note for note in bench.notes)
+    bench.board.put(Role.FIRST, Entry(Told(STANDSTILL, bench.now)))
+    bench.turn()
+    told = len(bench.hardware.told)
     bench.link.send(Velocity(0.2, 0.0))
-    bench.guard.send(pack_answer(bench.answer._replace(told=Told(STANDSTILL, bench.now))))
-    assert 0 < bench.turn().linear <= 0.011
+    assert 0 < bench.turn().linear <= 0.021
+    assert len(bench.hardware.told) == told
 
 
 def test_the_gate_goes_on_from_what_the_wheels_were_told(bench):
@@ -201,12 +207,20 @@ def test_a_gate_that_stood_still_goes_on_from_standstill(bench):
     assert not bench.hardware.told  # the guard is there: it answers the next beat
 
 
-def test_a_guard_whose_writer_is_gone_has_the_gate_brake(bench):
+def test_a_guard_that_answers_and_whose_writer_is_gone_has_the_gate_brake(bench):
     drive(bench)
-    bench.answer = bench.answer._replace(take=True)
-    bench.turn()
-    bench.turn()
-    assert bench.hardware.told[0].linear == pytest.approx(0.18)
+    for _ in range(5):
+        bench.turn(answered=False)
+        bench.guard.send(pack_answer(bench.answer._replace(at=bench.now)))
+    assert bench.hardware.told[0].linear == pytest.approx(0.2 - 2.0 * 0.03)  # the third turn without a word
+
+
+def test_a_guard_that_is_frozen_while_its_writer_tells_the_wheels_leaves_them_to_it(bench):
+    drive(bench)
+    for _ in range(20):
+        bench.turn(answered=False)
+        bench.board.put(Role.FIRST, Entry(Told(Velocity(0.1, 0.0), bench.now)))
+    assert not bench.hardware.told
 
 
 def test_a_guard_that_is_gone_is_noticed(bench):

@@ -65,11 +65,13 @@ def test_who_stood_still_goes_on_from_what_the_wheels_were_told(robot, role, sec
 
 
 @pytest.mark.parametrize("role", ["gate", "guard"])
-def test_a_button_pressed_while_somebody_stood_still_finds_the_robot_standing(robot, role):
+@pytest.mark.parametrize("after", [0.0, 0.7])  # by then the gate's socket is full of words that it is up
+def test_a_button_pressed_while_somebody_stood_still_finds_the_robot_standing(robot, role, after):
     stage = Stage(robot)
     pid = robot.signal(role, signal.SIGSTOP)
+    time.sleep(after)
     robot.pressed = True
-    with stage.stands(stage.promised.partner, f"the {role} is frozen, and the button is pressed"):
+    with stage.stands(0.0 if after else stage.promised.partner, f"the {role} is frozen, and the button is pressed"):
         time.sleep(1.0)
         os.kill(pid, signal.SIGCONT)
         time.sleep(1.0)

@@ -286,6 +286,49 @@ def test_a_button_that_returns(on_silence):
     assert bench.wheels == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("on_silence", OnSilence)
+def test_after_a_gap_the_button_is_to_be_heard_anew(on_silence):
+    bench = Bench(replace(RULES, sources=replace(RULES.sources, on_silence=on_silence)), agent=0.2)
+    bench.gate.start(bench.now)
+    assert bench.run(0.5).velocity.linear == pytest.approx(0.2)
+    bench.now += 0.3
+    bench.gate.rebase(STANDSTILL, bench.now)
+    bench.gate.stalled(bench.now)
+    for _ in range(8):  # what waited in the socket says that it is up
+        assert bench.run().velocity == STANDSTILL
+    assert "since the gate stood still" in bench.run().troubles["button"]
+    assert "not heard" in bench.gate.refuses_reset(bench.now)
+    assert bench.run(0.5).velocity.linear == pytest.approx(0.2)  # it was heard, and nothing else is asked for
+    assert bench.gate.stopped == ""
+
+
+def test_after_a_gap_a_press_that_waited_counts_and_a_command_that_waited_does_not():
+    bench = Bench(agent=None)
+    bench.says["nav_vel"] = twist(0.2)
+    bench.gate.start(bench.now)
+    bench.run(0.1)
+    bench.gate.start(bench.now)
+    assert bench.run(0.5).velocity.linear == pytest.approx(0.2)
+    bench.says = {"nav_vel": twist(0.2)}
+    bench.now += 2.0
+    bench.gate.rebase(STANDSTILL, bench.now)
+    bench.gate.stalled(bench.now)
+    bench.gate.sense("estop", Bool(True), bench.now)
+    assert bench.run(0.05).hand == Hand.NOBODY
+    assert "pressed" in bench.gate.stopped
+    assert not bench.gate._sources._sources["navigation"].speaks(bench.now)
+
+
+def test_a_button_that_speaks_only_when_it_changes_is_not_waited_for():
+    sources = replace(RULES.sources, button=ButtonParams(max_age_s=inf))
+    bench = Bench(replace(RULES, sources=sources), agent=0.2)
+    bench.gate.start(bench.now)
+    bench.says.pop("estop")
+    bench.run(0.3)
+    bench.gate.stalled(bench.now)
+    assert bench.run(0.3).velocity.linear > 0
+
+
 def test_a_button_that_was_never_heard_does_not_latch():
     bench = Bench(replace(RULES, sources=replace(RULES.sources, on_silence=OnSilence.LATCH)))
     bench.gate = Gate(bench.rules)

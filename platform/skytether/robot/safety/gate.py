@@ -1,4 +1,4 @@
-"""The gate as a process: ``python -m skytether.robot.safety.gate FD CONFIG [ESTOP]``, started by the guard alone.
+"""The gate as a process: ``python -m skytether.robot.safety.gate FD CONFIG BOARD [ESTOP]``, started by the guard alone.
 
 One loop at a fixed rate: what came on the sockets goes in, one velocity goes to the guard, which owns the wheels. The
 guard answers each; when it does not, it is gone or frozen, and the gate stops the wheels itself. The configuration
@@ -20,6 +20,7 @@ from math import isfinite
 from typing import Any
 
 from skytether.guard import privileges
+from skytether.guard.board import Board
 from skytether.guard.clock import now as boottime
 from skytether.guard.latch import Keeper, boot_id
 from skytether.guard.loop import LATCH_FILE
@@ -57,7 +58,8 @@ class GateLoop:
         config: The section of robot.yaml.
         guard: The socket to the guard; whole packets, never waits.
         sensors: Where readings come from.
-        wheels: For the day that the guard is gone.
+        wheels: For the day that nobody else tells them anything.
+        board: What the wheels were told.
         refused: What `privileges.take` was not permitted, for the status.
         clock: `skytether.guard.clock.now`; replaced by tests only.
     """
@@ -68,6 +70,7 @@ class GateLoop:
         guard: socket.socket,
         sensors: Sensors,
         wheels: Wheels,
+        board: Board,
         refused: Sequence[str] = (),
         clock: Callable[[], float] = boottime,
     ) -> None:
@@ -79,13 +82,15 @@ class GateLoop:
         self._refused = refused
         folder = config.place()
         self._gate = Gate(config.rules())
-        self._heartbeat = Heartbeat(guard, wheels, config.bounds(), self._period, config.guard_s, self._trouble)
+        self._heartbeat = Heartbeat(
+            guard, wheels, config.bounds(), self._period, config.guard_s, board, self._trouble, clock
+        )
         self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
         self._notices = Notices(_log)
-        self._started = clock()
+        self._started = self._turned_at = clock()
         self._overruns = 0
         self._turns = 0
         self._last: Decision | None = None
@@ -107,6 +112,7 @@ class GateLoop:
         _log.error("the guard is gone; the gate stops the wheels and ends")
         stood = 0.0
         while stood < _LAST_STOPS_S:
+            self._heartbeat.hear()
             stands = self._heartbeat.stop_wheels(self._clock()) == STANDSTILL
             stood = stood + self._period if stands else 0.0
             time.sleep(self._period)
@@ -115,6 +121,9 @@ class GateLoop:
         """One turn of the loop."""
         self._heartbeat.hear()
         now = self._clock()
+        if now - self._turned_at > self._config.guard_s:
+            self._gate.stalled(now)
+        self._turned_at = now
         for topic, message in self._sensors.stops():  # before all else, a reset above all
             self._gate.sense(topic, message, now)
         self._control.turn(now)
@@ -210,9 +219,9 @@ def main() -> None:
     warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
     refused = privileges.take(privileges.GATE)
     notices = Notices(_log)
-    estop = socket.socket(fileno=int(sys.argv[3])) if len(sys.argv) > 3 else None
+    estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
     sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)
-    loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"), refused)
+    loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"), Board(int(sys.argv[3])), refused)
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short
     loop.run()

@@ -10,10 +10,8 @@ import socket
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from skytether.guard import wheels
+from skytether.guard import teller, wheels
 from skytether.guard.mailbox import bind
-from skytether.guard.protocol import Told
-from skytether.guard.velocity import Velocity
 from skytether.messages import Message, PointCloud2
 
 from .inbox import Inbox, Topics
@@ -30,27 +28,15 @@ _STOPS_EACH_TURN = 1024
 Address = str | tuple[str, int]
 
 
-class Wheels(Protocol):
-    """Where velocities go."""
-
-    def write(self, velocity: Velocity) -> None:
-        """What the wheels do until the next call. Returns at once.
-
-        Raises:
-            OSError: It did not get there.
-        """
-        ...
+class Wheels(teller.Wheels, Protocol):
+    """Where velocities go, and the enable signal where that is a topic."""
 
     def enable(self, level: bool) -> None:
-        """Publish a level of the enable signal, where that is a topic.
+        """Publish a level of the enable signal.
 
         Raises:
             OSError: It did not get there.
         """
-        ...
-
-    def listeners(self) -> frozenset[str] | None:
-        """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
     def close(self) -> None:
@@ -77,30 +63,11 @@ class Sensors(Protocol):
         ...
 
 
-class SocketWheels:
-    """Each velocity is a datagram: a geometry_msgs/msg/Twist as CDR.
-
-    Args:
-        address: Of whoever turns the wheels; it may come later, and come again.
-    """
-
-    def __init__(self, address: Address) -> None:
-        self._wheels = wheels.SocketWheels(address)
-
-    def write(self, velocity: Velocity) -> None:
-        """Wheels: send it."""
-        self._wheels.write(velocity, Told(), 0.0)
+class SocketWheels(wheels.SocketWheels):
+    """Each velocity is a datagram: a geometry_msgs/msg/Twist as CDR."""
 
     def enable(self, level: bool) -> None:
         """Wheels: the guard has a line of its own for that."""
-
-    def listeners(self) -> frozenset[str] | None:
-        """Wheels: not known."""
-        return None
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._wheels.close()
 
 
 class SocketSensors:

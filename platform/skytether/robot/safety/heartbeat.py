@@ -1,7 +1,7 @@
-"""The gate's end of the socket to the guard: beats there, answers back, and the wheels when the guard is gone.
+"""The gate's end of the socket to the guard: beats there, answers back, and the wheels when nobody else tells them.
 
-The guard answers every beat with what the wheels were really told last. A guard that does not, because it is gone,
-frozen or has lost its writer, makes the gate stop the wheels itself, ramped from there.
+What the wheels were really told last is on the board. When the guard, or on a graph its writer, puts nothing there any
+more, because it is gone, frozen or not heard, the gate stops the wheels itself, from there.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 
+from skytether.guard.board import Board, Role
 from skytether.guard.kinematics import Bounds
 from skytether.guard.protocol import LARGEST, Answer, Beat, Told, pack_beat, pack_note, unpack_answer
+from skytether.guard.teller import Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 
@@ -31,7 +33,9 @@ class Heartbeat:
         bounds: Of the wheels.
         period_s: Of the gate's loop [s].
         patience_s: With the guard [s].
+        board: What the wheels were told.
         trouble: Told a kind, a sentence and the time.
+        clock: `skytether.guard.clock.now`; replaced by tests only.
     """
 
     def __init__(
@@ -41,26 +45,24 @@ class Heartbeat:
         bounds: Bounds,
         period_s: float,
         patience_s: float,
+        board: Board,
         trouble: Callable[[str, str, float], object],
+        clock: Callable[[], float],
     ) -> None:
         self.gone = False
         """The guard has ended."""
         self.answer: Answer | None = None
         """Its newest."""
         self._guard = guard
-        self._wheels = wheels
         self._watch = Watch(bounds, period_s, patience_s)
         self._period_s = period_s
         self._patience_s = patience_s
-        # The gate begins so early that the wheels are not without a word until they stop by themselves: they are
-        # without one since the beat before the first that was not answered, and a turn may come late.
-        self._silence_s = max(patience_s - 3.5 * period_s, period_s)
+        self._teller = Teller(wheels, self._watch, board, Role.SECOND, period_s, clock)
         self._trouble = trouble
-        self._wrote = Told()
-        self._unanswered: float | None = None
 
     def hear(self) -> None:
-        """Take the guard's answers in."""
+        """Take in what the guard answers, and what the wheels were told."""
+        self._teller.look()
         for _ in range(_PACKETS):
             try:
                 data = self._guard.recv(LARGEST)
@@ -73,8 +75,7 @@ class Heartbeat:
                 return
             answer = unpack_answer(data)
             if answer is not None:
-                self.answer, self._unanswered = answer, None
-                self._watch.learn(answer.told)
+                self.answer = answer
 
     def told(self, now: float) -> Told:
         """What the wheels were told last; after a stall, a standstill."""
@@ -86,7 +87,7 @@ class Heartbeat:
         return differs(self._watch.told, said, now, self._patience_s, self._period_s)
 
     def say(self, velocity: Velocity, stopped: str, reset: bool, now: float) -> Velocity:
-        """Tell the guard what is wanted; the wheels too, if it has gone silent.
+        """Tell the guard what is wanted; the wheels, if nobody else tells them anything.
 
         Args:
             velocity: Wanted.
@@ -97,15 +98,12 @@ class Heartbeat:
         Returns:
             What the gate has said so, to either.
         """
-        silent = self._unanswered is not None and now - self._unanswered > self._silence_s
-        if self.gone or silent or (self.answer is not None and self.answer.take):
-            if not self.gone:
-                self._trouble("guard", "the guard does not answer; the gate stops the wheels itself", now)
-            velocity = self.stop_wheels(now)
+        if self._speak(now):
+            self._trouble("guard", "nobody else tells the wheels anything; the gate stops them itself", now)
+            velocity = self.told(now).velocity
         generation = self.answer.generation if self.answer is not None else 0
-        self._unanswered = now if self._unanswered is None else self._unanswered
         try:
-            self._guard.send(pack_beat(Beat(now, velocity, self._wrote, generation, reset, stopped)))
+            self._guard.send(pack_beat(Beat(now, velocity, generation, reset, stopped)))
         except BlockingIOError:
             pass
         except OSError:
@@ -113,15 +111,17 @@ class Heartbeat:
         return velocity
 
     def stop_wheels(self, now: float) -> Velocity:
-        """Brake the wheels by the gate's own way, one step."""
-        velocity, _ = self._watch.want(now)
+        """Brake the wheels by the gate's own way, one step, unless somebody else tells them. What they were told."""
+        self._speak(now)
+        return self.told(now).velocity
+
+    def _speak(self, now: float) -> bool:
+        """Tell the wheels to stop, if it is the gate's turn."""
         try:
-            self._wheels.write(velocity)
-            self._watch.wrote(velocity, now)
-            self._wrote = Told(velocity, now)
+            return self._teller.tell(now)
         except Exception as error:  # tried again at the next turn
             self._trouble("wheels", f"the wheels cannot be told to stand: {error}", now)
-        return velocity
+            return True
 
     def note(self, sentence: str) -> None:
         """Something for the guard's event record."""

@@ -7,10 +7,12 @@ the robot too, but is not latched: a driver that starts a second later than the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import nan
+from math import isfinite, isinf, isnan, nan
 
 from skytether.guard.latch import FIRST_ACT
 
+SETTLES_S = 0.1
+"""After a time in which the gate stood still, what waited meanwhile comes within this long."""
 _TOLERANCE_S = 0.05
 """How far ahead of now something may have been heard."""
 
@@ -36,11 +38,14 @@ class Latch:
         reason: Why the robot is stopped until somebody resets it; empty: it is not.
         pressed: What the button last said.
         heard_at: When; NaN: never.
+        doubted_until: The gate stood still. What it hears until then waited meanwhile and is old: a press counts, and
+            that it is not pressed does not; NaN: it did not.
     """
 
     reason: str = ""
     pressed: bool = False
     heard_at: float = nan
+    doubted_until: float = nan
 
 
 def engage(before: Latch, reason: str) -> Latch:
@@ -51,8 +56,25 @@ def engage(before: Latch, reason: str) -> Latch:
 def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:
     """Take in what the button says."""
     pressed = value is params.pressed_is
-    heard = replace(before, pressed=pressed, heard_at=now)
+    doubted_until = before.doubted_until if now < before.doubted_until else nan
+    heard = replace(before, pressed=pressed, heard_at=now, doubted_until=doubted_until)
     return engage(heard, "the emergency stop button was pressed") if pressed else heard
+
+
+def doubt(params: ButtonParams, before: Latch, now: float) -> Latch:
+    """The gate stood still, and a driver cannot put more into a socket that is full: the button is to be heard anew.
+
+    Its silence counts from now on. One that speaks only when it changes is not waited for.
+    """
+    if isinf(params.max_age_s):
+        return before
+    heard_at = now if isfinite(before.heard_at) else before.heard_at
+    return replace(before, heard_at=heard_at, doubted_until=now + SETTLES_S)
+
+
+def doubted(latch: Latch) -> bool:
+    """Whether nothing new was heard since the gate stood still."""
+    return not isnan(latch.doubted_until)
 
 
 def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch, str]:
@@ -64,7 +86,7 @@ def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch
     if params is not None:
         if before.pressed:
             return before, "the emergency stop button is still pressed; release it first"
-        if silent(params, before, now):
+        if doubted(before) or silent(params, before, now):
             return before, "the emergency stop button is not heard; see that its driver runs"
     return replace(before, reason=""), ""
 

@@ -169,6 +169,10 @@ class Gate:
         else:
             self._event(f"topic:{topic[:64]}", f"{topic[:64]}: a {message.TYPE} is not expected there and not used")
 
+    def stalled(self, now: float) -> None:
+        """The gate stood still until now; see `Sources.stalled`."""
+        self._sources.stalled(now)
+
     def engage(self, reason: str) -> None:
         """Emergency stop, until `reset`."""
         self._sources.engage(reason)

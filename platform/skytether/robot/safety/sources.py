@@ -145,6 +145,7 @@ class Sources:
         for params in rules.further.values():
             self._sources[params.name] = _Source(params.priority, params.timeout_s, wait)
         self._joystick_count = 0
+        self._settled_at = -inf
 
     @property
     def stopped(self) -> str:
@@ -171,6 +172,15 @@ class Sources:
             self._joystick = Joystick()
             self._require(_RESET, inf)
         return refused
+
+    def stalled(self, now: float) -> None:
+        """The gate stood still: commands that waited meanwhile are not followed, and the button is to be heard anew.
+
+        The age of an agent's command is known, and a joystick is looked after by `joystick.hear`.
+        """
+        self._settled_at = now + latch.SETTLES_S
+        if self._rules.button is not None:
+            self._latch = latch.doubt(self._rules.button, self._latch, now)
 
     def start(self, now: float) -> tuple[list[str], str]:
         """A person says that those who want to drive now may do so.
@@ -216,7 +226,7 @@ class Sources:
         elif isinstance(message, Joy) and rules.joystick is not None:
             return self._hear_joystick(rules.joystick, message, now)
         elif isinstance(message, Twist | TwistStamped) and topic in rules.further:
-            return self._hear_twist(rules.further[topic].name, message, now)
+            return (None, "") if now < self._settled_at else self._hear_twist(rules.further[topic].name, message, now)
         return None, ""
 
     def admitted(self, command: Command, now: float) -> None:
@@ -278,6 +288,12 @@ class Sources:
     def _stops(self, now: float, troubles: dict[str, str]) -> bool:
         """Whether the emergency stop holds the robot, or its button is not heard."""
         rules = self._rules
+        doubted = rules.button is not None and latch.doubted(self._latch)
+        if doubted:
+            sentence = (
+                "the emergency stop button was not heard since the gate stood still; the robot stands until it is"
+            )
+            troubles["button"] = f"{rules.button_topic}: {sentence}"
         silent = rules.button is not None and latch.silent(rules.button, self._latch, now)
         if silent:
             if rules.on_silence is OnSilence.LATCH and isfinite(self._latch.heard_at):
@@ -288,7 +304,7 @@ class Sources:
             troubles["button"] = f"{rules.button_topic}: {sentence}"
         if self._latch.reason:
             troubles["stopped"] = f"emergency stop: {self._latch.reason}; `skytether robot reset` ends it"
-        return silent or bool(self._latch.reason)
+        return doubted or silent or bool(self._latch.reason)
 
     def _floor_of_locks(self, now: float, troubles: dict[str, str]) -> float:
         """Below what priority sources are blocked."""

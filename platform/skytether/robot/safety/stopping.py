@@ -16,15 +16,17 @@ which their real motion may lag behind the told one; the stop zone is larger by 
 decided is then held for ``hold`` at most before the brakes are told:
 
 - The gate's next turn may brake, a period later; but the gate may hang. The guard brakes once the gate's word is
-  older than ``guard``, and looks every ``period``, up to a period late: ``hold = guard + 2 period + writer``. A
+  older than ``guard``, and may be up to two periods late: ``hold = guard + 2 period + writer``. A
   gate that hangs for less than ``guard`` and goes on is no worse: its next turn comes within ``hold``.
-- ``writer`` is the process between guard and wheels where the wheels are on a graph, which looks every period, too.
+- ``writer`` is the process between guard and wheels where the wheels are on a graph, which may be a period late, too.
 
 From then on the told velocity falls by ``a dt`` at every turn, where ``dt`` is the time since the turn before. This
 staircase is never above the straight line v - a (t - hold): the step that is held longest belongs to the turn that
 came latest, and that turn is in ``hold``. It is so at every rate and with every jitter *as long as dt is not cut
 short*; therefore a turn counts for all its time up to ``guard`` (`Stages.longest_step_s`), beyond which the guard
-has taken over. So the way until the standstill is at most v (sensing + age + hold + wheels) + v^2 / (2 a).
+has taken over, and who tells the wheels says nothing old again while the gate is no more than a period late
+(`skytether.guard.teller.repeat_s`). So the way until the standstill is at most
+v (sensing + age + hold + wheels) + v^2 / (2 a).
 
 At the next turn either the same holds for the velocity then wanted, or the gate goes on braking on the old curve,
 for which it held. One of gate, guard and writer may hang at a time; drives that hear nothing must stop by

@@ -1,8 +1,9 @@
-"""The writer as a process: ``python -m skytether.robot.safety.writer FD CONFIG``, started by the guard.
+"""The writer as a process: ``python -m skytether.robot.safety.writer FD CONFIG BOARD``, started by the guard.
 
-It publishes on the robot's graph what the guard wants, and answers what it told, and whether anybody listens. The
-guard has no library of a graph in its process so. A writer whose guard is silent brakes by itself, ramped from what it
-told last, and keeps saying standstill.
+It publishes on the robot's graph what the guard wants. The guard has no library of a graph in its process so. On a
+graph it is the first to tell the wheels: the guard only says where they are to get, and the limits are held here. A
+writer whose guard is silent brakes by itself, from what the wheels were told last, and keeps saying standstill. While
+nobody listens to it, it is silent, and the gate may be heard.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from math import nan
 
 from skytether.guard import privileges
+from skytether.guard.board import Board, Role
 from skytether.guard.clock import now as boottime
 from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat, unpack_enable
 from skytether.guard.settings import thaw
+from skytether.guard.teller import Teller, repeat_s
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Twist, warm
@@ -30,8 +34,6 @@ from .process import log_without_waiting
 from .ways import open_wheels
 
 _log = logging.getLogger("skytether.writer")
-_SLACK = 1.25
-"""Periods without a word of the guard after which the wheels are told anew."""
 _LAST_STOPS_S = 0.5
 """How long a writer without a guard says standstill before it ends."""
 _PACKETS = 64
@@ -44,20 +46,28 @@ class Writer:
         config: The section of robot.yaml.
         guard: The socket to the guard; whole packets, never waits.
         wheels: On the graph.
+        board: What the wheels were told.
         clock: `skytether.guard.clock.now`; replaced by tests only.
     """
 
     def __init__(
-        self, config: SafetyConfig, guard: socket.socket, wheels: Wheels, clock: Callable[[], float] = boottime
+        self,
+        config: SafetyConfig,
+        guard: socket.socket,
+        wheels: Wheels,
+        board: Board,
+        clock: Callable[[], float] = boottime,
     ) -> None:
         self._guard = guard
         self._wheels = wheels
         self._clock = clock
         self._period = 1 / config.rate_hz
+        self._repeat_s = repeat_s(self._period, config.guard_s)
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
+        self._teller = Teller(wheels, self._watch, board, Role.FIRST, self._period, clock)
         self._notices = Notices(_log)
-        self._listeners: frozenset[str] = frozenset()
         self._gone = False
+        self._wanted_at = nan
         self._due = clock()
 
     def run(self) -> None:
@@ -74,19 +84,21 @@ class Writer:
 
     def turn(self) -> None:
         """Take in what the guard wants, and tell the wheels if it is time."""
+        heard = self._hear()
         now = self._clock()
-        if not self._hear() and now < self._due:
+        if not heard and now < self._due:
             return
-        self._tell(now)
-        self._due = now + _SLACK * self._period
+        told = self._tell(now)
+        self._due = self._watch.due(now, self._repeat_s) if told else now + self._period / 2
         try:
-            self._guard.send(pack_answer(Answer(now, self._watch.told)))
+            self._guard.send(pack_answer(Answer(now)))
         except BlockingIOError:
             pass
         except OSError:
             self._gone = True
 
     def _hear(self) -> bool:
+        """Take in what the guard wants. True if that is newer than what it wanted before."""
         newest = None
         for _ in range(_PACKETS):
             try:
@@ -103,9 +115,11 @@ class Writer:
             level = unpack_enable(data)
             if level is not None:
                 self._enable(level)
-        if newest is not None:
-            self._watch.hear(newest)
-        return newest is not None
+        if newest is None or newest.at == self._wanted_at:
+            return False
+        self._watch.hear(newest)
+        self._wanted_at = newest.at
+        return True
 
     def _enable(self, level: bool) -> None:
         try:
@@ -113,21 +127,14 @@ class Writer:
         except Exception as error:  # then the signal does not change, and the power goes
             self._notices.say("enable", f"the enable signal cannot be published: {error}", self._clock())
 
-    def _tell(self, now: float) -> None:
-        listeners = self._wheels.listeners()
-        if listeners is not None:
-            if not listeners & self._listeners:
-                self._watch.failed(now)  # nobody, or somebody who knows nothing of what was told before
-            self._listeners = listeners
-        velocity, _ = self._watch.want(now)
-        if self._clock() - now > self._period:
-            return  # this process stood still in between
+    def _tell(self, now: float) -> bool:
+        """Tell the wheels. False: not yet."""
+        self._teller.look()
         try:
-            self._wheels.write(velocity)
-            self._watch.wrote(velocity, now)
+            return self._teller.tell(now)
         except Exception as error:  # tried again in a moment
-            self._watch.failed(now)
             self._notices.say("wheels", f"the wheels cannot be told anything: {error}", now)
+            return True
 
 
 def main() -> None:
@@ -143,7 +150,7 @@ def main() -> None:
     for sentence in privileges.take(privileges.WRITER):
         _log.info("%s", sentence)
     wheels = open_wheels(config, "guard")
-    writer = Writer(config, guard, wheels)
+    writer = Writer(config, guard, wheels, Board(int(sys.argv[3])))
     gc.collect()
     gc.freeze()
     try:

@@ -1,0 +1,102 @@
+"""What the wheels were really told last, where guard, gate and writer see it at once: a page of memory of all three.
+
+Whoever tells the wheels something writes it down here in the same moment. So the one who takes over begins from there,
+also when those who could have told it are dead or frozen, and sees whether anybody else still speaks. A message would
+come too late for both: it takes a turn of each process on its way.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import struct
+from enum import IntEnum
+from math import isfinite, nan
+from typing import NamedTuple
+from zlib import crc32
+
+from .protocol import Told
+from .velocity import Velocity
+
+_ENTRY = struct.Struct("<Qdddd")
+_SUM = struct.Struct("<I")
+_SLOT = 64
+"""Bytes between two entries: a line of the processor's cache each."""
+_SIZE = 4096
+_SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
+
+
+class Role(IntEnum):
+    """Who tells the wheels."""
+
+    FIRST = 0
+    """The guard, or on a graph the writer."""
+    SECOND = 1
+    """The gate, while the first says nothing."""
+
+
+class Entry(NamedTuple):
+    """What one of them has written down."""
+
+    told: Told = Told()
+    claim: float = nan
+    """Since when it wants to tell the wheels what the other one has told them so far [s]; NaN: it does not."""
+
+    @property
+    def sign(self) -> float:
+        """When it last gave a sign of life [s]; NaN: never."""
+        return self.claim if not self.told.at >= self.claim and isfinite(self.claim) else self.told.at
+
+
+class Board:
+    """The page. Each role has two places and writes to them in turn: one that dies while it writes spoils only one.
+
+    Args:
+        file: Made by `make`; its number is the same in the children.
+    """
+
+    def __init__(self, file: int) -> None:
+        self._page = mmap.mmap(file, _SIZE)
+
+    def put(self, role: Role, entry: Entry) -> None:
+        """Write down. Only one process at a time may have a role."""
+        (first, _), (second, _) = self._at(role, 0), self._at(role, 1)
+        place, count = (1, first) if first > second else (0, second)
+        data = _ENTRY.pack(count + 1, *entry.told.velocity, entry.told.at, entry.claim)
+        start = _SLOT * (2 * role + place)
+        self._page[start : start + _ENTRY.size + _SUM.size] = data + _SUM.pack(crc32(data))
+
+    def of(self, role: Role) -> Entry:
+        """What somebody wrote down last."""
+        return max(self._at(role, 0), self._at(role, 1), key=lambda found: found[0])[1]
+
+    def newest(self) -> Told:
+        """What the wheels were told last, by whomever."""
+        first, second = self.of(Role.FIRST).told, self.of(Role.SECOND).told
+        return first if not second.at >= first.at else second
+
+    def close(self) -> None:
+        """Let go of the page."""
+        self._page.close()
+
+    def _at(self, role: Role, place: int) -> tuple[int, Entry]:
+        """How many there were before it, and what it says; 0: nothing."""
+        start = _SLOT * (2 * role + place)
+        data = self._page[start : start + _ENTRY.size + _SUM.size]
+        if _SUM.unpack_from(data, _ENTRY.size)[0] != crc32(data[: _ENTRY.size]):
+            return 0, Entry()
+        count, linear, angular, at, claim = _ENTRY.unpack_from(data)
+        return count, Entry(Told(Velocity(linear, angular), at), claim)
+
+
+def make() -> int:
+    """A page for `Board`, in which nothing is written yet.
+
+    Raises:
+        OSError: The kernel does not make it.
+    """
+    file = os.memfd_create("skytether-told", os.MFD_ALLOW_SEALING)
+    os.ftruncate(file, _SIZE)
+    fcntl.fcntl(file, fcntl.F_ADD_SEALS, _SEALS)  # nobody can take the page away from the others
+    return file

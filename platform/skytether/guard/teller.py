@@ -1,0 +1,160 @@
+"""Telling the wheels, and writing down what they were told. Guard, writer and gate do it in the same way.
+
+Only one of them does so at a time, and each starts from what the wheels were really told last, by whomever
+(`board.Board`). The guard, or on a graph the writer, is the first and speaks whenever it can; the gate is the second
+and speaks while the first is silent. Who takes over *claims* the wheels on the board before it speaks, and waits until
+the other one has either seen that or cannot speak any more:
+
+- The second claims when the first gave no sign for `SILENT` periods, and speaks in a later turn if there still is none.
+- The first, once the second may speak (`LATE` periods after its claim), claims too and waits for a period, in which
+  the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
+- Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isnan, nan
+from typing import Protocol
+
+from .board import Board, Entry, Role
+from .protocol import Told
+from .velocity import Velocity
+from .watch import Watch
+
+SILENT = 1.5
+"""Periods. The gate speaks in every period, and the first answers it by telling the wheels."""
+LATE = 0.75
+"""Periods."""
+_SOON = 0.5
+"""Periods. So much later than the second's claim the first may still speak without a claim of its own."""
+_AGAIN_S = 1.0
+"""Between attempts on a way that is broken; meanwhile the other one speaks."""
+
+
+def repeat_s(period_s: float, patience_s: float) -> float:
+    """Time [s] after which the first says the same again, if nothing new is wanted.
+
+    Not sooner than it must: what comes a little late, a period even, then finds that all the time since the last change
+    still counts for the next one, and braking gets no weaker.
+    """
+    return min(max(patience_s - 3 * period_s, 1.25 * period_s), 2 * period_s)
+
+
+class Wheels(Protocol):
+    """Where velocities go."""
+
+    def write(self, velocity: Velocity) -> None:
+        """What the wheels do until the next call. Returns at once.
+
+        Raises:
+            OSError: There is nobody whom anybody could tell anything.
+            Exception: This way to them is broken.
+        """
+        ...
+
+    def listeners(self) -> frozenset[str] | None:
+        """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
+        ...
+
+
+class Teller:
+    """One who tells the wheels.
+
+    Args:
+        wheels: The way to them.
+        watch: What they are told.
+        board: What they were told.
+        role: Of this one.
+        period_s: Of its loop [s].
+        clock: `clock.now`; replaced by tests only.
+    """
+
+    def __init__(
+        self, wheels: Wheels, watch: Watch, board: Board, role: Role, period_s: float, clock: Callable[[], float]
+    ) -> None:
+        self._wheels = wheels
+        self._watch = watch
+        self._board = board
+        self._role = role
+        self._period_s = period_s
+        self._clock = clock
+        self._listeners: frozenset[str] | None = frozenset()
+        self._strangers = False
+        self._broken_at = nan
+        self._own, self._claim = board.of(role)  # of who had the role before
+
+    def look(self) -> None:
+        """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
+        self._watch.learn(self._board.newest())
+        before, self._listeners = self._listeners, self._wheels.listeners()
+        self._strangers = bool(self._listeners) and not (before and self._listeners and before & self._listeners)
+
+    def tell(self, now: float, stopped: bool = False) -> bool:
+        """Tell the wheels once what the watch has for them. `look` comes before.
+
+        Args:
+            now: [s]
+            stopped: Brake, whatever is wanted.
+
+        Returns:
+            Whether they were. If not: nobody listens, or it is not this one's turn; it soon will be, if the other one
+            is silent.
+
+        Raises:
+            OSError: There is nobody whom anybody could tell anything. It counts as a standstill.
+            Exception: This way to them is broken. It counts as silence.
+        """
+        unheard = self._listeners is not None and not self._listeners
+        if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
+            return False
+        if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:
+            self._failed(now)  # they know nothing of what was told before, and nobody else has told them
+        velocity, _ = self._watch.want(now, stopped)
+        at = self._clock()
+        if at - now > LATE * self._period_s or not self._may(at):
+            return False
+        try:
+            self._wheels.write(velocity)
+        except OSError:
+            self._failed(now)
+            raise
+        except Exception:
+            self._broken_at = now
+            raise
+        self._watch.wrote(velocity, now)
+        self._put(self._watch.told)
+        return True
+
+    def _may(self, at: float) -> bool:
+        """Whether this one may speak now; it claims what it needs for that."""
+        return self._first_may(at) if self._role is Role.FIRST else self._second_may(at)
+
+    def _first_may(self, at: float) -> bool:
+        other = self._board.of(Role.SECOND).claim
+        if isnan(other) or at < other + _SOON * self._period_s:
+            return True
+        if not self._claim > other:
+            self._put(self._own, at)
+        return at >= self._claim + self._period_s
+
+    def _second_may(self, at: float) -> bool:
+        sign = self._board.of(Role.FIRST).sign
+        if at - sign <= SILENT * self._period_s:
+            if not isnan(self._claim):
+                self._put(self._own, nan)
+            return False
+        if isnan(self._claim) or sign > self._claim:
+            self._put(self._own, at)
+        return at >= self._claim + LATE * self._period_s
+
+    def _failed(self, now: float) -> None:
+        self._watch.failed(now)
+        self._put(self._watch.told)
+
+    def _put(self, told: Told, claim: float | None = None) -> None:
+        self._own, self._claim = told, self._claim if claim is None else claim
+        self._board.put(self._role, Entry(self._own, self._claim))
+
+
+_OTHER = {Role.FIRST: Role.SECOND, Role.SECOND: Role.FIRST}

@@ -1,0 +1,227 @@
+"""Who tells the wheels, from where they begin, and what each sees of the other: made-up time, no processes."""
+
+import os
+from contextlib import suppress
+from math import isnan, nan
+
+import pytest
+
+from skytether.guard import board
+from skytether.guard.board import Board, Entry, Role
+from skytether.guard.kinematics import Bounds
+from skytether.guard.protocol import Beat, Told
+from skytether.guard.teller import Teller
+from skytether.guard.velocity import STANDSTILL, Velocity
+from skytether.guard.watch import Watch
+
+BOUNDS = Bounds(0.5, -0.1, 0.8, 1.0, 2.0, 2.0, 4.0)
+PERIOD, PATIENCE = 0.02, 0.1
+FAST = Velocity(0.4, 0.0)
+
+
+class Wheels:
+    def __init__(self):
+        self.told = []
+        self.nodes = frozenset({"/base"})
+        self.fails: Exception | None = None
+
+    def write(self, velocity):
+        if self.fails:
+            raise self.fails
+        self.told.append(velocity)
+
+    def listeners(self):
+        return self.nodes
+
+
+class One:
+    """One who tells the wheels, with a clock that may jump in the middle of a turn."""
+
+    def __init__(self, file, role):
+        self.board, self.wheels, self.watch = Board(file), Wheels(), Watch(BOUNDS, PERIOD, PATIENCE)
+        self.late = 0.0
+        self.now = nan
+        self.teller = Teller(self.wheels, self.watch, self.board, role, PERIOD, lambda: self.now + self.late)
+        self.teller.look()
+
+    def turn(self, now, wanted=None):
+        self.now = now
+        if wanted is not None:
+            self.watch.hear(Beat(now, wanted))
+        self.teller.look()
+        return self.teller.tell(now)
+
+
+@pytest.fixture
+def both():
+    file = board.make()
+    first, second = One(file, Role.FIRST), One(file, Role.SECOND)
+    first.board.put(Role.FIRST, Entry(Told(FAST, 0.98)))
+    first.teller._own = Told(FAST, 0.98)
+    yield first, second
+    for one in (first, second):
+        one.board.close()
+    os.close(file)
+
+
+def test_the_second_is_silent_while_the_first_speaks(both):
+    first, second = both
+    for i in range(20):
+        assert first.turn(1.0 + i * PERIOD, FAST)
+        assert not second.turn(1.005 + i * PERIOD)
+    assert second.wheels.told == []
+
+
+def test_the_second_takes_over_from_what_was_told_and_brakes_within_the_limits(both):
+    first, second = both
+    first.turn(1.0, FAST)
+    spoke = [second.turn(1.0 + i * PERIOD) for i in range(1, 16)]
+    assert spoke == [False, False, *[True] * 13]  # sees it, claims, speaks
+    told = [velocity.linear for velocity in second.wheels.told]
+    assert told[0] == pytest.approx(0.4 - 2.0 * 0.06)
+    assert told[1] == pytest.approx(told[0] - 2.0 * 0.02)
+    assert told[-1] == 0.0
+
+
+def test_one_that_died_just_after_it_had_told_something_is_known_exactly(both):
+    """Writer and guard killed: what the gate had heard of them by messages was 0.1 s old, and it told standstill."""
+    first, second = both
+    first.turn(1.0, FAST)
+    for i in range(1, 4):
+        second.turn(1.0 + i * PERIOD)
+    assert second.wheels.told[0].linear == pytest.approx(0.28)
+
+
+def test_the_first_waits_for_the_second_to_give_way(both):
+    first, second = both
+    for i in range(1, 6):
+        second.turn(1.0 + i * PERIOD)
+    before = len(second.wheels.told)
+    assert before == 4
+    assert not first.turn(1.101, FAST)  # it claims
+    assert not first.turn(1.111, FAST)
+    assert not second.turn(1.12)  # sees the claim
+    assert first.turn(1.121, FAST)  # and that is seen
+    assert not second.turn(1.14)
+    assert len(second.wheels.told) == before
+    assert first.wheels.told[0].linear == pytest.approx(second.wheels.told[-1].linear + 1.0 * 0.021)
+
+
+def test_the_first_does_not_wait_for_one_that_is_dead(both):
+    first, second = both
+    for i in range(1, 6):
+        second.turn(1.0 + i * PERIOD)
+    spoke = [first.turn(1.11 + i * 0.01, FAST) for i in range(5)]
+    assert spoke == [False, False, True, True, True]
+
+
+def test_a_claim_of_the_second_that_comes_too_early_is_answered_by_speaking(both):
+    first, second = both
+    first.turn(1.0, FAST)
+    assert not second.turn(1.045)  # itself late; it claims
+    assert first.turn(1.046, FAST)
+    assert not second.turn(1.065)
+    assert isnan(second.board.of(Role.SECOND).claim)
+    assert second.wheels.told == []
+
+
+def test_a_first_that_is_late_after_a_claim_does_not_speak_beside_the_second(both):
+    first, second = both
+    first.turn(1.0, FAST)
+    second.turn(1.04)  # claims
+    assert not first.turn(1.056, FAST)  # the second may speak from 1.055 on
+    assert not second.turn(1.06)  # it sees the claim
+    assert first.turn(1.061, FAST)
+    assert second.wheels.told == []
+
+
+@pytest.mark.parametrize("role", [0, 1])
+def test_who_is_frozen_in_the_middle_of_a_turn_does_not_speak_by_what_it_saw_before(both, role):
+    both[0].turn(1.0, FAST)
+    both[1].turn(1.04)
+    one = both[role]
+    one.late = 0.5
+    before = len(one.wheels.told)
+    assert not one.turn(1.07, FAST)
+    assert len(one.wheels.told) == before
+
+
+def test_who_is_not_heard_leaves_it_to_the_other_one(both):
+    first, second = both
+    first.turn(1.0, FAST)
+    first.wheels.nodes = frozenset()
+    for i in range(1, 10):
+        assert not first.turn(1.0 + i * PERIOD, FAST)
+        second.turn(1.001 + i * PERIOD)
+    assert len(second.wheels.told) >= 5
+    first.wheels.nodes = frozenset({"/base"})  # a new writer, that the wheels now hear
+    for i in range(10, 14):
+        first.turn(1.0 + i * PERIOD, FAST)
+        second.turn(1.001 + i * PERIOD)
+    # They have been told something by the gate all the time, and go on from there.
+    assert first.wheels.told[1].linear == pytest.approx(second.wheels.told[-1].linear + 1.0 * 0.039)
+    assert second.wheels.told[-1].linear > 0
+
+
+def test_wheels_that_start_anew_begin_from_standstill(both):
+    first, _ = both
+    first.turn(1.0, FAST)
+    first.wheels.nodes = frozenset({"/base another time"})
+    first.turn(1.02, FAST)
+    first.turn(1.04, FAST)
+    assert [velocity.linear for velocity in first.wheels.told] == pytest.approx([0.4, 0.0, 0.02])
+
+
+def test_wheels_that_nobody_can_tell_anything_are_not_taken_over(both):
+    first, second = both
+    first.wheels.fails = FileNotFoundError()
+    for i in range(10):
+        with pytest.raises(FileNotFoundError):
+            first.turn(1.0 + i * PERIOD, FAST)
+        assert not second.turn(1.001 + i * PERIOD)
+    first.wheels.fails = None
+    first.turn(1.2, FAST)
+    assert first.wheels.told[0].linear == pytest.approx(0.02)
+
+
+def test_a_way_that_is_broken_is_silence(both):
+    first, second = both
+    first.turn(1.0, FAST)
+    first.wheels.fails = RuntimeError("closed")
+    for i in range(1, 8):
+        with suppress(RuntimeError):
+            first.turn(1.0 + i * PERIOD, FAST)
+        second.turn(1.001 + i * PERIOD)
+    assert second.wheels.told[0].linear == pytest.approx(0.4 - 2.0 * 0.061)
+    assert len(second.wheels.told) == 5
+
+
+def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
+    file = board.make()
+    before = One(file, Role.SECOND)
+    for i in range(5):
+        before.turn(1.0 + i * PERIOD)
+    after = One(file, Role.SECOND)
+    assert after.board.of(Role.SECOND) == (Told(STANDSTILL, 1.08), 1.0)
+    after.board.put(Role.FIRST, Entry(Told(FAST, 1.1)))
+    assert not after.turn(1.12)
+    assert isnan(after.board.of(Role.SECOND).claim)  # what a dead one has claimed is given back by the next
+    os.close(file)
+
+
+def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
+    file = board.make()
+    page = Board(file)
+    assert page.newest() == Told()
+    for at in (1.0, 2.0, 3.0):
+        page.put(Role.FIRST, Entry(Told(FAST, at), at))
+    newest = [place for place in range(0, 128, 64) if page._at(Role.FIRST, place // 64)[1].told.at == 3.0]
+    page._page[newest[0] + 10] ^= 1
+    assert page.of(Role.FIRST) == Entry(Told(FAST, 2.0), 2.0)
+    page.put(Role.FIRST, Entry(Told(STANDSTILL, 4.0)))
+    assert page.newest() == Told(STANDSTILL, 4.0)
+    page.put(Role.SECOND, Entry(Told(FAST, 5.0)))
+    assert Board(file).newest() == Told(FAST, 5.0)  # as another process sees it
+    with pytest.raises(PermissionError):
+        os.ftruncate(file, 0)
+    os.close(file)
