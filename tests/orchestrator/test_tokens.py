@@ -221,3 +221,22 @@ def test_no_two_have_the_same_name(served: Any) -> None:
     assert refused(lambda: operator.create_token(scoped)) == 409
     operator.delete_token(first.id)
     assert operator.create_token(scoped).name == "walker"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"environment": {"PYTHONWARNINGS": "error::antigravity.x", "BROWSER": "sh -c 'cp operator.token /tmp' #%s"}},
+        {"environment": {"LD_PRELOAD": "/tmp/evil.so"}},
+        {"python_path": ["/tmp"]},
+        {},
+    ],
+)
+def test_no_scope_makes_a_site_that_runs_as_the_orchestrator(served: Any, options: dict[str, Any]) -> None:
+    every = served.operator.create_token(TokenCreate(name="every", scopes=SCOPES)).token
+    asked = SiteCreate(name="here", tier="edge", runtime="process", options=options)
+    with pytest.raises(ApiError, match=r"own user.*operator\.token"):
+        served.client(every).create_site(asked)
+    assert [site.name for site in served.operator.sites()] == []
+    served.client(every).create_site(SiteCreate(name="fake", tier="edge", runtime="fake"))
+    served.operator.create_site(SiteCreate(name="here", tier="edge", runtime="process"))

@@ -64,6 +64,11 @@ class Principal:
             return f"robot:{self.robot}"
         return f"operator:{self.token.name}" if self.token else "operator"
 
+    @property
+    def owns_state(self) -> bool:
+        """Whether this is the operator of the state folder, who has the orchestrator's secrets anyway."""
+        return self.robot is None and self.token is None
+
     def may_use(self, service: str) -> bool:
         return ANY_SERVICE in self.services or service in self.services
 

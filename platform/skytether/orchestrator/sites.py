@@ -16,7 +16,7 @@ from skytether.api.faults import known
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
-from .errors import ConflictError, Fault, InvalidError, NotFoundError
+from .errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from .loops import Loop
 from .placement import NOTHING, Candidate
 from .runtimes.base import Capacity, Launch, Observation, Runtime, RuntimeFailure
@@ -213,10 +213,15 @@ class Sites:
             site.loop.stop(max(0.0, deadline - time.monotonic()))
             site.runtime.close()
 
-    def add(self, asked: SiteCreate) -> Site:
+    def add(self, asked: SiteCreate, *, by_owner: bool = True) -> Site:
         """A new site.
 
+        Args:
+            asked: As it was described.
+            by_owner: By the operator of the state folder, who may make one that runs as the orchestrator's user.
+
         Raises:
+            ForbiddenError: Somebody else wants one that does.
             InvalidError: Runtime or options are wrong.
             ConflictError: There is one of that name.
         """
@@ -226,6 +231,11 @@ class Sites:
                     f"there is a site '{asked.name}' already: choose another name, or delete that first"
                 )
             kind = self._find_runtime(asked.runtime)
+            if kind.runs_as_us and not by_owner:
+                raise ForbiddenError(
+                    f"instances at a site of the runtime '{asked.runtime}' are processes of the orchestrator's own "
+                    "user: only the token in its state folder (operator.token) may make one"
+                )
             asked = asked.model_copy(update={"options": kind.completed(asked.options)})
             self._must_be_unique(asked, kind.unique)
             runtime = self._make_runtime(asked)

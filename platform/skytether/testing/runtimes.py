@@ -45,6 +45,7 @@ class FakeRuntime(Runtime):
     """Every service is ready at once, runs until it is stopped, and ends when it is asked to."""
 
     Options = FakeOptions
+    runs_as_us = False
     looks_until_ready: float = 0
     """How often a run must have been observed before it listens."""
     obedient = True

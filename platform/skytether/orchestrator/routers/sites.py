@@ -45,7 +45,7 @@ def list_sites(core: Core, caller: Caller) -> list[Site]:
 @router.post("", status_code=201, responses=says(401, 403, 409, 422))
 def create_site(core: Core, caller: SitesOperator, asked: SiteCreate, response: Response) -> Site:
     """Add a site."""
-    site = core.sites.add(asked)
+    site = core.sites.add(asked, by_owner=caller.owns_state)
     made(response, "sites", site.name)
     return _show(core, site, caller)
 

@@ -121,6 +121,10 @@ class Runtime(ABC):
     unique: ClassVar[str] = ""
     """Option by which the site's instances are found: two sites with the same would end each other's."""
 
+    runs_as_us: ClassVar[bool] = True
+    """What it starts are processes of the orchestrator's own user, who has all its secrets: whoever chooses what runs
+    there, or with which variables, is that user. Such a site is made by the operator of the state folder alone."""
+
     @abstractmethod
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
         """Take charge of what is there already, also what an earlier orchestrator started.

@@ -42,6 +42,7 @@ class DockerRuntime(Runtime):
 
     Options = DockerOptions
     unique = "owner"
+    runs_as_us = False
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
