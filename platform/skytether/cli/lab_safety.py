@@ -23,7 +23,7 @@ def safety(
         bool, typer.Option("--ros1", help="Attacks on a robot that is a ROS 1 graph, too; needs rosmaster.")
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each attack.")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table of docs/safety.md.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table of docs/safety-attacks.md.")] = False,
 ) -> None:
     """Attack the robot's gate on real processes, and hold what the wheels received against what is promised.
 
@@ -52,6 +52,9 @@ def safety(
     else:
         _show(rows)
     broken = [row for row in rows if row.violations]
+    for row in broken if not json else ():
+        for text in row.what:
+            console.print(f"{row.attack}: {text}", markup=False, style="red", highlight=False, soft_wrap=True)
     if broken:
         fail(f"promises were broken in {len(broken)} of {len(rows)} attacks")
 
@@ -74,6 +77,3 @@ def _show(rows: list[SafetyRow]) -> None:
             "" if row.promised_s is None else f"{row.promised_s:.2f}",
         )
     console.print(table)
-    for row in rows:
-        for text in row.what:
-            console.print(f"{row.attack}: {text}", markup=False, style="red", highlight=False, soft_wrap=True)
