@@ -82,6 +82,14 @@ def test_a_request_that_is_none_is_refused(asked, data):
         assert "request" in json.loads(link.recv(1000))["refused"]
 
 
+def test_a_stop_whose_reason_is_too_long_to_be_read_is_a_stop(asked):
+    requests, path, _ = asked
+    with connect(path) as link:
+        link.send(json.dumps({"do": "stop", "reason": "\U0001f525" * 500}).encode())
+        requests.turn()
+        assert json.loads(link.recv(1000)) == {"do": "stop"}
+
+
 def test_the_socket_is_the_users_own(asked):
     _, path, _ = asked
     assert path.stat().st_mode & 0o077 == 0

@@ -1,3 +1,4 @@
+import threading
 from math import inf, nan
 from types import SimpleNamespace
 
@@ -5,10 +6,12 @@ import numpy as np
 import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.protocol import STOP_SOCKET
+from skytether.guard.requests import Requests
 from skytether.messages import Joy, Twist, Vector3
 from skytether.robot.safety import joystick, kinematics, latch
 from skytether.robot.safety.base import GatedBase
-from skytether.robot.safety.client import GateLink
+from skytether.robot.safety.client import GateLink, stop
 from skytether.robot.safety.joystick import Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams, Latch
 from skytether.robot.supervisor import Limits
@@ -140,3 +143,25 @@ def test_the_agents_wheels_are_not_asked_for_what_they_do_not_have(tmp_path):
     link.close()
     with pytest.raises(ValueError, match=r"linear\.y, linear\.z, angular\.x, angular\.y cannot be asked"):
         base.write(Twist(linear=Vector3(x=0.1, y=0.1)))
+
+
+@pytest.mark.parametrize("letter", ["\U0001f525", "\x00", "\ud800", '"', "\u2028", "\x1b"])
+def test_no_reason_keeps_a_stop_from_being_read(tmp_path, letter):
+    """Five hundred flames were 6 kB of JSON, of which 4 kB were read: the stop was refused."""
+    asked = []
+    requests = Requests(str(tmp_path / STOP_SOCKET), lambda request: asked.append(request) or {})
+    ended = threading.Event()
+
+    def run():
+        while not ended.wait(0.002):
+            requests.turn()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert stop(tmp_path, letter * 1000, 30.0) == {}
+    finally:
+        ended.set()
+        thread.join()
+        requests.close()
+    assert asked == [{"do": "stop", "reason": (letter if letter != "\ud800" else "?") * 500}]

@@ -20,7 +20,7 @@ from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, pack_command, u
 
 _LARGEST_ANSWER = 256 * 1024
 _LONGEST_REASON = 500
-"""Characters that are sent; fewer are kept."""
+"""Characters that are sent; fewer are kept. Whatever they are, the request is smaller than what guard and gate read."""
 _GUARD_S = 1.0
 _LARGEST_STATE = 512
 _ANCILLARY = socket.CMSG_SPACE(12)
@@ -135,7 +135,10 @@ def stop(folder: Path, reason: str = "", timeout: float = 3.0) -> dict[str, Any]
     Raises:
         GateError: Neither took it.
     """
-    request = json.dumps({"do": "stop", "reason": reason[:_LONGEST_REASON]}).encode()
+    # In UTF-8: as escapes of JSON they would be twelve bytes each, and a request that is cut off is none.
+    request = json.dumps({"do": "stop", "reason": reason[:_LONGEST_REASON]}, ensure_ascii=False).encode(
+        errors="replace"
+    )
     links: dict[socket.socket, Path] = {}
     errors: list[GateError] = []
     for path in (folder / STOP_SOCKET, folder / CONTROL_SOCKET):
