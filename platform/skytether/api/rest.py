@@ -344,7 +344,8 @@ class StopRobot(Strict):
 class StopOrder(Strict):
     """An order to stop. The robot stands until a person beside it resets it; nobody can reset it from afar."""
 
-    id: str
+    id: Annotated[str, Field(max_length=64)]
+    """A robot keeps those that it obeyed."""
     robot: str
     reason: str
     by: str

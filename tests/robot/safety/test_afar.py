@@ -152,3 +152,8 @@ def test_the_gates_state_is_watched(tmp_path):
     assert len(watch.report.stopped) == 200
     watch.step()
     assert not watch.report.answers
+
+
+def test_what_is_kept_of_orders_is_bounded():
+    with pytest.raises(ValueError, match="at most 64"):
+        StopOrder(id="a" * 65, robot="walker", reason="fire", by="operator", at=NOW)

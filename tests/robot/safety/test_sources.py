@@ -329,6 +329,26 @@ def test_a_button_that_speaks_only_when_it_changes_is_not_waited_for():
     assert bench.run(0.3).velocity.linear > 0
 
 
+@pytest.mark.parametrize("on_silence", OnSilence)
+def test_a_button_that_returns_while_a_stick_is_pushed(on_silence):
+    """The joystick is one of those who drive: held meanwhile, it must be let go and pressed anew."""
+    bench = Bench(replace(RULES, sources=replace(RULES.sources, on_silence=on_silence)))
+    bench.held = 1.0
+    bench.run(1.0)
+    assert bench.wheels == pytest.approx(0.2)
+    button = bench.says.pop("estop")
+    assert bench.run(1.5).velocity == STANDSTILL
+    bench.says["estop"] = button
+    bench.run(1.0)
+    assert bench.wheels == pytest.approx(0.2 if on_silence is OnSilence.STOP else 0.0)
+    bench.gate.reset(bench.now)
+    bench.held = None
+    bench.run(0.3)
+    bench.held = 1.0
+    bench.run(1.0)
+    assert bench.wheels == pytest.approx(0.2)
+
+
 def test_a_button_that_was_never_heard_does_not_latch():
     bench = Bench(replace(RULES, sources=replace(RULES.sources, on_silence=OnSilence.LATCH)))
     bench.gate = Gate(bench.rules)

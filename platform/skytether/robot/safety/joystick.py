@@ -73,7 +73,7 @@ class Joystick:
         changed_at: When what it says last changed.
         content: What it said.
         up_since: Since when the button is up; NaN: it is down, or was never heard.
-        seen_released: Whether a press counts: the button was seen up since the start, a loss or a reset.
+        seen_released: Whether a press counts: the button was seen up since the start, a loss, a reset or `distrust`.
         lost: How it was lost, for people; empty: it is not.
     """
 
@@ -121,6 +121,12 @@ def look(params: JoystickParams, before: Joystick, now: float) -> Joystick:
             before, f"says the same for {params.max_still_s:g} s with the button held, as if its radio were gone"
         )
     return before
+
+
+def distrust(before: Joystick) -> Joystick:
+    """No press counts from here on until the button was seen up, as after a reset; what is lost stays lost."""
+    grip = Grip.UNSURE if before.grip is Grip.HELD else before.grip
+    return replace(before, grip=grip, wanted=STANDSTILL, up_since=nan, seen_released=False)
 
 
 def _lose(before: Joystick, how: str) -> Joystick:

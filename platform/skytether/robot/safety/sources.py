@@ -300,6 +300,7 @@ class Sources:
                 self.engage("the emergency stop button fell silent")
             elif rules.on_silence is OnSilence.NEUTRAL:
                 self._require("the emergency stop button was silent", inf)
+                self._joystick = joystick.distrust(self._joystick)
             sentence = "the emergency stop button is not heard; the robot stands; see that its driver runs"
             troubles["button"] = f"{rules.button_topic}: {sentence}"
         if self._latch.reason:
