@@ -128,7 +128,10 @@ def _along(row: Floats, x: Line, y: Line, z: Line) -> Floats:
 
 
 def _squared(x: Floats, y: Floats, z: Floats) -> Floats:
-    squared: Floats = x * x + y * y + z * z
+    squared, more = x * x, y * y
+    squared += more
+    np.multiply(z, z, out=more)
+    squared += more
     return squared
 
 
@@ -154,11 +157,13 @@ def _obstacles(mount: CloudMount, outline: Footprint, axes: Floats, cloud: Coord
         if len(at):
             x, y, z = _picked(at, *line)
             squared = _squared(x, y, z)
-            used = (squared > 0) & (squared >= near * near) & (squared < far * far)
             ahead, left = _along(axes[0], x, y, z), _along(axes[1], x, y, z)
-            if mount.slope:
-                used &= up.take(at) >= low + np.float32(mount.slope) * np.sqrt(ahead * ahead + left * left)
-            floor.add(*((ahead, left) if used.all() else (ahead[used], left[used])))
+            if mount.slope or not (near * near <= squared.min() > 0 and squared.max() < far * far):
+                used = (squared > 0) & (squared >= near * near) & (squared < far * far)
+                if mount.slope:
+                    used &= up.take(at) >= low + np.float32(mount.slope) * np.sqrt(ahead * ahead + left * left)
+                ahead, left = ahead[used], left[used]
+            floor.add(ahead, left)
     ahead_left = floor.corners()
     level, bearings = np.hypot(*ahead_left.T), np.arctan2(ahead_left[:, 1], ahead_left[:, 0])
     ignored = _ignored(mount)
