@@ -73,6 +73,16 @@ def test_a_jump_up_and_down():
     assert check(up, [], WHEELS).acceleration_max == pytest.approx(0.41 / 0.029)
 
 
+def test_a_judge_that_was_held_up_blames_nobody_and_sees_a_jump_all_the_same():
+    """On a graph: for 0.15 s nothing was taken, then all at once; the times between are not known."""
+    record = drive((0.5, 1.0), (0.0, 0.5))
+    late = [t if not 1.0 < t.at < 1.15 else Told(1.15, t.velocity, earliest=1.0) for t in record]
+    assert kinds([Told(t.at, t.velocity) for t in late]) == ["acceleration"]
+    assert kinds(late) == []
+    jump = [*drive((0.5, 1.0)), Told(1.0, Velocity(0.0, 0.0), earliest=0.99)]
+    assert kinds(jump) == ["acceleration"]
+
+
 def test_a_change_that_is_too_fast_in_small_steps_does_not_hide_in_the_tolerance():
     """1.5 m/s^2 where 1 is allowed: each step is within the tolerance, all together are not."""
     record = [Told(PERIOD * i, Velocity(min(0.5, 1.5 * PERIOD * i), 0.0)) for i in range(50)]

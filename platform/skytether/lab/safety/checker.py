@@ -6,6 +6,10 @@ a robot of which nobody speaks stands, and whoever speaks to it again finds it s
 Velocities may change by limit * time. The time is known to within `Wheels.jitter_s`: a process looks at its clock,
 decides, and sends; the kernel stamps what it sends, and in between the process may lose the processor. The
 tolerance is the same for every stretch of up to `_STRETCH_S`, not for every message, so that it cannot add up.
+
+On a graph nobody knows when a message was sent, only when this process took it, and a process that was held up takes
+many at once: they were sent at some time since it looked before (`Told.earliest`). What is possible by some of these
+times is no violation: it would be one of whoever held up the judge.
 """
 
 from __future__ import annotations
@@ -30,11 +34,18 @@ class Told:
         at: When it was sent [s].
         velocity: In the base frame [m/s, rad/s].
         sender: Process that sent it; 0: not known.
+        earliest: It was sent at this time or later, until ``at`` [s]; None: at that very moment.
     """
 
     at: float
     velocity: Velocity
     sender: int = 0
+    earliest: float | None = None
+
+    @property
+    def since(self) -> float:
+        """When it was sent, at the earliest [s]."""
+        return self.at if self.earliest is None else self.earliest
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +195,7 @@ def _excess(before: Sequence[Told], after: Told, wheels: Wheels) -> tuple[float,
     limits, jitter = wheels.limits, wheels.jitter_s
     worst, text, most = 0.0, "", 0.0
     for told in before:
-        dt = max(0.0, after.at - told.at) + jitter
+        dt = max(0.0, after.at - told.since) + jitter
         linear, angular = told.velocity
         most = max(most, abs(after.velocity.linear - linear) / dt)
         needed = max(
@@ -205,20 +216,19 @@ def _before(record: Sequence[Told], i: int, wheels: Wheels) -> list[list[Told]]:
 
     A gap on the edge of silence leaves two possibilities: the wheels had stopped, or just not yet.
     """
-    now = later = record[i].at
+    now, later = record[i].at, record[i]
     possible: list[list[Told]] = []
     found: list[Told] = []
     for told in (record[j] for j in range(i - 1, -1, -1)):
-        gap = later - told.at
-        stopped = [*found, Told(later, STANDSTILL)]
-        if gap > wheels.silence_s + wheels.jitter_s:
+        stopped = [*found, Told(later.at, STANDSTILL, earliest=later.since)]
+        if later.since - told.at > wheels.silence_s + wheels.jitter_s:
             return [*possible, stopped]
-        if gap > wheels.silence_s - wheels.jitter_s:
+        if later.at - told.since > wheels.silence_s - wheels.jitter_s:
             possible.append(stopped)
         if now - told.at > _STRETCH_S:
             break
         found.append(told)
-        later = told.at
+        later = told
     return [*possible, found]
 
 
@@ -239,13 +249,13 @@ def _motions(record: Sequence[Told], wheels: Wheels) -> list[tuple[float, float,
     for i, told in enumerate(record):
         if told.velocity == STANDSTILL:
             continue
-        end = told.at + wheels.silence_s
+        end = told.since + wheels.silence_s
         if i + 1 < len(record):
-            end = min(end, record[i + 1].at)
-        if found and told.at <= found[-1][1]:
+            end = min(end, record[i + 1].since)
+        if found and told.since <= found[-1][1]:
             found[-1] = (found[-1][0], end, found[-1][2])
         else:
-            found.append((told.at, end, told.velocity))
+            found.append((told.since, end, told.velocity))
     return found
 
 

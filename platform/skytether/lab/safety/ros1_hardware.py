@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
 import socket
 import subprocess
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +28,7 @@ _HOST = "127.0.0.1"
 _WHEELS = "/cmd_vel_safe"
 _SENSORS: Mapping[str, type[Message]] = {"scan": LaserScan, "estop": Bool, "joy": Joy}
 _PATIENCE_S = 30.0
+_LOOK_S = 0.004
 _PROGRAM = "rosmaster"
 
 
@@ -37,6 +40,8 @@ def available() -> bool:
 class Ros1Hardware:
     """Remembers with each velocity when it was received: TCP says nothing of when it was sent.
 
+    And since when it may have waited: the node's thread looks again and again, and between two looks it may be held up.
+
     Args:
         folder: Of the gate's sockets; the master's log is there too.
 
@@ -46,6 +51,8 @@ class Ros1Hardware:
 
     def __init__(self, folder: Path) -> None:
         self.record = WheelRecord()
+        self._looked: deque[float] = deque([now()] * 2, 2)
+        self._looks = False
         self._undo = ExitStack()
         with socket.create_server((_HOST, 0)) as free:
             port = free.getsockname()[1]
@@ -114,5 +121,13 @@ class Ros1Hardware:
             return False
 
     def _take(self, data: bytes, _: object) -> None:
+        if not self._looks:
+            self._looks = True
+            self._look()
         twist = decode(Twist, data, "ros1")
-        self.record.add(Told(now(), Velocity(twist.linear.x, twist.angular.z)))
+        # Of the look in the same turn of the thread's loop nobody knows whether it was before or after the message.
+        self.record.add(Told(now(), Velocity(twist.linear.x, twist.angular.z), earliest=self._looked[0]))
+
+    def _look(self) -> None:
+        self._looked.append(now())
+        asyncio.get_running_loop().call_later(_LOOK_S, self._look)
