@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from skytether.control.admittance import Velocity
 
 from .footprint import Footprint, Points
+from .sweep import moved
 
 CELLS = 1440
 """Of a whole turn."""
@@ -178,7 +179,7 @@ class Unseen:
         least = inf
         for pose in range(_POSES):
             time = longest / speed / 2**pose
-            points = _moved(self._outline, velocity, time)
+            points = moved(self._outline, velocity, time)
             beyond = self._footprint.outside(points)
             points, beyond = points[beyond > self._params.near_m], beyond[beyond > self._params.near_m]
             if not len(points):
@@ -205,15 +206,3 @@ def _along(footprint: Footprint) -> Points:
             for start, side, length in zip(starts, sides, lengths, strict=True)
         ]
     )
-
-
-def _moved(points: Points, velocity: Velocity, time: float) -> Points:
-    """Where points of the robot are after a time on the same curve, in the base frame of now."""
-    turn = velocity.angular * time
-    # The chord of the curve; sin(x)/x and (1 - cos(x))/x are well-behaved at zero only in this form.
-    half = turn / 2
-    chord = velocity.linear * time * float(np.sinc(half / np.pi))
-    c, s = np.cos(turn), np.sin(turn)
-    x = c * points[:, 0] - s * points[:, 1] + chord * np.cos(half)
-    y = s * points[:, 0] + c * points[:, 1] + chord * np.sin(half)
-    return np.column_stack((x, y))

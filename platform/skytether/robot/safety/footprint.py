@@ -23,6 +23,8 @@ _STRAIGHT = 1e-4
 """Curvature [1/m] that counts as none: 1 mm beside the way after 5 m."""
 _EDGE = 1e-9
 """Distance [m] from the edge that still counts as on it, against rounding."""
+_ROUNDED = 2e-6
+"""The same for edges of outlines that `polygon` made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +77,19 @@ class Footprint:
         nearest: NDArray[np.float64] = ways.min(axis=1)
         return nearest
 
+    def inner_shares(self, starts: Points, along: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """From which share of each line to which it is inside, by more than rounding; never: the second is below.
+
+        Args:
+            starts: Where the lines begin, shape (n, 2).
+            along: From there to their ends, shape (n, 2).
+        """
+        beyond = starts @ self._normals.T - self._offsets + _ROUNDED
+        enter, leave = _passage(beyond, along @ self._normals.T)
+        return np.maximum(enter, 0.0), np.minimum(leave, 1.0)
+
     def time_to_contact(self, points: Points, linear: float, angular: float) -> float:
         """When the first of the points, which stand still, is touched if the robot goes on like that.
-
-        A point on the edge or inside is touched at once if the motion brings it deeper, else it is not looked at: from
-        such a place the robot may go, but not on.
 
         Args:
             points: Shape (n, 2).
@@ -89,37 +99,41 @@ class Footprint:
         Returns:
             Seconds, 0 or more; inf for never.
         """
+        return float(self.times_to_contact(points, linear, angular).min(initial=inf))
+
+    def times_to_contact(self, points: Points, linear: float, angular: float) -> NDArray[np.float64]:
+        """The same for each of the points alone, shape (n,).
+
+        A point on the edge or inside is touched at once if the motion brings it deeper, else it is not looked at: from
+        such a place the robot may go, but not on.
+        """
+        times = np.full(len(points), inf)
         if not len(points) or (linear == 0 and angular == 0):
-            return inf
+            return times
         beyond = points @ self._normals.T - self._offsets
         inside = beyond.max(axis=1) <= _EDGE
-        if inside.any() and self._deeper(points[inside], beyond[inside], linear, angular):
-            return 0.0
-        others = points[~inside]
-        if not len(others):
-            return inf
-        if abs(angular) <= _STRAIGHT * abs(linear):
-            return self._straight(beyond[~inside], linear)
-        return self._arc(others, linear, angular)
+        outside = ~inside
+        if inside.any():
+            times[inside] = np.where(self._deeper(points[inside], beyond[inside], linear, angular), 0.0, inf)
+        if is_straight(linear, angular):
+            times[outside] = self._straight(beyond[outside], linear)
+        elif outside.any():
+            times[outside] = self._arc(points[outside], linear, angular)
+        return times
 
-    def _deeper(self, points: Points, beyond: NDArray[np.float64], linear: float, angular: float) -> bool:
-        """Whether any of these points, seen from the robot, moves in through the edge that it is nearest to."""
+    def _deeper(self, points: Points, beyond: NDArray[np.float64], linear: float, angular: float) -> NDArray[np.bool_]:
+        """Which of these points, seen from the robot, move in through the edge that they are nearest to."""
         normals = self._normals[beyond.argmax(axis=1)]
         seen = np.column_stack((angular * points[:, 1] - linear, -angular * points[:, 0]))
-        return bool((np.einsum("ij,ij->i", normals, seen) < -_EDGE).any())
+        deeper: NDArray[np.bool_] = np.einsum("ij,ij->i", normals, seen) < -_EDGE
+        return deeper
 
-    def _straight(self, beyond: NDArray[np.float64], linear: float) -> float:
+    def _straight(self, beyond: NDArray[np.float64], linear: float) -> NDArray[np.float64]:
         """Seen from the robot the points come along x: clip their way at the line of each edge."""
-        rate = np.broadcast_to(-linear * self._normals[:, 0], beyond.shape)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossing = -beyond / rate
-        enter = np.where(rate < 0, crossing, -inf).max(axis=1)
-        leave = np.where(rate > 0, crossing, inf).min(axis=1)
-        beside = ((rate == 0) & (beyond > 0)).any(axis=1)
-        hit = ~beside & (enter <= leave) & (enter >= 0)
-        return float(enter[hit].min(initial=inf))
+        enter, leave = _passage(beyond, np.broadcast_to(-linear * self._normals[:, 0], beyond.shape))
+        return np.where((enter <= leave) & (enter >= 0), enter, inf)
 
-    def _arc(self, points: Points, linear: float, angular: float) -> float:
+    def _arc(self, points: Points, linear: float, angular: float) -> NDArray[np.float64]:
         """Seen from the robot the points go on circles about the centre of its turn: cut them with each edge."""
         centre = np.array((0.0, linear / angular))
         rays = points - centre
@@ -132,14 +146,15 @@ class Footprint:
         cut = root >= 0
         root = np.sqrt(np.where(cut, root, 0.0))
         bearing = np.arctan2(rays[:, 1], rays[:, 0])[:, None]
-        first = inf
+        first = np.full(len(points), inf)
         for sign in (-1.0, 1.0):
             share = (sign * root - half_b) / a
             x, y = start[:, 0] + share * along[:, 0], start[:, 1] + share * along[:, 1]
             turn = ((bearing - np.arctan2(y, x)) * np.sign(angular)) % tau
             hit = cut & (share >= -_EDGE) & (share <= 1 + _EDGE)
-            first = min(first, float(turn[hit].min(initial=inf)))
-        return first / abs(angular)
+            first = np.minimum(first, np.where(hit, turn, inf).min(axis=1))
+        with np.errstate(over="ignore"):
+            return first / abs(angular)
 
 
 class Outlines:
@@ -158,6 +173,11 @@ class Outlines:
     def __call__(self, more: float) -> Footprint:
         """With so much more room [m], 0 or above."""
         return self.least if more <= 0 else Footprint(self._corners + (self._margin + more) * self._ways)
+
+
+def is_straight(linear: float, angular: float) -> bool:
+    """Whether a curve is so wide that it counts as none."""
+    return abs(angular) <= _STRAIGHT * abs(linear)
 
 
 def polygon(corners: Iterable[tuple[float, float]]) -> Footprint:
@@ -217,6 +237,21 @@ def _sums(one: Points, two: Points) -> tuple[Points, Points]:
             pairs.append((at[0] % len(one), at[1] % len(two)))
     first, second = zip(*pairs, strict=True)
     return one[list(first)], two[list(second)]
+
+
+def _passage(beyond: NDArray[np.float64], rate: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """When points that come at steady rates are past the line of every edge, and when they leave again.
+
+    Args:
+        beyond: How far each point is outside of each edge's line, shape (points, edges).
+        rate: How that grows, the same shape.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        crossing = -beyond / rate
+    enter = np.where(rate < 0, crossing, -inf).max(axis=1)
+    leave = np.where(rate > 0, crossing, inf).min(axis=1)
+    beside = ((rate == 0) & (beyond > 0)).any(axis=1)
+    return np.where(beside, inf, enter), np.where(beside, -inf, leave)
 
 
 def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:

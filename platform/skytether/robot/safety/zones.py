@@ -115,13 +115,22 @@ class Zones:
         speed = self.speed(velocity)
         return min(1.0, self._params.slow_speed / speed) if speed else 1.0
 
+    def stopping(self, velocity: Velocity) -> float:
+        """How far the outermost corner gets until it stands, all stages at their worst [m]."""
+        speed = self.speed(velocity)
+        return speed * (self._stages.reaction_s(0.0) + 0.5 / kinematics.slowdown(self._limits, velocity))
+
     def way(self, velocity: Velocity) -> float:
         """Of the outermost corner until it stands, and the room that it must have then [m]."""
-        speed = self.speed(velocity)
-        if speed == 0:
-            return self._params.stop_m
-        slowdown = kinematics.slowdown(self._limits, velocity)
-        return speed * (self._stages.reaction_s(0.0) + 0.5 / slowdown) + self._params.stop_m
+        return self.stopping(velocity) + self._params.stop_m
+
+    def outline(self, velocity: Velocity, varied: Variation) -> Footprint:
+        """The stop zone, with what is not known of where the robot is; see `allow`."""
+        return self._outlines(self._unsure(velocity, varied))
+
+    def counts(self, velocity: Velocity, before: Zone) -> float:
+        """What is farther on the way than this does not make the robot slower [m]; see `allow`."""
+        return max(self._slow_way(before), self._stop_way(before), self.stopping(velocity))
 
     def allow(self, velocity: Velocity, points: Points, varied: Variation, before: Zone) -> Allowed:
         """Say what share of a velocity is safe.
@@ -160,22 +169,30 @@ class Zones:
 
     def _contact(self, velocity: Velocity, points: Points, varied: Variation) -> float:
         """Time until the first of the points gets into the stop zone [s]; inf: none within all that could matter."""
-        p, speed = self._params, self.speed(velocity)
-        slowdown = kinematics.slowdown(self._limits, velocity)
-        horizon = max(p.slow_m + p.hysteresis_m, speed * (self._stages.reaction_s(0.0) + 0.5 / slowdown))
-        reach = self.stop.radius + horizon
-        unsure = self._stages.late_s * (varied.linear + varied.angular * reach)
-        near = points[np.hypot(points[:, 0], points[:, 1]) <= reach + unsure]
+        unsure = self._unsure(velocity, varied)
+        near = points[np.hypot(points[:, 0], points[:, 1]) <= self._reach(velocity) + unsure]
         return self._outlines(unsure).time_to_contact(near, velocity.linear, velocity.angular)
+
+    def _reach(self, velocity: Velocity) -> float:
+        """Distance from the origin of what could matter [m]."""
+        horizon = max(self._params.slow_m + self._params.hysteresis_m, self.stopping(velocity))
+        return self.stop.radius + horizon
+
+    def _unsure(self, velocity: Velocity, varied: Variation) -> float:
+        """How far off things may be, as the wheels may be late [m]."""
+        return self._stages.late_s * (varied.linear + varied.angular * self._reach(velocity))
 
     def _share(self, contact: float, slowdown: float) -> float:
         """Of the velocity that touches after this time, so that the robot stands before."""
         return 1.0 if isinf(contact) else min(1.0, fastest(contact, slowdown, self._stages.reaction_s(0.0)))
 
     def _zone(self, way: float, before: Zone) -> Zone:
-        p = self._params
-        if way <= _TOUCH_M + (p.hysteresis_m if before is Zone.STOP else 0.0):
+        if way <= self._stop_way(before):
             return Zone.STOP
-        if way <= p.slow_m + (p.hysteresis_m if before is not Zone.CLEAR else 0.0):
-            return Zone.SLOW
-        return Zone.CLEAR
+        return Zone.SLOW if way <= self._slow_way(before) else Zone.CLEAR
+
+    def _stop_way(self, before: Zone) -> float:
+        return _TOUCH_M + (self._params.hysteresis_m if before is Zone.STOP else 0.0)
+
+    def _slow_way(self, before: Zone) -> float:
+        return self._params.slow_m + (self._params.hysteresis_m if before is not Zone.CLEAR else 0.0)
