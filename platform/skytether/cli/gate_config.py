@@ -27,7 +27,11 @@ class _GateFile(BaseModel):
 
     @field_validator("safety")
     @classmethod
-    def _has_a_graph_for_its_topic(cls, safety: SafetyConfig) -> SafetyConfig:
+    def _has_a_graph_for_its_topics(cls, safety: SafetyConfig) -> SafetyConfig:
+        if safety.display is not None and not (safety.ros1 or safety.ros2):
+            raise ValueError(
+                "display needs ros1 or ros2; without a graph there is `skytether robot gate-status --json`"
+            )
         if safety.enable is not None and safety.enable.topic and not (safety.ros1 or safety.ros2):
             raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
         return safety

@@ -22,6 +22,7 @@ from .folder import objection
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
 from .mailbox import bind
+from .onlooker import Onlooker
 from .protocol import LARGEST, STOP_SOCKET, Answer, Beat, pack_answer, unpack_beat, unpack_note
 from .record import Record
 from .requests import Reply, Requests
@@ -101,6 +102,7 @@ class Guard:
         self._systemd = Systemd()
         self._gate: Child | None = None
         self._writer: Child | None = None
+        self._display = Onlooker("display", settings.display, settings.config, log)
         self._tried: dict[str, float] = {}
         self._restarts: dict[str, int] = {}
         self._dead: list[Child] = []
@@ -135,6 +137,7 @@ class Guard:
             self._gate.end()
         if self._writer is not None:
             self._writer.socket.close()  # it says standstill for a while, leaves the graph and ends
+        self._display.leave()
         self._requests.close()
         if self._estop is not None:
             self._estop.close()
@@ -145,6 +148,7 @@ class Guard:
             time.sleep(0.01)
         if self._writer is not None:
             self._writer.end()
+        self._display.end()
 
     def turn(self) -> None:
         """Wait for the gate, a period at most, and tell the wheels once."""
@@ -261,6 +265,7 @@ class Guard:
         """Start what is not there, end what hangs."""
         self._dead = [child for child in self._dead if not child.reaped()]
         self._gate = self._kept_alive("gate", self._gate, self._settings.gate, now)
+        self._display.turn(now)
         if self._settings.writer:
             writer = self._kept_alive("writer", self._writer, self._settings.writer, now)
             if writer is not self._writer and isinstance(self._wheels, WriterWheels):
@@ -360,7 +365,7 @@ class Guard:
             "seconds": round(self._clock() - self._started, 1),
             "enabled": None if self._enable is None else self._enable.on,
             "not_permitted": list(self._refused),
-            "troubles": list(self._troubles.values()),
+            "troubles": [*self._troubles.values(), *([self._display.trouble] if self._display.trouble else [])],
         }
 
 

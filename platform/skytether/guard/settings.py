@@ -40,6 +40,8 @@ class Settings(NamedTuple):
     """Line of the enable signal, see `enable.open_line`; ``topic``: the writer publishes it; empty: there is none."""
     enable_after_s: float = 0.0
     """From the standstill that is told to the end of the enable signal [s]."""
+    display: tuple[str, ...] = ()
+    """Command of the process that shows people what the gate knows; empty: there is none."""
     say: tuple[str, ...] = ()
     """What the command that checked the configuration has to say; by the log, which is never waited for."""
 
@@ -69,6 +71,7 @@ def load(text: str) -> Settings:
         config=int(found["config"]),
         enable=tuple(found["enable"]),
         enable_after_s=float(found["enable_after_s"]),
+        display=tuple(found["display"]),
         say=tuple(found["say"]),
     )
 

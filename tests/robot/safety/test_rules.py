@@ -208,7 +208,7 @@ def test_a_laser_that_repeats_one_scan_is_silent():
         bench.gate.sense("scan", frozen, bench.now)
         bench.run()
     assert bench.last.velocity == STANDSTILL
-    assert "same scan again" in bench.last.troubles["sensor:scan:repeated"]
+    assert "same reading again" in bench.last.troubles["sensor:scan:repeated"]
 
 
 def test_a_laser_that_sees_nothing_anywhere_slows_the_robot():

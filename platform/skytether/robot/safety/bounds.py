@@ -94,6 +94,7 @@ BOUNDS: tuple[Bound, ...] = (
     Bound("odometry.blocked_s", 0.2, 10, "s", "a blocked motor burns"),
     Bound("odometry.max_age_s", 0.02, 1, "s", "the real motion is not known for so long"),
     Bound("enable.after_s", 0, 3, "s", "power goes so late after a stop"),
+    Bound("display.rate_hz", 0.2, 20, "Hz", "slower nobody follows it, faster nobody sees it"),
     Bound("mode.max_age_s", 0.05, 10, "s", "a load that was taken up is not known of for so long"),
     Bound("rate_hz", 10, 500, "Hz", "slower it reacts late, faster Python does not turn"),
     Bound("guard_s", 0.02, 0.5, "s", "the wheels go on as they were told for so long when the gate hangs"),

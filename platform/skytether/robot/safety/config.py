@@ -21,6 +21,7 @@ from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Numbers, Topic, no_switches
 from .contact import ContactParams, feels
+from .display_config import DisplayConfig
 from .enable_config import EnableConfig
 from .inbox import IsStop, Topics
 from .mode_config import Modes, ModeSource, mode_rules
@@ -114,6 +115,8 @@ class SafetyConfig(SourcesConfig):
     """What the wheels really do; null: nobody looks."""
     enable: EnableConfig | None = None
     """An output that takes power away; null: there is none."""
+    display: DisplayConfig | None = None
+    """Zones, stopping way and state for RViz and Foxglove, with ``ros1`` or ``ros2``; null: they are not shown."""
     modes: Modes = {}
     """Tighter limits, zones and outlines that hold at times, by name."""
     mode: ModeSource = ModeSource()
@@ -163,12 +166,23 @@ class SafetyConfig(SourcesConfig):
         for topic in topics:
             if topics.count(topic) > 1:
                 raise ValueError(f"the topic '{topic}' cannot be two things")
+        self._check_display()
         if self.guard_s < 2 / self.rate_hz:
             raise ValueError(f"guard_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
         limits = self.limits or Limits()
         if limits.max_gap_s < 2 / self.rate_hz:
             raise ValueError(f"limits.max_gap_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
         return self
+
+    def _check_display(self) -> None:
+        """Nobody listens to it but people."""
+        way = self.ros1 or self.ros2
+        if self.display is None or way is None:
+            return
+        check_name(self.display.topic, 1 if self.ros1 else 2)
+        others = [*self.kinds(), way.cmd_vel, (self.enable.topic if self.enable is not None else None) or way.cmd_vel]
+        if resolve(self.display.topic, way.namespace) in {resolve(name, way.namespace) for name in others}:
+            raise ValueError(f"display.topic: '{self.display.topic}' is another topic of the gate")
 
     @model_validator(mode="after")
     def _can_stop(self) -> SafetyConfig:

@@ -33,10 +33,12 @@ from skytether.robot.notices import Notices
 
 from .config import SafetyConfig
 from .control import Control
+from .display.feed import Feed
+from .display.snapshot import snapshot
 from .hardware import Sensors, Wheels, receive_from
 from .heartbeat import Heartbeat
 from .process import log_without_waiting
-from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, pack_state, unpack_command
+from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
 from .rules import Decision, Gate
 from .sources import Hand
 from .ways import open_sensors, open_wheels
@@ -90,6 +92,9 @@ class GateLoop:
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
         self._notices = Notices(_log)
+        self._feed = None
+        if config.display is not None:
+            self._feed = Feed(str(folder / DISPLAY_SOCKET), config.display.rate_hz, clock())
         self._started = self._turned_at = clock()
         self._overruns = 0
         self._turns = 0
@@ -143,11 +148,15 @@ class GateLoop:
             self._trouble(kind, sentence, now)
         if agent:
             self._tell_agent(agent, decision, now)
+        if self._feed is not None:
+            self._show(self._feed, decision, now)
 
     def close(self) -> None:
         """Close the sockets."""
         self._requests.close()
         self._commands.close()
+        if self._feed is not None:
+            self._feed.close()
 
     def _take_commands(self, now: float) -> Any:
         """Take in what the agent wants; the address of the agent, None: it said nothing."""
@@ -180,9 +189,18 @@ class GateLoop:
         with suppress(OSError):  # it is gone, or does not read; it asks again
             self._commands.sendto(pack_state(state), agent)
 
+    def _show(self, feed: Feed, decision: Decision, now: float) -> None:
+        if self._clock() - now > self._period / 2:
+            return  # a late turn has no time for it
+        told, gate = self._heartbeat.told(now).velocity, self._gate
+        feed.turn(lambda: snapshot(decision, gate.asked, told, self._stopped, gate.modes), now)
+        if feed.trouble:
+            self._trouble("display", feed.trouble, now)
+
     def _status(self) -> dict[str, Any]:
         last, answer = self._last, self._heartbeat.answer
         told = self._heartbeat.told(self._clock()).velocity
+        feed = self._feed.trouble if self._feed is not None else ""
         return {
             "stopped": self._stopped,
             "kept": answer.kept if answer else None,
@@ -194,7 +212,7 @@ class GateLoop:
             "share": round(last.share, 3) if last else None,
             "linear_m_s": told.linear,
             "angular_rad_s": told.angular,
-            "troubles": list(last.troubles.values()) if last else [],
+            "troubles": [*(last.troubles.values() if last else ()), *([feed] if feed else [])],
             "beyond": list(self._config.notes()),
             "counts": dict(self._gate.counts),
             "turns": self._turns,

@@ -63,6 +63,18 @@ class Sensors(Protocol):
         ...
 
 
+class Graph(Protocol):
+    """Where something is published for people."""
+
+    def publish(self, message: Message) -> None:
+        """Publish it. Returns at once."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+
 class SocketWheels(wheels.SocketWheels):
     """Each velocity is a datagram: a geometry_msgs/msg/Twist as CDR."""
 

@@ -24,6 +24,8 @@ CONTROL_SOCKET = "control.sock"
 SENSORS_SOCKET = "sensors.sock"
 ESTOP_SOCKET = "estop.sock"
 WHEELS_SOCKET = "wheels.sock"
+DISPLAY_SOCKET = "display.sock"
+"""In the gate's folder: what the gate knows, for the process that draws it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from skytether.control.admittance import Velocity
-from skytether.messages import Bool, Message, Twist, Vector3, encode, hash_of
+from skytether.messages import Bool, MarkerArray, Message, Twist, Vector3, encode, hash_of
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
@@ -91,6 +91,31 @@ class Ros1Sensors:
 
     def _listener(self, name: str) -> Listener:
         return Listener(lambda data, _: self._inbox.put(name, data))
+
+
+class Ros1Display:
+    """A topic for people, visualization_msgs/MarkerArray.
+
+    Args:
+        way: Where it is.
+        topic: As configured: absolute, or in the namespace.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros1Way, topic: str) -> None:
+        self._node = _start(way, "display")
+        kind = MarkerArray.TYPE
+        self._publication = self._node.advertise(resolve(topic, way.namespace), kind, hash_of(kind, "ros1"), queue=1)
+
+    def publish(self, message: Message) -> None:
+        """Graph: publish it."""
+        self._publication.publish(encode(message, "ros1"))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
 
 
 def _start(way: Ros1Way, role: str) -> Node:

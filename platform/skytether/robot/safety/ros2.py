@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from skytether.control.admittance import Velocity
-from skytether.messages import Bool, Header, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
+from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
 from skytether.ros.ros2.node import Ros2Error, Ros2Node
@@ -91,6 +91,31 @@ class Ros2Sensors:
     def read(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what else came since the last turn."""
         return self._inbox.take()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.close()
+
+
+class Ros2Display:
+    """A topic for people, visualization_msgs/msg/MarkerArray.
+
+    Args:
+        way: Where it is.
+        topic: As configured: absolute, or in the namespace.
+
+    Raises:
+        OSError: The node cannot be.
+    """
+
+    def __init__(self, way: Ros2Way, topic: str) -> None:
+        self._node = _start(way, "display")
+        name = resolve(topic, way.namespace)
+        self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, name, MarkerArray.TYPE))
+
+    def publish(self, message: Message) -> None:
+        """Graph: publish it."""
+        self._publication.put(encode(message))
 
     def close(self) -> None:
         """Leave the graph."""

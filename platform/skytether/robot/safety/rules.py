@@ -19,15 +19,16 @@ from skytether.robot.supervisor import Limits, Objection, Supervised
 
 from . import kinematics as reach
 from .contact import ContactParams, Contacts
-from .coverage import Action, Unseen, UnseenParams
+from .coverage import Action, UnseenParams
 from .dead_reckoning import DeadReckoning
 from .footprint import Footprint
 from .modes import Envelope, ModeRules, Modes
+from .places import Places
 from .real_motion import OdometryRules, RealMotion
 from .sensing import RangeSensor, Sensing
 from .sources import Hand, SourceRules, Sources
 from .stopping import Stages
-from .zones import Allowed, Zone, ZoneParams, Zones
+from .zones import Allowed, Asked, Zone, ZoneParams
 
 _ORDINARY = frozenset({Objection.LINEAR_ACCELERATION, Objection.ANGULAR_ACCELERATION})
 """Every start and every turn meets these limits; they are counted and not named."""
@@ -84,16 +85,6 @@ class Decision:
     troubles: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """What the modes of a time leave."""
-
-    limits: Limits
-    stages: Stages
-    zones: Zones
-    unseen: Unseen
-
-
 class Gate:
     """Takes in commands and readings as they come, and says at each step what the wheels are told.
 
@@ -105,10 +96,12 @@ class Gate:
     def __init__(self, rules: Rules, stopped: str = "") -> None:
         self.counts: Counter[str] = Counter()
         """What was objected to, by kind."""
+        self.asked: Asked | None = None
+        """What the zones were asked at the last step."""
         self._rules = rules
         self._modes = Modes(rules.modes, Envelope(rules.limits, rules.zones, rules.footprint))
-        self._places: dict[frozenset[str], _Place] = {}
-        self._active, self._place = frozenset[str](), self._place_of(frozenset())
+        self._places = Places(self._modes, rules.stages, rules.unseen)
+        self._active, self._place = frozenset[str](), self._places.of(frozenset())
         self._supervised = Supervised()
         self._sources = Sources(rules.sources, rules.limits, stopped)
         self._sensing = Sensing(rules.sensors, rules.footprint, rules.limits.clock_tolerance_s)
@@ -219,6 +212,7 @@ class Gate:
         """Decide what the wheels are told until the next step. Never raises; whatever fails stands still."""
         troubles: dict[str, str] = self._events
         self._events = {}
+        self.asked = None
         try:
             decision = self._decide(now, troubles)
         except Exception as error:  # a bug in here must not keep the wheels turning
@@ -233,7 +227,7 @@ class Gate:
 
     def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
         self._active = self._modes.active(now, troubles)
-        self._place = place = self._place_of(self._active)
+        self._place = place = self._places.of(self._active)
         before, dt = self._supervised.velocity, supervisor.elapsed(place.limits, self._supervised, now)
         broken = self._motion.look(now, troubles) if self._motion is not None else ""
         if broken:
@@ -271,7 +265,8 @@ class Gate:
         scene = self._sensing.see(now, self._reckoning)
         troubles.update(scene.troubles)
         varied = self._reckoning.varied(now - scene.age - self._place.stages.late_s, wanted)
-        allowed = self._place.zones.allow(wanted, scene.points, varied, self._zone)
+        self.asked = asked = Asked(wanted, scene.points, varied, self._zone)
+        allowed = self._place.zones.allow(wanted, asked.points, varied, self._zone)
         self._zone = allowed.zone
         covers = [part.cover for part in scene.parts]
         unseen = self._place.unseen.share(wanted, covers, self._place.zones.way(wanted))
@@ -289,19 +284,6 @@ class Gate:
     def _most(self, action: Action, wanted: Velocity) -> float:
         """What share of a velocity an action leaves."""
         return {Action.STOP: 0.0, Action.SLOW: self._place.zones.slow(wanted), Action.FREE: 1.0}[action]
-
-    def _place_of(self, active: frozenset[str]) -> _Place:
-        """Made when these modes hold for the first time."""
-        if active not in self._places:
-            now, rules = self._modes.envelope(active), self._rules
-            stages = replace(rules.stages, sensing_s=now.zones.sensing_s, wheels_s=now.zones.reaction_s)
-            self._places[active] = _Place(
-                now.limits,
-                stages if active else rules.stages,
-                Zones(now.zones, now.footprint, now.limits, stages if active else rules.stages),
-                Unseen(rules.unseen, now.footprint, now.zones.slow_speed),
-            )
-        return self._places[active]
 
     def _hear(self, topic: str, message: Message, now: float) -> None:
         command, wrong = self._sources.hear(topic, message, now)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from .address import address
 from .config import SafetyConfig, SocketsConfig
-from .hardware import Address, Sensors, SocketSensors, SocketWheels, Wheels
+from .hardware import Address, Graph, Sensors, SocketSensors, SocketWheels, Wheels
 from .protocol import ESTOP_SOCKET, SENSORS_SOCKET, WHEELS_SOCKET
 
 
@@ -59,6 +59,24 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
         return Ros2Wheels(config.ros2, role, enable or "")
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
+
+
+def open_display(config: SafetyConfig) -> Graph:
+    """Where what the gate knows is published.
+
+    Raises:
+        OSError: It cannot be had.
+    """
+    topic = config.display.topic if config.display is not None else ""
+    if config.ros1 is not None:
+        from .ros1 import Ros1Display
+
+        return Ros1Display(config.ros1, topic)
+    if config.ros2 is not None:
+        from .ros2 import Ros2Display
+
+        return Ros2Display(config.ros2, topic)
+    raise OSError("there is no graph to publish it on")
 
 
 def estop_address(config: SafetyConfig) -> Address:

@@ -88,6 +88,23 @@ class Allowed:
     way: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """What zones are asked, see `Zones.allow`.
+
+    Attributes:
+        velocity: What is wanted.
+        points: What is seen.
+        varied: How the velocity changed.
+        before: What was said the time before.
+    """
+
+    velocity: Velocity
+    points: Points
+    varied: Variation
+    before: Zone
+
+
 class Zones:
     """The zones of one robot.
 
