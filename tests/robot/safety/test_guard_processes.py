@@ -82,10 +82,10 @@ def test_a_button_pressed_while_somebody_stood_still_finds_the_robot_standing(ro
 def test_a_driver_that_starts_again_begins_from_standstill(robot):
     stage = Stage(robot)
     for seconds in (0.0, 0.05, 0.5):
-        robot.record.vanish()
+        robot.hardware.vanish()
         time.sleep(seconds)
         began = now()
-        robot.record.appear()
+        robot.hardware.appear()
         robot.wait(lambda since=began: robot.record.last.at > since, "the driver is told something")
         stage.drives_on("the driver is there again")
         first = [told for told in robot.record.since(began) if told.at >= began]
