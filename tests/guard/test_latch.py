@@ -117,3 +117,17 @@ def test_where_nothing_can_be_written_a_release_is_taken_away(tmp_path, monkeypa
     latch.stop("somebody fell")
     wait(lambda: latch.kept)
     assert Keeper(str(path), BOOT, pytest.fail).before() == FIRST_ACT
+
+
+def test_a_stop_of_a_robot_that_is_stopped_outlives_a_reset_that_was_asked_for_before(tmp_path):
+    keeper = Keeper(str(tmp_path / "latch"), BOOT, pytest.fail)
+    latch = Latch(keeper)
+    keeper.start()
+    latch.stop("somebody fell")
+    wait(lambda: latch.kept)
+    known = latch.generation
+    assert not latch.stop("and another one")
+    latch.renew()
+    assert latch.kept  # the same is on disk
+    assert not latch.reset(known)
+    assert latch.reset(latch.generation)

@@ -39,9 +39,9 @@ def main() -> None:
         log.line("INFO", sentence)
     gc.collect()
     gc.freeze()
-    guard.run(lambda: bool(ended))
+    told = guard.run(lambda: bool(ended))
     log.close()
-    os._exit(0)  # no thread that hangs at a disk or a pipe holds up the end
+    os._exit(0 if told else 1)  # no thread that hangs at a disk or a pipe holds up the end
 
 
 if __name__ == "__main__":

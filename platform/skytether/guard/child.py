@@ -28,6 +28,9 @@ class Child:
         config: File descriptor of its configuration, whose number comes after that.
         now: [s]
         inherited: Further file descriptors that it gets, whose numbers come after that.
+
+    Raises:
+        OSError: There is no descriptor left for the socket to it.
     """
 
     def __init__(
@@ -85,7 +88,7 @@ class Child:
                     pass_fds=[theirs.fileno(), *files],
                     start_new_session=True,  # a Ctrl-C is for the guard, which ends its children when the wheels stand
                 )
-            except OSError as error:
-                self._failed = error.strerror or str(error)
+            except (OSError, MemoryError) as error:
+                self._failed = getattr(error, "strerror", None) or str(error) or type(error).__name__
         if self._ended and self._process is not None:
             self._process.kill()

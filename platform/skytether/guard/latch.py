@@ -153,7 +153,8 @@ class Latch:
         self.reason = keeper.before()
         """Why the robot stands until a person resets it; empty: it does not."""
         self.generation = 1
-        keeper.keep(self.generation, self.reason)
+        self._changes = 1
+        keeper.keep(self._changes, self.reason)
 
     def stop(self, reason: str) -> bool:
         """In effect at once. The first reason is kept, but for `FIRST_ACT`, which is nobody's. True if this is new."""
@@ -162,6 +163,10 @@ class Latch:
             return False
         self._change(reason)
         return True
+
+    def renew(self) -> None:
+        """A person stops a robot that is stopped already: a reset that was asked for before does not end this."""
+        self.generation += 1
 
     def reset(self, generation: int) -> bool:
         """End the stop that whoever asks knows of; a newer one stays. True if it was stopped and is no more."""
@@ -173,15 +178,16 @@ class Latch:
     @property
     def kept(self) -> bool:
         """It is on disk as it is."""
-        return self._keeper.kept == (self.generation, "")
+        return self._keeper.kept == (self._changes, "")
 
     @property
     def unkept(self) -> str:
         """Why it could not be kept; empty: it is, or is being written."""
         done, error = self._keeper.kept
-        return error if done == self.generation else ""
+        return error if done == self._changes else ""
 
     def _change(self, reason: str) -> None:
         self.reason = reason
         self.generation += 1
-        self._keeper.keep(self.generation, reason)
+        self._changes += 1
+        self._keeper.keep(self._changes, reason)

@@ -6,7 +6,6 @@ stop the robot that needs no gate.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import select
 import time
@@ -16,9 +15,9 @@ from collections.abc import Callable
 from . import board
 from .board import Board, Role
 from .child import Child
+from .claim import Claim, ClaimError
 from .clock import now as boottime
 from .enable import Enable, Power, WriterLine, open_line
-from .folder import objection
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
 from .mailbox import bind
@@ -34,7 +33,6 @@ from .watch import Watch
 from .wheels import SocketWheels, WriterWheels
 
 LATCH_FILE = "latch"
-LOCK_FILE = "lock"
 _AGAIN_S = 1.0
 """Between starts of a child."""
 _DEATHS, _DEATHS_S = 3, 60.0
@@ -75,7 +73,10 @@ class Guard:
         self._settings = settings
         self._log = log
         self._clock = clock
-        self._lock = _take_folder(settings.folder)
+        try:
+            self._claim = Claim(settings.folder)
+        except ClaimError as error:
+            raise GuardError(str(error)) from error
         boot = boot_id()
         self._record = Record(settings.record, boot)
         keeper = Keeper(os.path.join(settings.folder, LATCH_FILE), boot, self._not_kept)
@@ -89,6 +90,10 @@ class Guard:
             self._estop = None if settings.estop is None else bind(settings.estop)
         except OSError as error:
             raise GuardError(f"cannot have {settings.estop} for stops: {error.strerror}") from error
+        self._claim.add(os.path.join(settings.folder, STOP_SOCKET))
+        if isinstance(settings.estop, str):
+            self._claim.add(settings.estop)
+        self._claim.start()
         self._watch = Watch(settings.bounds, settings.period_s, settings.patience_s)
         self._board_file = board.make()
         self._board = Board(self._board_file)
@@ -123,15 +128,22 @@ class Guard:
             return Enable(lambda: WriterLine(wheels), power)
         return Enable(lambda: open_line(settings.enable), power)
 
-    def run(self, ended: Callable[[], bool]) -> None:
-        """Guard until told to end; the wheels stand at the end."""
+    def run(self, ended: Callable[[], bool]) -> bool:
+        """Guard until told to end, or until nobody can reach this guard any more; the wheels stand at the end.
+
+        Returns:
+            Whether it was told to end.
+        """
         for sentence in self._refused:
             self._log.line("INFO", sentence)
         self._event("guard", "start", self._latch.reason or "released")
-        while not ended():
+        while not ended() and not self._claim.lost:
             self.turn()
+        lost = self._claim.lost
         self._systemd.tell("STOPPING=1")
-        self._event("guard", "end", "told to end")
+        if lost:
+            self._log.line("ERROR", f"{lost} was removed or replaced: nobody could stop this guard; it brakes and ends")
+        self._event("guard", "end", f"{lost} was removed or replaced" if lost else "told to end")
         self._brake()
         if self._gate is not None:
             self._gate.end()
@@ -149,6 +161,7 @@ class Guard:
         if self._writer is not None:
             self._writer.end()
         self._display.end()
+        return not lost
 
     def turn(self) -> None:
         """Wait for the gate, a period at most, and tell the wheels once."""
@@ -280,7 +293,12 @@ class Guard:
                 return None
             self._tried[name] = now
             more = (self._estop.fileno(),) if name == "gate" and self._estop is not None else ()
-            return Child(name, command, self._settings.config, now, (self._board_file, *more))
+            try:
+                return Child(name, command, self._settings.config, now, (self._board_file, *more))
+            except (OSError, RuntimeError, MemoryError) as error:  # no descriptor, no thread: there may be one later
+                sentence = f"the {name} cannot be started: {getattr(error, 'strerror', None) or error!r}"
+                self._trouble(f"start:{name}", "trouble", sentence, now)
+                return None
         why = child.ended(now)
         if not why:
             return child
@@ -312,10 +330,13 @@ class Guard:
             self._systemd.tell("WATCHDOG=1")
             time.sleep(self._settings.period_s)
 
-    def _stop(self, who: str, reason: str) -> None:
-        if self._latch.stop(reason):
-            self._log.line("WARNING", f"emergency stop: {self._latch.reason}")
-            self._event(who, "stop", self._latch.reason)
+    def _stop(self, who: str, reason: str) -> bool:
+        """True if this is new."""
+        if not self._latch.stop(reason):
+            return False
+        self._log.line("WARNING", f"emergency stop: {self._latch.reason}")
+        self._event(who, "stop", self._latch.reason)
+        return True
 
     def _trouble(self, kind: str, what: str, sentence: str, now: float) -> None:
         if self._log.trouble(kind, sentence, now):
@@ -334,7 +355,8 @@ class Guard:
             return self._status()
         if what != "stop":
             return {"refused": f"there is no request {str(what)[:40]!r}; the guard knows status and stop"}
-        self._stop("person", clean(request.get("reason")) or "somebody asked for it")
+        if not self._stop("person", clean(request.get("reason")) or "somebody asked for it"):
+            self._latch.renew()
         end = self._clock() + _KEPT_S
 
         def kept() -> Reply | None:
@@ -367,22 +389,3 @@ class Guard:
             "not_permitted": list(self._refused),
             "troubles": [*self._troubles.values(), *([self._display.trouble] if self._display.trouble else [])],
         }
-
-
-def _take_folder(folder: str) -> int:
-    before = os.umask(0o022)  # nobody else may write into it, whatever this process was started with
-    try:
-        os.makedirs(folder, exist_ok=True)
-        if why := objection(folder):
-            raise GuardError(f"cannot trust the folder {folder} for the gate's sockets: {why}")
-        lock = os.open(os.path.join(folder, LOCK_FILE), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        raise GuardError(f"cannot use the folder {folder} for the gate's sockets: {error.strerror}") from error
-    finally:
-        os.umask(before)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(lock)
-        raise GuardError(f"another gate runs in {folder}; end it, or name another safety.folder") from error
-    return lock

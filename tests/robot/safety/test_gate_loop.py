@@ -330,6 +330,23 @@ def test_a_reset_is_over_when_the_guard_says_so(bench):
     assert bench.beat.stopped == ""
 
 
+def test_a_reset_does_not_end_a_stop_that_came_after_it(bench):
+    """It waited in a gate that hung; meanwhile a person stopped the robot again, by the guard's own way."""
+    bench.answer = bench.answer._replace(generation=2, stopped="somebody fell")
+    bench.turn()
+    bench.turn()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+        link.connect(str(bench.folder / "control.sock"))
+        link.send(b'{"do": "reset"}')
+        bench.answer = bench.answer._replace(generation=3)
+        bench.turn()
+        bench.turn()
+        assert not bench.beat.reset
+        bench.turn()
+        assert json.loads(link.recv(65536))["refused"] == "still stopped: somebody fell"
+    assert bench.loop._gate.stopped == "somebody fell"
+
+
 def test_a_guard_that_does_not_reset_leaves_the_gate_stopped(bench):
     bench.answer = bench.answer._replace(generation=2, stopped="somebody fell")
     bench.turn()

@@ -7,6 +7,7 @@ larger than the limits allow in that time (`skytether.lab.safety.checker`), what
 import itertools
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -24,6 +25,7 @@ from skytether.guard.velocity import STANDSTILL
 from skytether.lab.safety.record import now
 from skytether.lab.safety.robot import PlayedRobot
 from skytether.lab.safety.stage import Stage
+from skytether.messages import Bool
 from skytether.robot.safety.client import GateError
 
 pytestmark = pytest.mark.slow
@@ -207,6 +209,57 @@ def test_a_stop_while_the_guard_is_frozen_holds_for_the_next_one(robot):
     robot.start_guard()
     robot.wait(lambda: other_gate(robot, 0), "the next gate answers")
     assert "somebody fell" in robot.ask("status")["stopped"]
+
+
+@pytest.mark.parametrize("again", ["stop.sock", "button"])
+def test_a_reset_that_waits_in_a_frozen_gate_does_not_end_a_stop_that_came_after_it(robot, again):
+    robot.stop("somebody fell")
+    robot.wait(lambda: robot.ask("status")["guard"]["stopped"] == "somebody fell", "gate and guard know it")
+    gate = robot.signal("gate", signal.SIGSTOP)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as reset:
+        reset.connect(str(robot.folder / "control.sock"))
+        reset.send(b'{"do": "reset"}')
+        if again == "button":
+            robot.hardware.send("estop", Bool(True))
+        else:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+                link.connect(str(robot.folder / again))
+                link.send(b'{"do": "stop", "reason": "and another one"}')
+                assert json.loads(link.recv(65536))["kept"]
+        time.sleep(0.1)
+        os.kill(gate, signal.SIGCONT)
+        reset.settimeout(30)
+        assert "refused" in json.loads(reset.recv(65536))
+    assert robot.ask("status")["stopped"] == "somebody fell"
+
+
+@pytest.mark.parametrize("what", ["lock", "folder"])
+def test_a_guard_whose_folder_is_gone_brakes_and_ends(robot, what):
+    """Nobody could stop it any more, and another one could be started for the same wheels."""
+    stage = Stage(robot)
+    if what == "lock":
+        (robot.folder / "lock").unlink()
+    else:
+        robot.folder.rename(robot.folder.with_name("old"))
+    assert robot.guard.wait(30) == 1
+    assert robot.record.last.velocity == STANDSTILL
+    robot.wait(lambda: not robot.alive("gate"), "its gate ends")
+    check(stage)
+
+
+def test_a_guard_that_gets_no_descriptor_more_goes_on_without_a_gate(robot):
+    guard = robot.pid("guard")
+    before = resource.prlimit(guard, resource.RLIMIT_NOFILE)
+    lowest = max(int(name) for name in os.listdir(f"/proc/{guard}/fd")) + 1
+    resource.prlimit(guard, resource.RLIMIT_NOFILE, (min(lowest, 3), before[1]))  # not one, whatever is closed
+    stage = Stage(robot)
+    with stage.stands(stage.promised.partner, "the gate was killed while the guard could open nothing"):
+        robot.signal("gate", signal.SIGKILL)
+        time.sleep(2.5)
+    assert robot.guard.poll() is None
+    resource.prlimit(guard, resource.RLIMIT_NOFILE, before)
+    robot.go()
+    check(stage)
 
 
 def test_idle_clients_do_not_hold_up_a_stop(robot):

@@ -13,6 +13,8 @@ from math import isnan
 
 from skytether.messages import Bool, Message, Range
 
+from .latch import PRESSED_S
+
 _TOLERANCE_S = 0.05
 """How far ahead of now something may have been heard."""
 
@@ -71,6 +73,7 @@ class Contacts:
     def __init__(self, params: Mapping[str, ContactParams]) -> None:
         self._params = params
         self._heard: dict[str, tuple[bool, float]] = {}
+        self._felt_at: dict[str, float] = {}
 
     def hear(self, topic: str, message: Message, now: float) -> str:
         """Take a message in.
@@ -82,6 +85,8 @@ class Contacts:
         if felt is None:
             return ""
         self._heard[topic] = (felt, now)
+        if felt:
+            self._felt_at[topic] = now
         return _SAYS[self._params[topic].kind].format(topic) if felt else ""
 
     def silent(self, now: float) -> Mapping[str, str]:
@@ -104,6 +109,9 @@ class Contacts:
             if felt:
                 still = "still touched" if self._params[topic].kind is ContactKind.BUMPER else "still without a floor"
                 return f"{topic} is {still}; move the robot away by hand first"
+        for topic, at in self._felt_at.items():
+            if now - at < PRESSED_S:
+                return f"{topic} stopped the robot just now"
         return next((f"{sentence}; see that its driver runs" for sentence in self.silent(now).values()), "")
 
 

@@ -49,6 +49,8 @@ class Control:
         self._clock = clock
         self._changes = 0
         self._reset_until = 0.0
+        self._reset_of: int | None = None
+        """The stop that the person who asked for the reset could know of; None: of the first that the guard tells."""
 
     def turn(self, now: float) -> None:
         """What the guard says about the emergency stop holds for the gate."""
@@ -60,6 +62,10 @@ class Control:
             self._gate.reset(now)
         elif answer.stopped:
             self._gate.engage(answer.stopped)
+            if self._reset_of is None:
+                self._reset_of = answer.generation
+            if answer.generation != self._reset_of:
+                self.resets = False  # somebody has stopped the robot again since
 
     def handle(self, asked: Mapping[str, object]) -> Reply | Callable[[], Reply | None]:
         """A request; its answer, or what has it later."""
@@ -116,6 +122,7 @@ class Control:
             self._gate.reset(now)  # a joystick that was lost, and what sensors have learnt
             return self._status()
         self.resets, self._reset_until = True, now + _RESET_S
+        self._reset_of = None if answer is None else answer.generation
 
         def done() -> Reply | None:
             if self.resets and self._clock() <= self._reset_until:

@@ -13,6 +13,8 @@ from skytether.guard.latch import FIRST_ACT
 
 SETTLES_S = 0.1
 """After a time in which the gate stood still, what waited meanwhile comes within this long."""
+PRESSED_S = 0.08
+"""A reset that comes so soon after a press may have waited since before it, in a gate that hung."""
 _TOLERANCE_S = 0.05
 """How far ahead of now something may have been heard."""
 
@@ -40,12 +42,14 @@ class Latch:
         heard_at: When; NaN: never.
         doubted_until: The gate stood still. What it hears until then waited meanwhile and is old: a press counts, and
             that it is not pressed does not; NaN: it did not.
+        pressed_at: When it last said that it is pressed; NaN: never.
     """
 
     reason: str = ""
     pressed: bool = False
     heard_at: float = nan
     doubted_until: float = nan
+    pressed_at: float = nan
 
 
 def engage(before: Latch, reason: str) -> Latch:
@@ -57,7 +61,8 @@ def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:
     """Take in what the button says."""
     pressed = value is params.pressed_is
     doubted_until = before.doubted_until if now < before.doubted_until else nan
-    heard = replace(before, pressed=pressed, heard_at=now, doubted_until=doubted_until)
+    pressed_at = now if pressed else before.pressed_at
+    heard = replace(before, pressed=pressed, heard_at=now, doubted_until=doubted_until, pressed_at=pressed_at)
     return engage(heard, "the emergency stop button was pressed") if pressed else heard
 
 
@@ -86,6 +91,8 @@ def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch
     if params is not None:
         if before.pressed:
             return before, "the emergency stop button is still pressed; release it first"
+        if now - before.pressed_at < PRESSED_S:
+            return before, "the emergency stop button was pressed just now"
         if doubted(before) or silent(params, before, now):
             return before, "the emergency stop button is not heard; see that its driver runs"
     return replace(before, reason=""), ""
