@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import IO
 
+from skytether.guard.claim import LOCK_FILE
 from skytether.guard.clock import now as boottime
 from skytether.guard.enable import Line, open_line
 from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
-from skytether.guard.claim import LOCK_FILE
 from skytether.guard.loop import LATCH_FILE
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool
