@@ -83,7 +83,7 @@ class Display:
         """Draw until the guard is gone."""
         while True:
             ready, _, _ = select.select([self._feed, self._guard], [], [], _SILENCE_S / 2)
-            if self._guard in ready and not self._guard.recv(1):
+            if self._guard in ready and self._gone():
                 return
             self.turn()
 
@@ -104,6 +104,12 @@ class Display:
     def close(self) -> None:
         """Close the socket."""
         self._feed.close()
+
+    def _gone(self) -> bool:
+        try:
+            return not self._guard.recv(1)
+        except OSError:  # it ended without having read the last signs of life
+            return True
 
     def _draw(self, data: bytes, now: float) -> None:
         seen = unpack(data)
