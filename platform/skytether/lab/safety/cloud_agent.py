@@ -37,7 +37,8 @@ def wants(kind: str) -> Iterator[tuple[float, float]]:
         return repeat((5.0, 9.0))
     if kind == "jumping":
         return cycle([(0.5, 0.8)] * 20 + [(-0.5, -0.8)] * 20)
-    return cycle([(0.5, 0.3)] * 40 + [(nan, 0.0), (inf, nan), (0.5, -inf)] * 10)
+    # Long enough without nonsense for the agent to take the cloud back.
+    return cycle([(0.5, 0.3)] * 90 + [(nan, 0.0), (inf, nan), (0.5, -inf)] * 10)
 
 
 class _Nothing:
