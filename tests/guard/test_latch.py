@@ -60,6 +60,17 @@ def wait(condition):
         time.sleep(0.001)
 
 
+def test_a_pipe_in_the_place_of_the_file_holds_up_nothing(tmp_path):
+    path = tmp_path / "latch"
+    os.mkfifo(path)
+    keeper = Keeper(str(path), BOOT, pytest.fail)
+    latch = Latch(keeper)
+    assert latch.reason == "what was kept of the emergency stop cannot be read"
+    keeper.start()
+    wait(lambda: latch.kept)
+    assert not path.exists()
+
+
 def test_acknowledged_is_kept(tmp_path):
     path = str(tmp_path / "latch")
     keeper = Keeper(path, BOOT, pytest.fail)

@@ -97,8 +97,11 @@ class Keeper:
     def before(self) -> str:
         """Why the robot is to stand from the start; empty: it is not."""
         try:
-            with open(self._path, "rb") as file:
-                return decode(file.read(2 * SIZE), self._boot)
+            file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe must not hold it up
+            try:
+                return decode(os.read(file, 2 * SIZE), self._boot)
+            finally:
+                os.close(file)
         except FileNotFoundError:
             return decode(None, self._boot)
         except OSError as error:
@@ -126,7 +129,7 @@ class Keeper:
 
     def _write(self, reason: str) -> str:
         try:
-            file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
             try:
                 written = os.pwrite(file, encode(reason, self._boot), 0)
                 os.fsync(file)

@@ -295,6 +295,28 @@ def test_the_guard_frozen_or_killed(robot):
     wait(lambda: not _alive(gate), "the gate ends without its guard", robot)
 
 
+def test_a_gate_that_is_started_without_standard_descriptors_is_ready(tmp_path):
+    (tmp_path / "run").mkdir()
+    config = tmp_path / "robot.yaml"
+    config.write_text(yaml.safe_dump({"safety": CONFIG | {"folder": str(tmp_path / "run")}}))
+    start = [sys.executable, "-m", "skytether.cli", "robot", "gate", str(config)]
+    guard = subprocess.Popen(["sh", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "sh", *start])
+
+    def answers() -> bool:
+        try:
+            return bool(ask(tmp_path / "run", {"do": "status"}, PATIENCE_S))
+        except GateError:
+            return False
+
+    try:
+        wait(answers, "the gate answers")
+        assert [os.readlink(f"/proc/{guard.pid}/fd/{number}") for number in range(3)] == ["/dev/null"] * 3
+        assert b"INFO" not in (tmp_path / "run/lock").read_bytes()
+    finally:
+        guard.terminate()
+        guard.wait(PATIENCE_S)
+
+
 def test_the_disk_is_full(tmp_path, netns):
     disk = tmp_path / "disk"
     disk.mkdir()

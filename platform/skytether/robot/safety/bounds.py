@@ -73,7 +73,7 @@ BOUNDS: tuple[Bound, ...] = (
     Bound("sensors.*.max_gap_deg", 0, 30, "degrees", "a person 1 m away is 30 degrees wide"),
     Bound("sensors.*.max_step_deg", 0.01, 5, "degrees", "a table's leg 1 m away is 3 degrees wide"),
     Bound("sensors.*.max_age_s", 0.02, 1, "s", "the robot drives by what it saw so long ago"),
-    Bound("unseen.near_m", 0.01, 1, "m", "beyond it the robot is blind beside itself"),
+    Bound("unseen.near_m", 0.01, 0.2, "m", "the gate remembers nothing: what leaves the sight is gone"),
     Bound("contacts.*.below_m", 0.005, 1, "m", "farther away it is a matter for the zones"),
     Bound("contacts.*.above_m", 0.01, 1, "m", "wheels fall into less"),
     Bound("contacts.*.max_age_s", 0.05, 2, "s", "a bumper that is cut off stops nothing for so long"),

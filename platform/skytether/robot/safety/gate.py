@@ -37,7 +37,7 @@ from .display.feed import Feed
 from .display.snapshot import snapshot
 from .hardware import Sensors, Wheels, receive_from
 from .heartbeat import Heartbeat
-from .process import log_without_waiting
+from .process import SWITCH_S, log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
 from .rules import Decision, Gate
 from .sources import Hand
@@ -232,6 +232,7 @@ def main() -> None:
     config = SafetyConfig.model_validate_json(thaw(int(sys.argv[2])))
     logging.basicConfig(format="%(levelname)s gate: %(message)s", level=logging.INFO)
     log_without_waiting()
+    sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
     warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")

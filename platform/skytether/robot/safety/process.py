@@ -1,4 +1,4 @@
-"""Logs of gate and writer, which never wait."""
+"""What gate and writer have in common as processes: a log that never waits, threads that do not hold up the loop."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from logging.handlers import QueueHandler, QueueListener
 
 _WAITING_LINES = 256
 """Lines of the log that wait for whoever reads them; of a reader that does not read, further ones are dropped."""
+SWITCH_S = 0.0005
+"""For `sys.setswitchinterval`: threads of a ROS node take turns of Python's usual 5 ms, some of them a whole period."""
 
 
 class _NeverWaits(QueueHandler):

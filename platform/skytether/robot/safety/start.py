@@ -22,10 +22,20 @@ def become_guard(config: SafetyConfig) -> NoReturn:
     Raises:
         OSError: A host's name is not known, or the kernel refuses.
     """
+    _open_standard_descriptors()
     config = config.frozen()
     settings = guard_settings(config, freeze("skytether-gate", config.model_dump_json()))
     file = freeze("skytether-guard", dump(settings))
     os.execv(sys.executable, [*_PYTHON, "-m", "skytether.guard", str(file)])  # noqa: S606 - a list of arguments
+
+
+def _open_standard_descriptors() -> None:
+    """Where 0, 1 or 2 is closed, a socket or the configuration would get that number, and the log what is meant for it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest that is free
 
 
 def guard_settings(config: SafetyConfig, file: int) -> Settings:

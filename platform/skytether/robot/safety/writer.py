@@ -30,7 +30,7 @@ from skytether.robot.notices import Notices
 
 from .config import SafetyConfig
 from .hardware import Wheels
-from .process import log_without_waiting
+from .process import SWITCH_S, log_without_waiting
 from .ways import open_wheels
 
 _log = logging.getLogger("skytether.writer")
@@ -144,6 +144,7 @@ def main() -> None:
     config = SafetyConfig.model_validate_json(thaw(int(sys.argv[2])))
     logging.basicConfig(format="%(levelname)s writer: %(message)s", level=logging.INFO)
     log_without_waiting()
+    sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
     warm([Twist], "cdr" if config.ros1 is None else "ros1")

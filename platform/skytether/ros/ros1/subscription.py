@@ -23,6 +23,8 @@ _REFUSED_S = 30.0
 """Between tries of a publisher of another type: it may have been exchanged."""
 _KEPT_LATCHED = 64
 """Publishers whose latched message is kept for a listener that comes later."""
+_MOST_PUBLISHERS = 64
+"""Of one topic: whoever reaches the node can name thousands, and to look for each costs the program its time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,11 @@ class Subscription:
 
     def update(self, uris: list[str]) -> None:
         """The master says who publishes. Connections that work are kept: a restarted master does not know them."""
-        self._listed = set(uris) - {self._own_uri}
+        named = list(dict.fromkeys(uri for uri in uris if uri != self._own_uri))
+        named.sort(key=lambda uri: uri not in self._following)  # whom it follows already it goes on to follow
+        if len(named) > _MOST_PUBLISHERS:
+            self._say(f"topic {self.topic} has more than {_MOST_PUBLISHERS} publishers; the others are left out")
+        self._listed = set(named[:_MOST_PUBLISHERS])
         for uri in self._listed - set(self._following):
             self._following[uri] = asyncio.ensure_future(self._follow(uri))
         for uri in set(self._following) - self._listed - set(self.connected):
