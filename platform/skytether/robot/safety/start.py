@@ -30,7 +30,7 @@ def become_guard(config: SafetyConfig) -> NoReturn:
 
 
 def _open_standard_descriptors() -> None:
-    """Where 0, 1 or 2 is closed, a socket or the configuration would get that number, and the log what is meant for it."""
+    """Where 0, 1 or 2 is closed, a socket or a configuration would get that number, and what is printed."""
     for number in range(3):
         try:
             os.fstat(number)
