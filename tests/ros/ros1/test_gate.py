@@ -120,3 +120,19 @@ def test_the_check_says_whether_the_gate_is_there(graph, gated, walker):
     status, text = check()
     assert status == 0, text
     assert "does not run yet" in " ".join(text.split())
+
+
+def test_a_gate_alone_names_who_else_publishes_the_wheels_topic(graph, gated, walker, tmp_path):
+    graph.skytether("robot", "gate", str(gated))
+    other = graph.start("rostopic", "pub", "-r", "5", "/cmd_vel", "geometry_msgs/Twist", "{}")
+
+    def named():
+        try:
+            troubles = ask(tmp_path / "gate", {"do": "status"}, timeout=30)["troubles"]
+        except GateError:  # it is being started
+            return False
+        return any("/rostopic" in trouble and "publishes /cmd_vel" in trouble for trouble in troubles)
+
+    wait_for(named, "the other publisher is named")
+    other.terminate()
+    wait_for(lambda: not named(), "it is gone")

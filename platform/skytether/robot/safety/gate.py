@@ -30,6 +30,8 @@ from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Twist, warm
 from skytether.robot.notices import Notices
+from skytether.robot.wheels_watch import NOBODY, Others, WatchesWheels
+from skytether.robot.wheels_watch import sentence as sentence_of_others
 
 from .config import SafetyConfig
 from .control import Control
@@ -82,6 +84,8 @@ class GateLoop:
         self._wheels = wheels
         self._period = 1 / config.rate_hz
         self._refused = refused
+        self._watched = wheels if isinstance(wheels, WatchesWheels) else None
+        self._others_noticed = 0
         folder = config.place()
         self._gate = Gate(config.rules())
         self._heartbeat = Heartbeat(
@@ -146,6 +150,9 @@ class GateLoop:
         self._requests.turn()
         for kind, sentence in decision.troubles.items():
             self._trouble(kind, sentence, now)
+        if self._others.noticed != self._others_noticed:  # the log has it from the watch
+            self._others_noticed = self._others.noticed
+            self._heartbeat.note(self._other_publishers)
         if agent:
             self._tell_agent(agent, decision, now)
         if self._feed is not None:
@@ -179,6 +186,15 @@ class GateLoop:
         known = self._heartbeat.answer is not None
         return self._gate.stopped or ("" if known else "the guard has not answered yet")
 
+    @property
+    def _others(self) -> Others:
+        return self._watched.others if self._watched is not None else NOBODY
+
+    @property
+    def _other_publishers(self) -> str:
+        names = self._others.names
+        return sentence_of_others(self._config.wheels_at(), names) if names else ""
+
     def _trouble(self, kind: str, sentence: str, now: float) -> None:
         if self._notices.say(kind, sentence, now):
             self._heartbeat.note(sentence)
@@ -201,6 +217,7 @@ class GateLoop:
         last, answer = self._last, self._heartbeat.answer
         told = self._heartbeat.told(self._clock()).velocity
         feed = self._feed.trouble if self._feed is not None else ""
+        more = [sentence for sentence in (feed, self._other_publishers) if sentence]
         return {
             "stopped": self._stopped,
             "kept": answer.kept if answer else None,
@@ -212,7 +229,7 @@ class GateLoop:
             "share": round(last.share, 3) if last else None,
             "linear_m_s": told.linear,
             "angular_rad_s": told.angular,
-            "troubles": [*(last.troubles.values() if last else ()), *([feed] if feed else [])],
+            "troubles": [*(last.troubles.values() if last else ()), *more],
             "beyond": list(self._config.notes()),
             "counts": dict(self._gate.counts),
             "turns": self._turns,

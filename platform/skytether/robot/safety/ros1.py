@@ -7,9 +7,11 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Bool, MarkerArray, Message, Twist, Vector3, encode, hash_of
+from skytether.robot.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
@@ -34,6 +36,10 @@ class Ros1Wheels:
         self._node = _start(way, role)
         topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+        self._watch = None
+        if role == "gate":
+            own = [resolve(f"{way.node}_{each}", "/") for each in ("guard", "gate")]
+            self._watch = WheelsWatch(topic, own, partial(self._node.master.publishers, topic))
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
@@ -53,8 +59,15 @@ class Ros1Wheels:
         """Wheels: the nodes that listen."""
         return frozenset(self._publication.subscribers)
 
+    @property
+    def others(self) -> Others:
+        """Who else publishes the topic; the gate's own looks for that."""
+        return self._watch.others if self._watch is not None else NOBODY
+
     def close(self) -> None:
         """Leave the graph."""
+        if self._watch is not None:
+            self._watch.close()
         self._node.close()
 
 

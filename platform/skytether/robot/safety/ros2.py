@@ -11,6 +11,7 @@ from functools import partial
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
+from skytether.robot.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
 from skytether.ros.ros2.node import Ros2Error, Ros2Node
@@ -37,6 +38,10 @@ class Ros2Wheels:
         self._node = _start(way, role)
         self._topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type))
+        self._watch = None
+        if role == "gate":
+            own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
+            self._watch = WheelsWatch(self._topic, own, self._publishers)
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
@@ -60,9 +65,19 @@ class Ros2Wheels:
         """Wheels: the nodes that listen."""
         return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))
 
+    @property
+    def others(self) -> Others:
+        """Who else publishes the topic; the gate's own looks for that."""
+        return self._watch.others if self._watch is not None else NOBODY
+
     def close(self) -> None:
         """Leave the graph."""
+        if self._watch is not None:
+            self._watch.close()
         self._node.close()
+
+    def _publishers(self) -> list[str]:
+        return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]
 
 
 class Ros2Sensors:
