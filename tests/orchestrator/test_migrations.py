@@ -75,6 +75,7 @@ ROWS: dict[str, dict[str, Any]] = {
         "last_seen_at": NOW + 2,
     },
     "services": {"name": "toy", "manifest": MANIFEST},
+    "stops": {"robot": "walker", "id": "s1", "at": NOW, "reason": "smoke", "by": "operator:x", "acknowledged_at": None},
     "sites": {
         "name": "lab",
         "tier": "edge",

@@ -86,8 +86,8 @@ def test_with_no_other_site_nothing_is_started(served: Any) -> None:
 
 def test_what_has_no_site_yet_is_not_moved(served: Any, manifest: Any) -> None:
     served.running = lambda i: served.operator.get_instance(i).state is State.RUNNING
-    served.site("only")
-    put(served, manifest, cpu=40)  # of 64
+    served.site("only", cpu=12)
+    put(served, manifest, cpu=8)
     ask(served)
     waiting = served.operator.create_instance(InstanceCreate(robot="walker", service="toy"))
     with pytest.raises(ApiError, match=r"has no site yet \(.+\): move it once it runs") as caught:
