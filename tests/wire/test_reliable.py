@@ -156,7 +156,7 @@ def parcel(shards=250, size=300):
     shape = shape_for(shards * size, size)
     sealed = memoryview(bytes(range(250)) * (shards * size // 250))
     common = push_common(16, 1, 2, 99, 3, shape.length)
-    return Parcel(99, common, sealed, shape, lambda parcel, now: None), shape, sealed
+    return Parcel(99, common, sealed, shape, lambda rows: None, lambda parcel, now: None), shape, sealed
 
 
 def take_all(parcel, now):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from .crypto import Ciphers
+from .ciphers import Ciphers
 from .measure import Inbound, Outbound, SequenceTracker
-from .replay import ReplayWindow
+from .replay import PacketWindow, ReplayWindow
 from .topic import Direction, PathUse, Topic
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class ReceiveTopic:
 class Epoch:
     """The state that a handshake begins and the next one ends."""
 
-    __slots__ = ("ciphers", "id", "life", "next_number", "receive", "replay", "send", "topics")
+    __slots__ = ("_packets", "ciphers", "id", "life", "next_number", "receive", "replay", "send", "topics")
 
     def __init__(
         self,
@@ -136,13 +136,21 @@ class Epoch:
         life: bytes,
     ) -> None:
         self.id = epoch_id
-        """One byte that tells its packets from those of the epochs before and after."""
+        """One byte that tells it from those before and after."""
         self.ciphers = ciphers
         self.next_number = 0
         """Of the next message sealed, whatever its topic: the nonce."""
         self.replay = ReplayWindow()
+        self._packets: dict[int, PacketWindow] = {}
         self.topics = topics
         self.life = life
         """The peer's (see `handshake`)."""
         self.send = {t.name: t for t in send}
         self.receive = {t.index: t for t in receive}
+
+    def packets(self, path: int) -> PacketWindow:
+        """Packet numbers that arrived by that path; to be asked about authentic packets only."""
+        window = self._packets.get(path)
+        if window is None:
+            window = self._packets[path] = PacketWindow()
+        return window

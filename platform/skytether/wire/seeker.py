@@ -6,7 +6,7 @@ import math
 from collections.abc import Hashable, Sequence
 
 from .config import Config
-from .crypto import Ciphers
+from .ciphers import Ciphers
 from .handshake import LIFE_SIZE, NO_KEYS, Entropy, Hello
 from .topic import Topic
 

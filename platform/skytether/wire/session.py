@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Sequence
 
 from . import control
+from .ciphers import HandshakeTags
 from .compression import Compressed, compress
 from .config import Config
 from .control import Forward, Goodbye, Ping, Report
@@ -74,20 +75,22 @@ class Session:
         self._events: deque[Event] = deque()
         self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, now)
         self._peer: Hashable | None = None
-        self._sender = Sender(session_id, self._config, self._paths.choice.active)
+        self._sender = Sender(self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
         self._delivery = Delivery(self._config.max_message, self._events, self._rejected)
+        service = role is Role.SERVICE
+        hello_tags, welcome_tags = HandshakeTags(key, b"hello"), HandshakeTags(key, b"welcome")
         self._receiver = Receiver(
-            session_id, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
+            session_id if service else None, hello_tags if service else welcome_tags, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
             self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._ledger = Ledger(role)
         self._streams = Streams(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
-        self._door = Doorkeeper(session_id, key, self._table, entropy) if role is Role.SERVICE else None
+        self._door = Doorkeeper(key, self._table, entropy) if service else None
         self._seeker = Seeker(session_id, key, topics, self._config, entropy)
         self._greeter = Greeter(
-            self._door, self._seeker, self._paths, self._sender, self._ledger, self._events, self._rejected,
-            self._on_welcomed,
+            self._door, self._seeker, self._paths, self._sender, self._ledger,
+            welcome_tags if service else hello_tags, self._events, self._rejected, self._on_welcomed,
         )  # fmt: skip
 
         self._epoch: Epoch | None = None
@@ -305,13 +308,13 @@ class Session:
         if times is not None:
             self._delivery.clock.exchange(*times, now)
 
-    def _find_epoch(self, epoch_id: int) -> Epoch | None:
+    def _find_epoch(self, packet_id: int) -> Epoch | None:
         epoch = self._epoch
-        if epoch is not None and epoch.id == epoch_id:
+        if epoch is not None and epoch.ciphers.packet_id == packet_id:
             return epoch
-        if self._previous is not None and self._previous.id == epoch_id:
+        if self._previous is not None and self._previous.ciphers.packet_id == packet_id:
             return self._previous
-        return self._door.pending(epoch_id) if self._door is not None else None
+        return self._door.pending(packet_id) if self._door is not None else None
 
     def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
