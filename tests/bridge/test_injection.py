@@ -70,7 +70,10 @@ KINDS = {
     "unknown type": (lambda seen, spec: [changed(p, 0, 0x2F) for p in data_of(seen)], "type"),
     "other session": (lambda seen, spec: [changed(p, 8, p[8] ^ 8) for p in data_of(seen)], "session"),
     "other keys": (lambda seen, spec: [changed(p, 9, p[9] ^ 0x55) for p in data_of(seen)], "forged"),
-    "session's own id": (lambda seen, spec: [p[:1] + SESSION_ID.to_bytes(8, "big") + p[9:] for p in data_of(seen)], "session"),
+    "session's own id": (
+        lambda seen, spec: [p[:1] + SESSION_ID.to_bytes(8, "big") + p[9:] for p in data_of(seen)],
+        "session",
+    ),
     "replayed": (lambda seen, spec: data_of(seen), "repeated"),
     "cut to nothing": (lambda seen, spec: [p[: packet.HEADER_SIZE] for p in seen], "short"),
     "forged": (lambda seen, spec: [forged(p) for p in data_of(seen)], "forged"),

@@ -15,8 +15,8 @@ ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 SESSION_ID = 0x1122334455667788
 REASONS = {
     "short", "version", "session", "type", "epoch", "path", "topic", "shape", "too_large", "implausible", "old",
-    "forged", "repeated", "evicted", "unasked", "control", "compressed", "hello_forged", "hello_replayed", "hello_malformed",
-    "welcome_forged",
+    "forged", "repeated", "evicted", "unasked", "control", "compressed", "hello_forged", "hello_replayed",
+    "hello_malformed", "welcome_forged",
 }  # fmt: skip
 """Bounded, for metrics."""
 

@@ -37,7 +37,10 @@ def test_round_trip(kind, session_id, epoch, number, topic, length, block, index
 
 def test_an_array_of_packets_has_the_same_fields():
     common = [packet.push_common(packet.SHARD, 2**64 - 1, 7, 2**40 + i, 9, 2400) for i in (1, 1, 2)]
-    rows = [c + packet.push_shard(3, i, 4, 2**31 + i, 2**15 + i) + b"tag " * 2 + bytes((i,)) * 100 for i, c in enumerate(common)]
+    rows = [
+        c + packet.push_shard(3, i, 4, 2**31 + i, 2**15 + i) + b"tag " * 2 + bytes((i,)) * 100
+        for i, c in enumerate(common)
+    ]
     packets = packet.pull_packets(b"".join(rows), 3, 140)
     assert packets["keys"][0].tobytes() == packet.KEYS.pack(packet.SHARD, 2**64 - 1, 7)
     assert [b.tobytes() for b in packets["block"]] == [row[: packet.BLOCK.size] for row in rows]

@@ -21,7 +21,9 @@ def all_but_rejected(link, role):
     """Everything that an end counts and knows, but what it refused."""
     session = link.sessions[role]
     path = session._paths.get(0)
-    counters = [(t.delivered, t.lost, t.late, t.superseded, t.expired, t.duplicate) for t in _topics(session, link, role)]
+    counters = [
+        (t.delivered, t.lost, t.late, t.superseded, t.expired, t.duplicate) for t in _topics(session, link, role)
+    ]
     losses, delays = path.losses, path.delays
     return (
         counters, path.address, len(path.claims), path.packets_received, path.bytes_received, path.newest,

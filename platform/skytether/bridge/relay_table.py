@@ -1,10 +1,10 @@
 """What a relay forwards, and where to (rule 9): pure, with time as an argument. The sockets are in `relay`.
 
 A relay holds no key and opens no packet. Of a HELLO it reads the session id and looks for the route of that id: where
-the service's end (or the next relay) is. All other packets have an id that changes with each handshake; to which session
-that belongs, the relay learns from the target, whose WELCOME has it first. Every address on the robot's side has a *leg*, a
-port of its own towards that target, as behind a NAT. So the two ends themselves decide who is who: the service's
-end answers to the leg from which authentic packets come, and whoever else has seen the id gets nothing.
+the service's end (or the next relay) is. All other packets have an id that changes with each handshake. To which
+session that belongs, the relay learns from the target, whose WELCOME has it first. Every address on the robot's side
+has a *leg*, a port of its own towards that target, as behind a NAT. So the two ends themselves decide who is who: the
+service's end answers to the leg from which authentic packets come, and whoever else has seen the id gets nothing.
 
 A leg begins as a newcomer. Newcomers of a route are few and share a budget of their own, so that no flood of
 them touches a session that runs. What goes back to one is bounded by what came from it, until it speaks again after

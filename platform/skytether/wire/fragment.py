@@ -1,9 +1,9 @@
 """A sealed message as equal shards in blocks, with parity: what the sender cuts and the receiver reassembles.
 
 A message of ``length`` bytes in shards of ``size`` bytes (a multiple of 4, for the tags) has ``ceil(length / size)``
-data shards, in as few blocks of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from two numbers. Parity is
-systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row only, so the receiver
-need not know how many parity shards there are.
+data shards, in as few blocks of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from
+two numbers. Parity is systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row
+only, so the receiver need not know how many parity shards there are.
 """
 
 from __future__ import annotations
@@ -117,7 +117,18 @@ def _order(count: int, parity: int) -> Bytes:
 class Shards:
     """One sealed message on its way out. Packets are made as they are sent, parity when it is needed."""
 
-    __slots__ = ("_common", "_data", "_parity", "_sent", "_shape", "_tagger", "_tails", "length", "packet_size", "remaining")
+    __slots__ = (
+        "_common",
+        "_data",
+        "_parity",
+        "_sent",
+        "_shape",
+        "_tagger",
+        "_tails",
+        "length",
+        "packet_size",
+        "remaining",
+    )
 
     def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int, tagger: Tagger) -> None:
         """Take a sealed message.
@@ -172,7 +183,9 @@ class Shards:
         """All of the message once more, in shards of at most ``room`` bytes: of the same size if they fit."""
         shape = self._shape if self._shape.size <= room else shape_for(self._shape.length, room)
         parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
-        return shards_of(self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity, self._tagger)
+        return shards_of(
+            self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity, self._tagger
+        )
 
     def pick(self, positions: Positions, path: int, first_number: int, time: int) -> memoryview:
         """Packets of any data shards, by their positions in the message, as `take` returns them."""

@@ -25,7 +25,6 @@ from .packet import (
     HEADER_SIZE,
     HELLO,
     KEYS,
-    PATH_AT,
     SHARD,
     SHARD_AT,
     VERSION,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 
-from .config import Config
 from .ciphers import Ciphers
+from .config import Config
 from .handshake import LIFE_SIZE, NO_KEYS, Entropy, Hello
 from .topic import Topic
 

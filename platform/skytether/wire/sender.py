@@ -338,9 +338,7 @@ class Sender:
         return size
 
     @staticmethod
-    def _send_packet(
-        topic: SendTopic, content: Message | LoneShard, path: Path, batches: Batches, now: float
-    ) -> int:
+    def _send_packet(topic: SendTopic, content: Message | LoneShard, path: Path, batches: Batches, now: float) -> int:
         packet = content.packet(path.id, path.number(), ticks(now))
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)

@@ -81,7 +81,8 @@ class Session:
         service = role is Role.SERVICE
         hello_tags, welcome_tags = HandshakeTags(key, b"hello"), HandshakeTags(key, b"welcome")
         self._receiver = Receiver(
-            session_id if service else None, hello_tags if service else welcome_tags, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
+            session_id if service else None, hello_tags if service else welcome_tags, self._config, self._paths.get,
+            self._find_epoch, self._on_message, self._on_handshake,
             self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._ledger = Ledger(role)
