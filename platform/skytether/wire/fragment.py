@@ -123,11 +123,11 @@ class Shards:
         "_parity",
         "_sent",
         "_shape",
-        "_tagger",
         "_tails",
         "length",
         "packet_size",
         "remaining",
+        "tagger",
     )
 
     def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int, tagger: Tagger) -> None:
@@ -143,7 +143,7 @@ class Shards:
         self._common = np.frombuffer(common, np.uint8)
         self._data: Bytes = np.frombuffer(sealed, np.uint8).reshape(shape.shards, shape.size)
         self._shape = shape
-        self._tagger = tagger
+        self.tagger = tagger
         self._tails = _order(shape.shards, parity)
         self._parity: dict[tuple[int, int], bytes] = {}
         self._sent = 0
@@ -170,7 +170,7 @@ class Shards:
             rows[first - start :, SHARD_AT:] = np.frombuffer(parity, np.uint8).reshape(end - first, -1)
         self._sent = end
         self.remaining -= count
-        self._tagger(rows)
+        self.tagger(rows)
         return rows.reshape(-1).data
 
     def sent(self, count: int, now: float) -> None:
@@ -184,14 +184,14 @@ class Shards:
         shape = self._shape if self._shape.size <= room else shape_for(self._shape.length, room)
         parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
         return shards_of(
-            self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity, self._tagger
+            self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity, self.tagger
         )
 
     def pick(self, positions: Positions, path: int, first_number: int, time: int) -> memoryview:
         """Packets of any data shards, by their positions in the message, as `take` returns them."""
         rows = self._headers(self._tails[positions], path, first_number, time)
         rows[:, SHARD_AT:] = self._data[positions]
-        self._tagger(rows)
+        self.tagger(rows)
         return rows.reshape(-1).data
 
     def _headers(self, tails: Bytes, path: int, first_number: int, time: int) -> Bytes:

@@ -126,7 +126,7 @@ class Greeter:
         previous: Epoch | None,
         now: float,
     ) -> None:
-        held = NO_KEYS if epoch is None else epoch.ciphers.resume
+        held = NO_KEYS if epoch is None or epoch.spent else epoch.ciphers.resume
         taken = {e.id for e in (epoch, previous) if e is not None}
         answer = door.answer(common, message, held, taken, now)
         if isinstance(answer, str):

@@ -168,6 +168,8 @@ class Receiver:
             batch, numbers = batch[new], numbers[new]
             if not len(batch):
                 return True
+        epoch.heard_at = origin.now
+        epoch.bytes_received += len(batch) * segment
         known = self._find_path(by)
         if known is not None:
             known.comes(len(batch) * segment, len(batch), origin.now, origin.waited)
@@ -204,7 +206,8 @@ class Receiver:
         if not epoch.packets(path).accept(packet):
             self.rejected["repeated"] += 1
             return
-        now = origin.now
+        epoch.heard_at = now = origin.now
+        epoch.bytes_received += size
         known = self._find_path(path)
         if known is not None:
             known.comes(size, 1, now, origin.waited)

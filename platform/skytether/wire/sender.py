@@ -95,6 +95,10 @@ class Sender:
         self.epoch = epoch
         self._control = _control()
 
+    def change_keys(self, epoch: Epoch) -> None:
+        """Seal with other keys from now on; what was sealed before is sent as it is."""
+        self.epoch = epoch
+
     def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
         self._active.queue.put(topic, payload, published_at, extra)
@@ -131,7 +135,7 @@ class Sender:
     def _packet(self, message: bytes, path: Path, now: float) -> bytes | None:
         """Seal a control message of one packet; None if there are no keys."""
         epoch, topic = self.epoch, self._control
-        if epoch is None:
+        if epoch is None or epoch.spent:
             return None
         packet = self._next(epoch, topic, message, now).packet(path.id, path.number(), ticks(now))
         topic.counters.bytes_sent += len(packet)
@@ -146,6 +150,8 @@ class Sender:
     def next_timer(self, full: Container[int] = ()) -> float:
         """When `transmit` will have something to send by paths not ``full``; 0 for at once, inf for never."""
         due = math.inf
+        if self.epoch is not None and self.epoch.spent:
+            return due
         for lane in self._lanes.values():
             path = lane.path
             if path.address is not None and path.id not in full:
@@ -155,7 +161,7 @@ class Sender:
     def transmit(self, path: Path, now: float) -> list[Transmit]:
         """What may be sent now, at most a burst."""
         epoch, address = self.epoch, path.address
-        if epoch is None or address is None:
+        if epoch is None or address is None or epoch.spent:
             return []
         lane = self._lane(path)
         queue, flights, copies = lane.queue, lane.flights, lane.copies
@@ -172,6 +178,7 @@ class Sender:
             batches.add(packet)
             left -= len(packet)
             path.bytes_sent += len(packet)
+            epoch.bytes_sent += len(packet)
             pacer.spend(len(packet))
         lane.urgent.clear()
         while (priority := queue.priority) >= 0 or flights:
@@ -218,6 +225,7 @@ class Sender:
                     continue
             left -= sent
             path.bytes_sent += sent
+            epoch.bytes_sent += sent
             pacer.spend(sent)
         batches.flush()
         return batches.done
@@ -265,7 +273,9 @@ class Sender:
             return 0
         parcel = letter.parcel
         if parcel is not None and (
-            parcel.number + NUMBER_SPAN < epoch.next_number or parcel.packet_size > lane.shard_room + SHARD_AT
+            parcel.number + NUMBER_SPAN < epoch.next_number
+            or parcel.packet_size > lane.shard_room + SHARD_AT
+            or (parcel.tagger is not epoch.ciphers.tagger and not parcel.flying)
         ):
             parcel.cancel()
             parcel = letter.parcel = None

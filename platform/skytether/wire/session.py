@@ -104,6 +104,7 @@ class Session:
         self._last_heard = math.nan
         self._sweep_at = math.inf
         self._report_at = math.inf
+        self._rekey_at = math.inf
         self._check_at = math.inf
 
     # --- what the application calls
@@ -276,7 +277,7 @@ class Session:
             return None
         due = min(
             self._sender.next_timer(full), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
-            self._check_at, self._streams.due,
+            self._check_at, self._rekey_at, self._streams.due,
         )  # fmt: skip
         return due if due < math.inf else None
 
@@ -286,6 +287,9 @@ class Session:
             return
         if now >= self._check_at:
             self._check(now)
+        if now >= self._rekey_at:
+            self._rekey_at = math.inf
+            self._seeker.rekey(now)
         if now >= self._seeker.due:
             self._greeter.seek(self._epoch, self._last_heard, now)
         self._paths.handle_timer(now, now - self._last_heard, self._connected)
@@ -298,6 +302,8 @@ class Session:
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
+            if self._door is None and self._epoch is not None and self._epoch.volume >= self._config.rekey_bytes:
+                self._seeker.rekey(now)
 
     # --- keys
 
@@ -319,21 +325,31 @@ class Session:
 
     def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
+        before = self._epoch
+        goes_on = before is not None and epoch.take_over(before)
         self._drop_previous()
-        if self._epoch is not None:
-            self._previous, self._previous_until = self._epoch, now + self._config.old_keys
+        if before is not None:
+            self._previous, self._previous_until = before, now + self._config.old_keys
         self._epoch = epoch
+        self._handshakes += 1
+        self._greeter.done()
+        self._last_heard = now
+        self._rekey_at = now + self._config.rekey_after if self._door is None else math.inf
+        self._seeker.found(now, epoch.id)
+        if goes_on:
+            self._sender.change_keys(epoch)
+            self._delivery.change_keys(epoch)
+            self._check_at = min(self._check_at, self._previous_until)
+            if not self._connected:
+                self._connect(epoch.topics, now)
+            return
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
         restarted = self._streams.start_epoch(epoch, now)
         self._delivery.start_epoch(epoch)
         self._paths.start_epoch(now)
-        self._handshakes += 1
-        self._greeter.done()
-        self._last_heard = now
         self._sweep_at = now + self._config.keepalive
         self._report_at = now + self._config.report_interval
-        self._seeker.found(now, epoch.id)
         self._connect(epoch.topics, now, restarted)
 
     def _end_epoch(self, now: float) -> None:
@@ -344,7 +360,7 @@ class Session:
         self._delivery.end_epoch()
         self._streams.start_epoch(None, now)
         self._paths.end_epoch()
-        self._sweep_at = self._report_at = math.inf
+        self._sweep_at = self._report_at = self._rekey_at = math.inf
         if self._door is None:
             self._seeker.rest(now + self._config.hello_retry)
         if self._connected:
@@ -352,8 +368,9 @@ class Session:
 
     def _drop_previous(self) -> None:
         if self._previous is not None:
-            for receiver in self._previous.receive.values():
-                receiver.settle(math.inf)
+            if not self._previous.belongs_with(self._epoch):
+                for receiver in self._previous.receive.values():
+                    receiver.settle(math.inf)
             self._previous = None
 
     # --- connection
@@ -378,10 +395,11 @@ class Session:
             else:
                 self._check_at = silent_at
         if self._previous is not None:
-            if now >= self._previous_until:
+            until = max(self._previous_until, self._previous.heard_at + self._config.old_keys)
+            if now >= until:  # a large message that was on its way is there, or will never be
                 self._drop_previous()
             else:
-                self._check_at = min(self._check_at, self._previous_until)
+                self._check_at = min(self._check_at, until)
 
     # --- messages
 
@@ -405,7 +423,7 @@ class Session:
                 self._paths.heard(came_by, number, address, size, now, proven=address == asked_from)
             if not self._connected:
                 self._connect(epoch.topics, now)
-            if self._seeker.hello is not None:
+            if self._seeker.hello is not None and not self._seeker.rekeying:
                 self._seeker.found(now, epoch.id)
         sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
@@ -425,7 +443,7 @@ class Session:
         message = control.pull_control(data)
         if message is None:
             self._rejected["control"] += 1
-        elif epoch is not self._epoch:
+        elif not epoch.belongs_with(self._epoch):
             return
         elif isinstance(message, Ping):
             if path is not None and path.id == message.path:
