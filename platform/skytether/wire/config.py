@@ -11,8 +11,8 @@ MAX_MTU = 65_507
 """Largest UDP payload over IPv4."""
 MAX_COPIES = 100
 MAX_REKEY_BYTES = 2**36
-"""64 GiB are 2**32 blocks of AES under one key: they can be told from random ones with a chance of 2**-65 (n**2 / 2**129).
-No packet has less than 60 bytes, so these are fewer than 2**31, and packet numbers of 32 bits do not repeat."""
+"""64 GiB are 2**32 blocks of AES under one key: they can be told from random ones with a chance of 2**-65 (of n blocks
+n**2 / 2**129). No packet has less than 60 bytes, so they are fewer than 2**31, and numbers of 32 bits do not repeat."""
 _POSITIVE = (
     "rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence", "hello_retry",
     "hello_retry_max", "rekey_after",
