@@ -6,7 +6,7 @@ import pytest
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Disconnected, Role, Topic, packet
-from skytether.wire.epoch import MAX_BYTES
+from skytether.wire.epoch import MAX_BYTES, Epoch
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 LINK = {"up": LinkConditions(delay=0.03), "down": LinkConditions(delay=0.03)}
@@ -151,3 +151,13 @@ def test_nothing_is_sent_with_keys_that_are_used_up(world):
     assert len(link.sent[SERVICE]) == sent
     link.run(2.0)  # nobody hears it, so the robot asks, and new keys are made
     assert bytes(link.messages[ROBOT][-1][1].payload) == b"x"
+
+
+def test_a_copy_of_the_message_that_confirmed_new_keys_is_no_new_message(world):
+    before = world.link(**LINK).sessions[SERVICE]._epoch
+    after = Epoch(before.id + 1, before.ciphers, before.topics, [], [], before.life)
+    number = before.replay.highest + 3
+    assert after.replay.accept(number)
+    assert after.take_over(before)
+    assert not after.replay.accept(number)
+    assert after.replay.accept(number - 1)

@@ -196,5 +196,6 @@ class Epoch:
             return False
         self.send, self.receive = before.send, before.receive
         self.next_number = before.next_number
-        self.replay.highest = before.replay.highest
+        # What confirmed these keys was accepted just now: going back would take its copies for new ones.
+        self.replay.highest = max(self.replay.highest, before.replay.highest)
         return True

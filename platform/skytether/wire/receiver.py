@@ -25,6 +25,7 @@ from .packet import (
     HEADER_SIZE,
     HELLO,
     KEYS,
+    PATH_AT,
     SHARD,
     SHARD_AT,
     VERSION,
@@ -146,8 +147,10 @@ class Receiver:
         if epoch is None:
             return False
         batch = pull_packets(data, whole, segment)
-        keys, paths = batch["keys"], batch["path"]
-        if (keys != keys[0]).any() or (paths != paths[0]).any():
+        paths = data[PATH_AT : whole * segment : segment].tobytes()
+        block = batch["block"]
+        change = np.flatnonzero(block[1:] != block[:-1]) + 1
+        if paths.count(paths[0]) < whole or (len(change) and (batch["keys"][change] != batch["keys"][0]).any()):
             return False
         good = epoch.ciphers.check(data, whole, segment)
         if good is None:
@@ -157,13 +160,13 @@ class Receiver:
             batch = batch[good]
             if not len(batch):
                 return True
-        by = int(paths[0])
+        by = paths[0]
         if origin.path not in (None, by):
             self.rejected["path"] += len(batch)
             return True
         numbers = batch["number"].astype(np.uint32)
         new = epoch.packets(by).accept_all(numbers)
-        if not new.all():
+        if new is not None:
             self.rejected["repeated"] += len(batch) - int(np.count_nonzero(new))
             batch, numbers = batch[new], numbers[new]
             if not len(batch):
@@ -174,8 +177,9 @@ class Receiver:
         if known is not None:
             known.comes(len(batch) * segment, len(batch), origin.now, origin.waited)
             known.arrived_all(numbers.tobytes(), batch["time"].astype(np.uint16).tobytes(), segment)
-        block = batch["block"]
-        change = np.flatnonzero(block[1:] != block[:-1]) + 1
+        if len(batch) < whole:
+            block = batch["block"]
+            change = np.flatnonzero(block[1:] != block[:-1]) + 1
         for start, end in pairwise((0, *change.tolist(), len(batch))):
             self._run(epoch, batch[start:end], segment - SHARD_AT, by, origin)
         return True

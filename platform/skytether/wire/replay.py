@@ -76,10 +76,14 @@ class PacketWindow(ReplayWindow):
     __slots__ = ()
 
     def accept(self, number: int) -> bool:
+        if number == (self.highest + 1) % self.NUMBERS:  # as nearly always
+            self.highest += 1
+            self._ring[self.highest % self.SIZE] = 1
+            return True
         return super().accept(self._whole(number))
 
-    def accept_all(self, numbers: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
-        """The same for several, in the order in which they came; which of them were new."""
+    def accept_all(self, numbers: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_] | None:
+        """The same for several, in the order in which they came; which of them were new, None for all."""
         first, count, size = self._whole(int(numbers[0])), len(numbers), self.SIZE
         start = first % size
         if first > self.highest and start + count <= size:
@@ -88,8 +92,9 @@ class PacketWindow(ReplayWindow):
                 super().accept(first)
                 self._ring[start : start + count] = b"\1" * count
                 self.highest = first + count - 1
-                return np.ones(count, bool)
-        return np.array([self.accept(number) for number in numbers.tolist()])
+                return None
+        new = np.array([self.accept(number) for number in numbers.tolist()])
+        return None if new.all() else new
 
     def _whole(self, number: int) -> int:
         """With the bits that packets do not carry."""

@@ -31,9 +31,10 @@ NONCE_WORDS = slice(6, 8)
 """Bytes 24 to 32 of the header, as words."""
 TAG_WORDS = slice(HEADER_SIZE // 4, (HEADER_SIZE + TAG_SIZE) // 4)
 SECRET_SIZE = 2 * KEY_SIZE
+_WORD = np.dtype("<u4")
 _FIRST = 352
 """Words for which there are keys from the beginning: a packet of 1,400 bytes."""
-_CHUNK = 32
+_CHUNK = 64
 """Packets handled at a time."""
 _SIZES = 256
 """Sizes of packets remembered: more than are in use."""
@@ -73,9 +74,9 @@ class Tags:
 
     def check_one(self, data: memoryview | bytes) -> bool:
         """The same for one packet."""
-        words = np.frombuffer(data, "<u4")
+        words = np.frombuffer(data, _WORD)
         keys, _, constant = self._sized.get(len(words)) or self._prepare(len(words))
-        first, second = (words.astype(np.uint64) @ keys).tolist()
+        first, second = keys.dot(words).tolist()
         upper = (first + constant[0] & _MASK) >> 32, (second + constant[1] & _MASK) >> 32
         nonce, rest, tag = _NONCE_AND_TAG.unpack_from(data, 4 * NONCE_WORDS.start)
         block = _BLOCK.pack(nonce, upper[0], rest, upper[1])
@@ -90,25 +91,25 @@ class Tags:
             rows = words[start : start + _CHUNK]
             wide = self._scratch[: rows.size].reshape(rows.shape)
             wide[...] = rows
-            np.matmul(wide, keys, out=hashes[start : start + _CHUNK])
+            np.einsum("ij,kj->ik", wide, keys, out=hashes[start : start + _CHUNK])
         hashes += constant
         hashes.view("<u4")[:, ::2] = words[:, NONCE_WORDS]  # the lower halves do not count
         return hashes.tobytes()
 
     def _prepare(self, size: int) -> _Sized:
         """Keys for packets of so many words, which also depend on the size itself."""
-        if size > len(self._keys):
+        if size > self._keys.shape[1]:
             self._extend(size)
         elif len(self._sized) == _SIZES:
             self._sized.clear()
         constant = self._constant[0] + self._constant[1] * np.uint64(size)
-        made = self._sized[size] = self._keys[:size], constant, tuple(constant.tolist())
+        made = self._sized[size] = self._keys[:, :size], constant, tuple(constant.tolist())
         return made
 
     def _extend(self, size: int) -> None:
         stream = np.frombuffer(key_stream(self._secret, 16 * (size + 2)), "<u8").astype(np.uint64).reshape(-1, 2)
-        self._constant, self._keys = stream[:2], stream[2:].copy()
-        self._keys[TAG_WORDS] = 0  # a packet's own tag does not count
+        self._constant, self._keys = stream[:2], np.ascontiguousarray(stream[2:].T)
+        self._keys[:, TAG_WORDS] = 0  # a packet's own tag does not count
         self._scratch = np.empty(_CHUNK * size, np.uint64)
         self._sized: dict[int, _Sized] = {}
         """By words of a packet."""
