@@ -34,8 +34,8 @@ SECRET_SIZE = 2 * KEY_SIZE
 _WORD = np.dtype("<u4")
 _FIRST = 352
 """Words for which there are keys from the beginning: a packet of 1,400 bytes."""
-_CHUNK = 64
-"""Packets handled at a time."""
+_CHUNK = 64 * _FIRST
+"""Words handled at a time: as a rule a whole batch, and no more memory for large packets that somebody makes up."""
 _SIZES = 256
 """Sizes of packets remembered: more than are in use."""
 _NONCE_AND_TAG = struct.Struct("4s4s8s")
@@ -87,11 +87,12 @@ class Tags:
         count, size = words.shape
         keys, constant, _ = self._sized.get(size) or self._prepare(size)
         hashes = np.empty((count, 2), np.uint64)
-        for start in range(0, count, _CHUNK):
-            rows = words[start : start + _CHUNK]
+        step = len(self._scratch) // size
+        for start in range(0, count, step):
+            rows = words[start : start + step]
             wide = self._scratch[: rows.size].reshape(rows.shape)
             wide[...] = rows
-            np.einsum("ij,kj->ik", wide, keys, out=hashes[start : start + _CHUNK])
+            np.einsum("ij,kj->ik", wide, keys, out=hashes[start : start + step])
         hashes += constant
         hashes.view("<u4")[:, ::2] = words[:, NONCE_WORDS]  # the lower halves do not count
         return hashes.tobytes()
@@ -110,6 +111,6 @@ class Tags:
         stream = np.frombuffer(key_stream(self._secret, 16 * (size + 2)), "<u8").astype(np.uint64).reshape(-1, 2)
         self._constant, self._keys = stream[:2], np.ascontiguousarray(stream[2:].T)
         self._keys[:, TAG_WORDS] = 0  # a packet's own tag does not count
-        self._scratch = np.empty(_CHUNK * size, np.uint64)
+        self._scratch = np.empty(max(_CHUNK, size), np.uint64)
         self._sized: dict[int, _Sized] = {}
         """By words of a packet."""
