@@ -311,26 +311,28 @@ def test_a_state_folder_that_is_a_file_and_secrets_for_all_and_a_broken_database
     assert (status, line) == (1, f"error: cannot make {blocked.folder}: File exists; give another --state-dir")
 
     open_to_all = programs(name="open")
-    open_to_all.folder.mkdir()
+    open_to_all.folder.mkdir(mode=0o700)
     (open_to_all.folder / "secret.key").write_bytes(b"x" * 32)
     (open_to_all.folder / "secret.key").chmod(0o644)
     key = open_to_all.folder / "secret.key"
     assert open_to_all.fails() == (1, f"error: {key} can be read by others: chmod 600 {key}")
 
     broken = programs(name="broken")
-    broken.folder.mkdir()
+    broken.folder.mkdir(mode=0o700)
     (broken.folder / "state.db").write_bytes(b"no database" * 100)
+    (broken.folder / "state.db").chmod(0o600)
     advice = "restore a backup (`skytether orchestrator restore`), or give another --state-dir"
     assert broken.fails() == (1, f"error: {broken.folder / 'state.db'} is no database: {advice}")
 
 
 def test_an_older_orchestrator_over_a_newer_schema_is_one_sentence(programs: Any) -> None:
     older = programs()
-    older.folder.mkdir()
+    older.folder.mkdir(mode=0o700)
     with closing(sqlite3.connect(older.folder / "state.db")) as database:
         database.executescript(
             "CREATE TABLE alembic_version (version_num VARCHAR(32)); INSERT INTO alembic_version VALUES ('9999')"
         )
+    (older.folder / "state.db").chmod(0o600)
     assert older.fails() == (1, f"error: {OutdatedError()}")
 
 
