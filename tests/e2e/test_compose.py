@@ -23,7 +23,7 @@ from docker_site import DockerSite, Images
 
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
-from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, TopicReport
+from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, SiteCreate, TopicReport
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.compose]
 
@@ -194,6 +194,7 @@ def report(n: int) -> Report:
         load=0.3,
         battery=0.8,
         overruns=n,
+        gate=GateReport(answers=True, stopped="somebody fell", troubles=1),
     )
 
 

@@ -167,7 +167,7 @@ def test_a_site_without_its_guard_says_so_and_starts_what_waits_when_it_is_there
     house.needs_device("/dev/null")
     instance = house.ask()
     house.until(instance, State.PENDING, lambda record: "late: the network of the instances cannot" in record.reason)
-    assert "`make images` builds it" in site.runtime.blocked()
+    assert "build it (`make images`)" in site.runtime.blocked()
     assert not site.unreachable
     docker("tag", guard, late)
     try:

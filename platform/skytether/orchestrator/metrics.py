@@ -209,7 +209,8 @@ def _of_quotas(quotas: Quotas, running: Iterable[Running]) -> Iterator[Family]:
     for key, most in quotas.limits().items():
         limits.put((key,), most)
     streams.put((), quotas.open_streams)
-    refused = [((key,), n) for key, n in dict(quotas.refused).items()]
+    # From 0 on: the first refusal is an increase, too.
+    refused = [((key,), n) for key, n in (dict.fromkeys(quotas.limits(), 0) | dict(quotas.refused)).items()]
     yield gauge("robot_instances", "Instances that have not ended", ("robot",), count)
     yield gauge("robot_promised_cpu_cores", "Processors that they asked for", ("robot",), cpu)
     yield gauge("robot_promised_memory_bytes", "Memory that they asked for", ("robot",), memory)
