@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skytether.control.admittance import STANDSTILL, Velocity
@@ -57,12 +57,13 @@ def seen(**more):
     return Snapshot(**(usual | {"troubles": (), "asked": asked} | more))
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(PLACES, ASKED)
+@example(place(), Asked(Velocity(1e-6, 0.0), NOTHING, STEADY, Zone.CLEAR))
 def test_the_robot_is_held_up_by_what_is_drawn_in_its_way_and_by_nothing_else(there, asked):
     allowed = there.zones.allow(asked.velocity, asked.points, asked.varied, asked.before)
     drawn = picture(there, asked, STANDSTILL)
-    if there.zones.speed(asked.velocity) < 1e-6:
+    if there.zones.speed(asked.velocity) <= 1e-6:
         assert drawn.slow is None
         return
     held_up = allowed.share < 1 or allowed.zone is not Zone.CLEAR
@@ -75,11 +76,11 @@ def test_the_robot_is_held_up_by_what_is_drawn_in_its_way_and_by_nothing_else(th
     assert (free.share, free.zone) == (1.0, Zone.CLEAR)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(PLACES, VELOCITIES, st.floats(0, 1))
 def test_the_stopping_way_ends_where_the_inequality_says(there, told, share):
     drawn = picture(there, Asked(STANDSTILL, NOTHING, STEADY, Zone.CLEAR), told)
-    if there.zones.speed(told) < 1e-6:
+    if there.zones.speed(told) <= 1e-6:
         assert drawn.stopping is None
         return
     # The outline at any time before the standstill is in it.
