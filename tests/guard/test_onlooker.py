@@ -1,11 +1,13 @@
 """A process that only shows: started, started anew, and never waited for."""
 
+import errno
 import os
 import sys
 import time
 
 import pytest
 
+from skytether.guard import child
 from skytether.guard.log import Log
 from skytether.guard.onlooker import Onlooker
 
@@ -71,6 +73,21 @@ def test_one_that_hangs_is_ended(look):
     until(onlooker, lambda: onlooker.trouble, 100.0, step=1.0)
     assert "did not start within" in onlooker.trouble
     until(onlooker, lambda: not onlooker._dead, 120.0)
+
+
+def test_without_a_descriptor_left_it_is_tried_again_later(look, monkeypatch):
+    def none_left(*_):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    onlooker = look(LIVES)
+    with monkeypatch.context() as patch:
+        patch.setattr(child.socket, "socketpair", none_left)
+        onlooker.turn(100.0)
+    assert onlooker.trouble == "the display cannot be started: Too many open files"
+    onlooker.turn(109.0)
+    assert onlooker._child is None
+    until(onlooker, lambda: not onlooker.trouble, 110.5)
+    assert onlooker._child is not None
 
 
 def test_without_a_command_there_is_none(tmp_path):

@@ -87,6 +87,11 @@ class Honest:
                 self.refused.append(str(error))
             time.sleep(every)
 
+    def was_in_time(self) -> None:
+        """Alone each takes milliseconds, under attack each took 7 s. A busy machine makes a single one wait."""
+        assert median(self.took) < 2.0
+        assert max(self.took) < 5.0
+
     def still_has_it(self) -> bool:
         return self.client.get_instance(self.instance).state is State.RUNNING
 
@@ -184,7 +189,7 @@ def test_who_says_nothing_more_costs_nobody_anything(program: Program, honest: H
         honest.renew_for(ATTACK)
         assert honest.refused == []
         assert honest.still_has_it()
-        assert median(honest.took) < 2.0  # alone a few milliseconds; a busy machine makes any single one wait
+        honest.was_in_time()
 
 
 def test_a_robots_own_slow_bodies_cost_only_itself(program: Program, honest: Honest, manifest: Any) -> None:
@@ -216,7 +221,7 @@ def test_names_that_a_robot_makes_up_cost_only_itself(
         honest.renew_for(2 * ATTACK)
     assert honest.refused == []
     assert honest.still_has_it()
-    assert median(honest.took) < 2.0
+    honest.was_in_time()
     assert memory().rss - before < 100 << 20
 
 
@@ -263,7 +268,7 @@ def test_instances_and_streams_that_a_robot_asks_for_starve_nobody(
         honest.renew_for(ATTACK)
     assert honest.refused == []
     assert honest.still_has_it()
-    assert median(honest.took) < 2.0
+    honest.was_in_time()
 
 
 def test_a_pattern_freezes_nobody(program: Program, honest: Honest, hostile: Hostile) -> None:
@@ -275,7 +280,7 @@ def test_a_pattern_freezes_nobody(program: Program, honest: Honest, hostile: Hos
     with hostile.again_and_again(4, "/api/v1/instances", lambda _: asked):
         honest.renew_for(ATTACK)
     assert honest.refused == []
-    assert median(honest.took) < 2.0
+    honest.was_in_time()
     assert set(hostile.statuses) <= {422, 429}
 
 

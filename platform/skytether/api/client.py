@@ -19,6 +19,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from .bounded import WHOLE, BoundedTransport, EndlessError
 from .manifest import Manifest
+from .printable import printable
 from .rest import (
     CHANGE,
     PATH_NAME,
@@ -569,7 +570,7 @@ def _parse(model: type[_Model], document: Any) -> _Model:
 def _problem(response: httpx.Response) -> Problem:
     try:
         problem = Problem.model_validate_json(response.content)
-        problem = problem.model_copy(update={"title": _plain(problem.title), "detail": _plain(problem.detail)})
+        problem = problem.model_copy(update={"title": _shown(problem.title), "detail": _shown(problem.detail)})
         if problem.status != 401:
             return problem
         # The orchestrator speaks of headers; who uses this client gave a token, or forgot to.
@@ -580,9 +581,9 @@ def _problem(response: httpx.Response) -> Problem:
         return Problem(title=response.reason_phrase, status=response.status_code, detail=detail)
 
 
-def _plain(text: str) -> str:
+def _shown(text: str) -> str:
     """What may be shown: no codes that a terminal obeys, and no more than somebody reads."""
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text[:_LONGEST])
+    return printable(text[:_LONGEST])
 
 
 def _strange(what: str) -> Problem:

@@ -14,6 +14,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from skytether.api.printable import printable
+
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
@@ -106,8 +108,7 @@ class _ConsoleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             # Some of it others wrote: a terminal obeys no code of theirs, and no second line looks like one of ours.
-            text = self.format(record).replace("\n", "\n    ")
-            text = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+            text = printable(self.format(record).replace("\n", "\n    "))
             console.print(f"[yellow]{record.levelname.lower()}:[/] {escape(text)}", soft_wrap=True)
         except Exception:
             self.handleError(record)

@@ -19,6 +19,10 @@ vars(subprocess)["_USE_VFORK"] = (
 )
 
 
+class StartError(Exception):
+    """Nothing can be started now; there may be a descriptor, or a thread, later. The text says what is missing."""
+
+
 class Child:
     """The process and the socket to it. It is started by a thread: a disk that hangs holds up nothing else.
 
@@ -30,7 +34,7 @@ class Child:
         inherited: Further file descriptors that it gets, whose numbers come after that.
 
     Raises:
-        OSError: There is no descriptor left for the socket to it.
+        StartError: There is no descriptor left for the socket to it, or no thread.
     """
 
     def __init__(
@@ -38,7 +42,10 @@ class Child:
     ) -> None:
         self.name = name
         self.heard_at: float | None = None
-        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        except OSError as error:
+            raise StartError(error.strerror) from error
         self.socket.setblocking(False)
         self.gone = False
         """It has closed its end."""
@@ -46,7 +53,13 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._failed = ""
         self._ended = False
-        threading.Thread(target=self._start, args=(tuple(command), theirs, (config, *inherited)), daemon=True).start()
+        files = (config, *inherited)
+        try:
+            threading.Thread(target=self._start, args=(tuple(command), theirs, files), daemon=True).start()
+        except (RuntimeError, MemoryError) as error:
+            self.socket.close()
+            theirs.close()
+            raise StartError(str(error) or "no memory") from error
 
     @property
     def pid(self) -> int:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 from . import board
 from .board import Board, Role
-from .child import Child
+from .child import Child, StartError
 from .claim import Claim, ClaimError
 from .clock import now as boottime
 from .enable import Enable, Power, WriterLine, open_line
@@ -295,9 +295,8 @@ class Guard:
             more = (self._estop.fileno(),) if name == "gate" and self._estop is not None else ()
             try:
                 return Child(name, command, self._settings.config, now, (self._board_file, *more))
-            except (OSError, RuntimeError, MemoryError) as error:  # no descriptor, no thread: there may be one later
-                sentence = f"the {name} cannot be started: {getattr(error, 'strerror', None) or error!r}"
-                self._trouble(f"start:{name}", "trouble", sentence, now)
+            except StartError as error:
+                self._trouble(f"start:{name}", "trouble", f"the {name} cannot be started: {error}", now)
                 return None
         why = child.ended(now)
         if not why:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .child import Child
+from .child import Child, StartError
 from .log import Log
 
 _LOOK_S = 0.5
@@ -43,7 +43,11 @@ class Onlooker:
         if self._child is None:
             if now >= self._start_at:
                 self._start_at = now + _AGAIN_S
-                self._child = Child(self._name, self._command, self._config, now)
+                try:
+                    self._child = Child(self._name, self._command, self._config, now)
+                except StartError as error:
+                    self.trouble = f"the {self._name} cannot be started: {error}"
+                    self._log.trouble(self._name, self.trouble, now)
             return
         self._hear(self._child, now)
         why = self._child.ended(now)

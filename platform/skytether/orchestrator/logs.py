@@ -14,6 +14,8 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from skytether.api.printable import printable
+
 from .audit import ChainFile, Journal, Sink
 from .settings import Logs, syslog_address
 from .throttle import Throttle
@@ -42,7 +44,7 @@ class TextFormatter(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 (logging's name)
         """The line, with control characters as escapes."""
-        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in super().formatMessage(record))
+        return printable(super().formatMessage(record), lines=False)
 
 
 class JsonFormatter(logging.Formatter):

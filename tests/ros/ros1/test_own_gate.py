@@ -109,7 +109,7 @@ def test_without_a_gate_the_last_velocity_of_a_killed_agent_is_the_last_word(wal
     agent.kill()
     agent.wait()
     time.sleep(3.0)
-    assert walker.speed == pytest.approx(0.2, abs=0.01)
+    assert walker.speed == pytest.approx(0.2, abs=1e-3)
     assert "there is no gate (safety: none)" in start.log.read_text()
 
 
