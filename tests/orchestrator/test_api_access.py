@@ -41,6 +41,7 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("DELETE", f"{API}/robots/tmp", None, (401, 401, 403, 403, 204)),
     ("POST", f"{API}/robots/walker/stop", {"reason": "fire"}, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/robots/stop", {"reason": "fire"}, (401, 401, 403, 403, 200)),
+    ("PUT", f"{API}/robots/walker/gate", {"answers": True}, (401, 401, 204, 403, 403)),
     ("GET", f"{API}/robots/walker/stop", None, (401, 401, 200, 403, 200)),
     ("POST", f"{API}/robots/walker/stop/0a/acknowledge", None, (401, 401, 404, 403, 403)),
     ("GET", f"{API}/tokens", None, (401, 401, 403, 403, 200)),

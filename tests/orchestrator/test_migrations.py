@@ -76,6 +76,7 @@ ROWS: dict[str, dict[str, Any]] = {
     },
     "services": {"name": "toy", "manifest": MANIFEST},
     "stops": {"robot": "walker", "id": "s1", "at": NOW, "reason": "smoke", "by": "operator:x", "acknowledged_at": None},
+    "gates": {"robot": "walker", "at": NOW, "report": {"answers": True, "troubles": 1}},
     "sites": {
         "name": "lab",
         "tier": "edge",

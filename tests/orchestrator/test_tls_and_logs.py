@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from orchestrator_program import Program, until, with_toy
 
 from skytether.api.client import ApiError, Client, Unreachable
-from skytether.api.rest import InstanceCreate, RobotCreate
+from skytether.api.rest import GateReport, InstanceCreate, RobotCreate
 from skytether.orchestrator.audit import verify
 from skytether.orchestrator.logs import TextFormatter
 
@@ -114,6 +114,9 @@ def test_the_log_is_json_and_the_audit_names_who_did_what(
     running = program(logs={"format": "json", "audit_file": str(file)}, proxies=["127.0.0.0/8"])
     with running.start() as operator:
         with_toy(operator, manifest)
+        operator.put_service("renew", manifest("renew"))
+        operator.put_service("renew", manifest("renew", params={}))
+        operator.delete_service("renew")
         token = operator.create_robot(RobotCreate(name="walker")).token
         url = (running.folder / "address").read_text().strip()
         with Client(url, token) as robot:
@@ -121,24 +124,28 @@ def test_the_log_is_json_and_the_audit_names_who_did_what(
             with pytest.raises(ApiError):
                 robot.delete_robot("walker")
             robot.renew_instance(made.id)
+            robot.report_gate("walker", GateReport())
             robot.instances()
             robot.delete_instance(made.id)
         with Client(url, "sky-wrong") as stranger, pytest.raises(ApiError):
             stranger.sites()
         # A proxy adds whom it has seen at the end; what stands before that may be made up.
         httpx.delete(f"{url}/api/v1/sites/local", headers={"X-Forwarded-For": "192.0.2.1, 198.51.100.9"})
-        until(lambda: len(file.read_text().splitlines()) == 5)
+        until(lambda: len(file.read_text().splitlines()) == 8)
         until(lambda: running.log.count("skytether.strangers") == 2)
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert [(line["who"], line["method"], line.get("made", line["path"]), line["status"]) for line in lines] == [
         ("operator", "PUT", "/api/v1/catalog/toy", 201),
+        ("operator", "PUT", "/api/v1/catalog/renew", 201),
+        ("operator", "PUT", "/api/v1/catalog/renew", 200),
+        ("operator", "DELETE", "/api/v1/catalog/renew", 204),
         ("operator", "POST", "/api/v1/robots/walker", 201),
         ("robot:walker", "POST", f"/api/v1/instances/{made.id}", 201),
         ("robot:walker", "DELETE", "/api/v1/robots/walker", 403),
         ("robot:walker", "DELETE", f"/api/v1/instances/{made.id}", 204),
     ]
-    assert verify(file).lines == 5
-    assert [line["address"] for line in lines] == ["127.0.0.1"] * 5
+    assert verify(file).lines == 8
+    assert [line["address"] for line in lines] == ["127.0.0.1"] * 8
     log = [json.loads(line) for line in running.log.splitlines()]
     strangers = [line for line in log if line["logger"] == "skytether.strangers"]
     assert [(line["who"], line["method"], line["path"], line["status"], line["address"]) for line in strangers] == [

@@ -24,6 +24,7 @@ from .rest import (
     CHANGE,
     PATH_NAME,
     Change,
+    GateReport,
     Instance,
     InstanceCreate,
     InstanceEvent,
@@ -408,6 +409,10 @@ class Client:
     def acknowledge_stop(self, name: str, order: str) -> StopOrder:
         """A robot says that it stands; with its own token only."""
         return self._one(StopOrder, "POST", _at("robots", name, _at("stop", order, "acknowledge").removeprefix("/")))
+
+    def report_gate(self, name: str, report: GateReport) -> None:
+        """A robot says how the gate before its wheels is; with its own token only."""
+        self._request("PUT", _at("robots", name, "gate"), report)
 
     # Everything
 

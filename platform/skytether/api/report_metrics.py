@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from .exposition import Family, Sample, Sums, counter, gauge
-from .rest import Report
+from .rest import GateReport, Report
 
 OUTCOMES = ("sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded", "duplicate")
 SOURCES = ("cloud", "fallback", "stop")
@@ -45,6 +45,7 @@ def of_report(labels: Labels, report: Report) -> Iterator[Family]:
     """All that a robot has reported."""
     robot, service, _ = labels
     yield from gauges_of([(labels, report)])
+    yield from gates_of({} if report.gate is None else {robot: report.gate})
     yield from counters_of({(robot, service): counts_of(report)})
 
 
@@ -88,7 +89,6 @@ def _of_robots(samples: Iterable[Sample]) -> Sums:
 def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
     """What is so now."""
     rtt, source, load, battery, delay, jitter = Sums(), Sums(), Sums(), Sums(), Sums(), Sums()
-    up, stopped, troubles = Sums(), Sums(), Sums()
     for (robot, service, site), report in reports:
         rtt.put((robot, service, site), report.rtt_s)
         if report.control_source in SOURCES:
@@ -96,10 +96,6 @@ def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
                 source.put((robot, service, name), float(name == report.control_source))
         load.put((robot,), report.load)
         battery.put((robot,), report.battery)
-        if report.gate is not None:
-            up.put((robot,), float(report.gate.answers))
-            stopped.put((robot,), float(bool(report.gate.stopped)))
-            troubles.put((robot,), float(report.gate.troubles))
         for topic in report.topics:
             labels = (robot, service, topic.topic, str(topic.priority), topic.direction)
             delay.put((*labels, "0.5"), topic.delay_p50_s)
@@ -108,10 +104,19 @@ def gauges_of(reports: Iterable[tuple[Labels, Report]]) -> Iterator[Family]:
     yield gauge("path_rtt_seconds", "Round trip between robot and service", INSTANCE, rtt)
     yield gauge("robot_load_ratio", "Share of the robot's processors that is busy", ("robot",), load)
     yield gauge("robot_battery_ratio", "Charge of the robot's battery", ("robot",), battery)
-    yield gauge("gate_up", "1 while the gate before the robot's wheels answers", ("robot",), up)
-    yield gauge("gate_stopped", "1 while the robot stands until a person resets it", ("robot",), stopped)
-    yield gauge("gate_troubles", "What the gate says is wrong", ("robot",), troubles)
     yield gauge("control_source", "1 for who drives, 0 for who does not", ("robot", "service", "source"), source)
     labelled = ("robot", "service", *_TOPIC)
     yield gauge("topic_one_way_delay_seconds", "From publish to delivery", (*labelled, "quantile"), delay)
     yield gauge("topic_jitter_seconds", "Mean difference of successive delays", labelled, jitter)
+
+
+def gates_of(gates: Mapping[str, GateReport]) -> Iterator[Family]:
+    """How robots' gates are, by robot."""
+    up, stopped, troubles = Sums(), Sums(), Sums()
+    for robot, gate in gates.items():
+        up.put((robot,), float(gate.answers))
+        stopped.put((robot,), float(bool(gate.stopped)))
+        troubles.put((robot,), float(gate.troubles))
+    yield gauge("gate_up", "1 while the gate before the robot's wheels answers", ("robot",), up)
+    yield gauge("gate_stopped", "1 while the robot stands until a person resets it", ("robot",), stopped)
+    yield gauge("gate_troubles", "What the gate says is wrong", ("robot",), troubles)

@@ -366,7 +366,9 @@ class Robot(RobotBase):
     stop: StopOrder | None = None
     """The last order to stop; None: there was none."""
     gate: GateReport | None = None
-    """As the robot reported with its last renewal; None: it holds no instance, or has no gate."""
+    """As the robot said last; None: it has no gate, or has not said how that is for `timing.gate_silent`."""
+    gate_heard_at: datetime | None = None
+    """When it said so; None: never."""
 
 
 class RobotCreated(Robot):

@@ -14,6 +14,8 @@ from .output import console, fail, or_dash, plain, print_json, print_table
 from .waiting import until_running
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from pydantic import BaseModel
 
     from skytether.api.rest import GateReport, StopOrder
@@ -294,7 +296,7 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
             f"{r.use.instances} of {r.quota.instances}",
             f"{r.use.cpu:g} of {r.quota.cpu:g}",
             f"{r.use.memory_mb} of {r.quota.memory_mb}",
-            _gate(r.gate),
+            _gate(r.gate, r.gate_heard_at),
             _stop(r.stop),
         )
         for r in found
@@ -348,9 +350,9 @@ def _stop(order: StopOrder | None) -> str:
     return f"acknowledged {or_dash(order.acknowledged_at)}: {order.reason}"
 
 
-def _gate(gate: GateReport | None) -> str:
+def _gate(gate: GateReport | None, heard_at: datetime | None) -> str:
     if gate is None:
-        return "-"
+        return "-" if heard_at is None else f"unknown: not heard of since {or_dash(heard_at)}"
     if not gate.answers:
         return "does not answer"
     return f"stopped: {gate.stopped}" if gate.stopped else f"{gate.hand or 'nobody'} drives, ahead {gate.zone}"

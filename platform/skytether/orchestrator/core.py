@@ -11,7 +11,7 @@ from typing import ParamSpec
 from sqlalchemy.exc import ProgrammingError, SQLAlchemyError
 
 from skytether.api.report_metrics import Owner
-from skytether.api.rest import Report, ScrapeTargets
+from skytether.api.rest import GateReport, Report, ScrapeTargets
 
 from .access import Access, Principal
 from .accounts import Account
@@ -20,6 +20,7 @@ from .db import GONE
 from .discovery import advertised, named, targets
 from .errors import OutdatedError
 from .events import Broker
+from .gates import Gates
 from .instances import Instances
 from .leader import Leadership
 from .loops import Loop
@@ -75,6 +76,7 @@ class Orchestrator:
         self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
         self.quotas = Quotas(self.store, settings.quotas)
         self.reports = Reports(self.store, self.quotas.drop_names)
+        self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -83,6 +85,7 @@ class Orchestrator:
             self._site_gauges,
             self._reports,
             self._accounts,
+            self._gates,
             self.quotas,
         )
         self.leadership = Leadership(self.store.lock(), self._elected)
@@ -133,6 +136,7 @@ class Orchestrator:
             moves,
             self.metrics,
             self.reports,
+            self.gates,
             secrets,
             clock,
             self._wake_placer,
@@ -181,11 +185,15 @@ class Orchestrator:
 
     def _write_reports(self) -> float:
         with contextlib.suppress(*GONE):  # they are kept until it answers
-            self.reports.write()
+            self._write()
             # Another one leads, and cannot know whom this one refused.
             if not self.leadership.leads and (self.strain.felt() or self.strain.owed()):
                 self.store.extend_leases(self._clock())
         return PERIOD
+
+    def _write(self) -> None:
+        self.reports.write()
+        self.gates.write()
 
     def _elect(self) -> float:
         if self.look_outdated():
@@ -250,7 +258,7 @@ class Orchestrator:
     def _write_last(self) -> None:
         try:
             if not self.outdated:
-                self.reports.write()
+                self._write()
         except SQLAlchemyError as error:
             log.warning("the robots' last reports are lost, for the database does not take them: %s", error)
 
@@ -304,6 +312,9 @@ class Orchestrator:
         if not self.leadership.leads:
             return {}
         return {instance: Report.model_validate(report) for instance, report in self.store.reports().items()}
+
+    def _gates(self) -> dict[str, GateReport]:
+        return self.gates.fresh() if self.leadership.leads else {}
 
     def _accounts(self) -> dict[Owner, Account]:
         return self.store.accounts() if self.leadership.leads else {}

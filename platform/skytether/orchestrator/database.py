@@ -11,12 +11,12 @@ from typing import Any
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
-from skytether.api.rest import Scope, SiteCreate
+from skytether.api.rest import GateReport, Scope, SiteCreate
 
 from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import Lock, lock_of
-from .models import facts, robots, services, sites, stops, tokens
+from .models import facts, gates, robots, services, sites, stops, tokens
 from .security import TokenHash
 
 
@@ -40,6 +40,16 @@ class StopRow:
     reason: str
     by: str
     acknowledged_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GateRow:
+    """What a robot said last of its gate."""
+
+    robot: str
+    at: float
+    report: GateReport | None
+    """None: it is too long ago to be so still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +84,11 @@ _HOLDERS = (
     .where(tokens.c.prefix == bindparam("prefix"))
 )
 """Made once: every request asks it."""
+_HEAR_GATE = text(
+    "INSERT INTO gates (robot, at, report) SELECT name, :at, :report FROM robots WHERE name = :of_robot"
+    " ON CONFLICT (robot) DO UPDATE SET at = excluded.at, report = excluded.report"
+).bindparams(bindparam("report", type_=gates.c.report.type))
+"""Nothing for a robot that was deleted meanwhile."""
 
 
 class Database:
@@ -231,6 +246,23 @@ class Database:
             connection.execute(update(stops).where(mine, stops.c.acknowledged_at.is_(None)).values(acknowledged_at=now))
             row = connection.execute(select(stops).where(mine)).one_or_none()
         return _stop(row) if row else None
+
+    def gates(self) -> dict[str, GateRow]:
+        """What each robot said last of its gate."""
+        with self._reader.connect() as connection:
+            rows = connection.execute(select(gates)).all()
+        return {row.robot: GateRow(row.robot, row.at, GateReport.model_validate(row.report)) for row in rows}
+
+    def hear_gates(self, heard: Iterable[GateRow]) -> None:
+        """Instead of what they said before; in order, lest two orchestrators wait for each other."""
+        ordered = sorted(heard, key=lambda row: row.robot)
+        rows = [
+            {"of_robot": row.robot, "at": row.at, "report": row.report.model_dump(mode="json")}
+            for row in ordered
+            if row.report is not None
+        ]
+        with self._writing() as connection:
+            connection.execute(_HEAR_GATE, rows)
 
     # Tokens
 

@@ -28,6 +28,7 @@ from .access import Principal
 from .accounts import of_robot
 from .catalogue import Catalogue
 from .errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
+from .gates import Gates
 from .metrics import Metrics
 from .moves import Moves
 from .placement import Decision
@@ -59,6 +60,7 @@ class Instances:
         moves: Moves,
         metrics: Metrics,
         reports: Reports,
+        gates: Gates,
         secrets_: Secrets,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
@@ -72,6 +74,7 @@ class Instances:
         self._moves = moves
         self._metrics = metrics
         self._reports = reports
+        self._gates = gates
         self._secrets = secrets_
         self._clock = clock
         self._wake_placer = wake_placer
@@ -216,6 +219,8 @@ class Instances:
             kept = self._metrics.bounded(renewed.record, renew.report)
             report = kept.model_dump(mode="json")
             self._reports.take(renewed.record, now, report, of_robot(renew.report), counts_of(kept))
+            if renew.report.gate is not None:
+                self._gates.hear(renewed.record.robot, renew.report.gate)
         return self._shown(renewed.record, self._session(renewed.record), renewed.successor)
 
     def claim_session(self, principal: Principal, instance: str, claim: str) -> SessionKey:

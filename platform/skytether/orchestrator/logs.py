@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 import time
 from collections import Counter
@@ -37,6 +38,8 @@ _REFUSED_PER_S, _REFUSED_AT_ONCE = 0.5, 60
 _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)
 _CREATED = 201
+_OFTEN = re.compile(r"POST /api/v1/instances/[^/]+/renew 200|PUT /api/v1/robots/[^/]+/gate 204")
+"""Every robot, every few seconds, about nothing but itself: the lease and the gate's state in the database say it."""
 
 
 class TextFormatter(logging.Formatter):
@@ -145,8 +148,8 @@ class Audit:
                 fields["left_out"] = left_out
         if made:
             fields["made"] = made  # which robot, token or instance: their names are in the body
-        if scope["path"].endswith("/renew") and status == 200:
-            return  # every robot, every two seconds: the lease in the database says it
+        if _OFTEN.fullmatch(f"{scope['method']} {scope['path']} {status}"):
+            return
         text = " ".join(str(value) for value in fields.values())
         (strangers if who == NOBODY else audit).info("%s", text, extra={"fields": fields})
 

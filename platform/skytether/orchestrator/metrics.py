@@ -14,8 +14,8 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 
 from skytether.api.exposition import Family, Sums, counter, exposition, gauge
 from skytether.api.manifest import ANY_TOPIC
-from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, counters_of, gauges_of
-from skytether.api.rest import Refusal, Report
+from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, counters_of, gates_of, gauges_of
+from skytether.api.rest import GateReport, Refusal, Report
 
 from .accounts import Account, of_instance, of_run
 from .quotas import Quotas, use_by_robot
@@ -61,6 +61,7 @@ class Metrics:
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
         reports: Callable[[], Mapping[str, Report]] = dict,
         accounts: Callable[[], Mapping[Owner, Account]] = dict,
+        gates: Callable[[], Mapping[str, GateReport]] = dict,
         quotas: Quotas | None = None,
     ) -> None:
         """All callables are asked at each scrape.
@@ -71,6 +72,7 @@ class Metrics:
             sites: What is known of the sites.
             reports: The last report on each instance, as ``bounded`` left it.
             accounts: What was counted, by robot and service.
+            gates: What robots say of their gates now, by robot.
             quotas: What robots may have, and what was refused for that.
         """
         self._quotas = quotas
@@ -78,6 +80,7 @@ class Metrics:
         self._sites = sites
         self._reports = reports
         self._accounts = accounts
+        self._gates = gates
         self._max_topics = max_topics
         self._registry = CollectorRegistry()
         self._start = Histogram(
@@ -169,6 +172,7 @@ class Metrics:
         yield from counters_of(used, USED)
         yield from _sites(self._sites(), running)
         yield from counters_of(sums)
+        yield from gates_of(self._gates())
         yield from gauges_of(
             [
                 ((r.robot, r.service, r.site or ""), _known_topics(report, sums[r.robot, r.service]))

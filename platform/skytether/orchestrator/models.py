@@ -70,6 +70,15 @@ stops = Table(
     comment="The last order to each robot to stop",
 )
 
+gates = Table(
+    "gates",
+    metadata,
+    Column("robot", String(63), ForeignKey("robots.name", ondelete="CASCADE"), primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("report", JSON, nullable=False),
+    comment="What each robot said last of the gate before its wheels",
+)
+
 tokens = Table(
     "tokens",
     metadata,

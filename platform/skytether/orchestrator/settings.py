@@ -58,6 +58,9 @@ class Timing(Group):
     """An instance runs for at least this long before it is moved so."""
     spare_lease: Seconds = 15.0
     """Lease of a standby when it is given to a robot that names none."""
+    gate_silent: Seconds = 15.0
+    """A robot that has not said for this long how its gate is has no series of it, and an unknown state in the list of
+    robots. Agents say it every 5 s at least."""
     lock_up: Seconds = 30.0
     """A reconcile loop without a pass for this long makes the orchestrator not ready."""
     outdated_grace: Annotated[float, Field(ge=0)] = 10.0

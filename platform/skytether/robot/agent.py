@@ -42,6 +42,7 @@ from .log_queue import log_queue
 from .notices import Notices
 from .resolver import Resolver
 from .safety.afar import StopFromAfar
+from .safety.gate_report import SaysGate
 from .safety.watch import GateWatch
 from .service_manager import ServiceManager, Terms, terms
 from .session import Endpoint, LiveSession
@@ -215,6 +216,11 @@ class Agent:
             random=random,
         )
         self._gate = None if config.gate is None else GateWatch(config.gate)
+        self._says_gate = (
+            None
+            if self._gate is None
+            else SaysGate(speaks, config.robot, self._gate.last, on_refused=self._another_token, clock=clock)
+        )
         self._afar = (
             StopFromAfar(speaks, config.robot, config.gate, clock=clock)
             if config.gate is not None and config.stop_from_afar
@@ -256,6 +262,7 @@ class Agent:
             "watch": self._watch,
             **({"decide": partial(self._tasks.run, self._stop)} if self._tasks else {}),
             **({"gate": partial(self._gate.run, self._stop)} if self._gate else {}),
+            **({"say_gate": partial(self._says_gate.run, self._stop)} if self._says_gate else {}),
             **({"afar": partial(self._afar.run, self._stop)} if self._afar else {}),
         }
         for name, target in targets.items():

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from skytether.api.client import Client
-from skytether.api.rest import RobotCreate
+from skytether.api.rest import GateReport, RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, Wrench, WrenchStamped, decode, encode
 from skytether.robot.agent import Agent, AgentConfig
@@ -207,6 +207,11 @@ def wait(condition: Callable[[], bool], what: str, robot: Robot | None = None) -
             log = robot._log.read_text() if robot else ""
             pytest.fail(f"not within {PATIENCE_S} s: {what}\n{log}")
         time.sleep(0.02)
+
+
+def reported(operator: Client) -> GateReport:
+    """What the orchestrator knows of the first robot's gate."""
+    return operator.robots()[0].gate or GateReport()
 
 
 def fill(path: Path) -> None:
@@ -497,6 +502,8 @@ def test_a_robot_without_an_instance_is_stopped_from_afar_once(robot, tmp_path):
             wait(lambda: agent.status().driver.told.stopped != "", "the gate's answer at the control loop", robot)
             assert agent.status().driver.velocity == (0.0, 0.0)
             assert agent.report().gate.stopped == agent.status().gate.stopped
+            wait(lambda: "smoke in the hall" in reported(operator).stopped, "its state at the orchestrator", robot)
+            assert not operator.instances()
             assert operator.stop_robot("walker", "once more").id != order.id
             wait(lambda: operator.robots()[0].stop.acknowledged_at is not None, "the second acknowledgement", robot)
             ask(robot.folder, {"do": "reset"}, 30)

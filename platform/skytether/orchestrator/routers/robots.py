@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from fastapi import APIRouter, Response
 
 from skytether.api.rest import GateReport, Robot, RobotCreate, RobotCreated, RobotUse, StopOrder, StopRobot
 
 from ..core import Orchestrator
-from ..database import RobotRow, StopRow
+from ..database import GateRow, RobotRow, StopRow
 from ..instances import utc
 from ..quotas import use_by_robot
-from ..records import Record
 from .deps import PREFIX, Caller, Core, Reader, RobotsOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(401, 403))
@@ -23,7 +20,7 @@ def _show(
     row: RobotRow,
     use: RobotUse | None = None,
     stop: StopRow | None = None,
-    gate: GateReport | None = None,
+    gate: GateRow | None = None,
 ) -> Robot:
     seen = utc(row.last_seen_at) if row.last_seen_at is not None else None
     most = core.settings.quotas
@@ -35,7 +32,8 @@ def _show(
         use=use or RobotUse(),
         quota=RobotUse(instances=most.robot_instances, cpu=most.robot_cpu, memory_mb=most.robot_memory_mb),
         stop=None if stop is None else _order(stop),
-        gate=gate,
+        gate=None if gate is None else gate.report,
+        gate_heard_at=None if gate is None else utc(gate.at),
     )
 
 
@@ -46,21 +44,10 @@ def _order(row: StopRow) -> StopOrder:
     )
 
 
-def _gates(core: Orchestrator, live: Iterable[Record]) -> dict[str, GateReport]:
-    """By robot, as it was last reported."""
-    robots = {record.id: record.robot for record in live}
-    return {
-        robots[instance]: GateReport.model_validate(report["gate"])
-        for instance, report in core.store.reports().items()
-        if instance in robots and report.get("gate") is not None
-    }
-
-
 @router.get("")
 def list_robots(core: Core, _: Reader) -> list[Robot]:
     """All registered robots, with what they use, their last order to stop and what they said of their gates."""
-    live = core.store.live()
-    use, gates, stops = use_by_robot(live), _gates(core, live), core.store.stops()
+    use, gates, stops = use_by_robot(core.store.live()), core.gates.all(), core.store.stops()
     rows = core.store.robots()
     return [_show(core, row, use.get(row.name), stops.get(row.name), gates.get(row.name)) for row in rows]
 
@@ -108,3 +95,9 @@ def get_stop(core: Core, caller: Caller, robot: str) -> StopOrder | None:
 def acknowledge_stop(core: Core, caller: Caller, robot: str, order: str) -> StopOrder:
     """The robot says that it stands. With the robot's own token only; the first time counts."""
     return _order(core.stops.acknowledge(caller, robot, order))
+
+
+@router.put("/{robot}/gate", status_code=204, responses=says(404, 422))
+def report_gate(core: Core, caller: Caller, robot: str, report: GateReport) -> None:
+    """The robot says how the gate before its wheels is, with an instance or without; with its own token only."""
+    core.gates.take(caller, robot, report)

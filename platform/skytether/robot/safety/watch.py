@@ -1,4 +1,4 @@
-"""What the gate says of itself, asked once a second by a thread of the agent: for status and metrics only."""
+"""What the gate says of itself, asked once a second by a thread of the agent: for status, metrics, the orchestrator."""
 
 from __future__ import annotations
 
@@ -29,6 +29,10 @@ class GateWatch:
         self._folder = folder
         self._ask = ask
         self.report = GateReport()
+
+    def last(self) -> GateReport:
+        """What it said last."""
+        return self.report
 
     def step(self) -> None:
         """Ask once."""
