@@ -217,7 +217,8 @@ def test_who_else_publishes_the_wheels_topic_is_named_and_counted(graph, walker,
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/status", timeout=30) as answer:
             return json.load(answer)["other_publishers"]
 
-    (name,) = status()["names"]
+    # With a gate it is the gate that looks; the agent hears of it a moment later.
+    (name,) = wait_for(lambda: status()["names"], "the agent to know")
     assert name.startswith("/rostopic")
     assert status()["noticed"] == 1
     assert start("run", "--check", safety=safety).wait(60) == 1
