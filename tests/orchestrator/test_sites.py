@@ -147,3 +147,26 @@ def test_a_reconciler_that_hangs_is_not_ready(start: Start, monkeypatch: pytest.
     core.placer.stop(5)
     core.placer.last_pass -= 31
     assert core.not_ready() == "the reconciler has made no pass for 31 s"
+
+
+def test_sites_that_are_looked_at_anew_are_listed_all_the_while(start: Start) -> None:
+    """Whoever comes to lead does that; who asks for a service meanwhile must not be told that there is no site."""
+    listed: list[list[str]] = []
+
+    class Seen(FakeRuntime):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            listed.append([site.name for site in core.sites.all()] if started else [])
+
+        def close(self) -> None:
+            super().close()
+            listed.append([site.name for site in core.sites.all()])
+
+    started: list[Orchestrator] = []
+    core = start(find=lambda _: Seen)
+    started.append(core)
+    before = core.sites.get("local")
+    listed.clear()
+    core.sites.reopen()
+    assert listed == [["local"], ["local"]], "when the new one is made, and when the old one is closed"
+    assert core.sites.get("local") is not before

@@ -18,8 +18,8 @@ import psutil
 from skytether.api.client import Client
 from skytether.orchestrator.runtimes.procfs import ProcessStat
 
-PATIENCE = 30.0
-"""Seconds; a busy machine starts a program in several."""
+PATIENCE = 60.0
+"""Seconds; a start takes three of processor time, a busy machine gives them slowly."""
 
 
 class Program:

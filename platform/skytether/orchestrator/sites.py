@@ -196,21 +196,24 @@ class Sites:
             self._close(site)
 
     def reopen(self) -> None:
-        """Look at all sites anew: another orchestrator has started and stopped what is there until now."""
-        with self._lock:
-            old, self._sites = list(self._sites.values()), {}
-        for site in old:
-            self._close(site)
+        """Look at all sites anew: another orchestrator has started and stopped what is there until now.
+
+        Each stays listed until its successor is there: who asks for a service meanwhile is not told that there is none.
+        """
         self.refresh()
+        with self._lock:
+            old = self.all()
+            _end(old)
+            for site in old:
+                self._open(site.asked, self._make_usable(site.asked))
+        for site in old:
+            site.runtime.close()
 
     def stop(self) -> None:
         """Let go of all sites; what runs there runs on."""
         all_ = self.all()
+        _end(all_)
         for site in all_:
-            site.loop.stop(timeout=0)  # all at once: several that hang take no longer than one
-        deadline = time.monotonic() + _CLOSE_TIMEOUT
-        for site in all_:
-            site.loop.stop(max(0.0, deadline - time.monotonic()))
             site.runtime.close()
 
     def add(self, asked: SiteCreate, *, by_owner: bool = True) -> Site:
@@ -331,3 +334,12 @@ class Sites:
     def _close(self, site: Site) -> None:
         site.loop.stop(timeout=_CLOSE_TIMEOUT)
         site.runtime.close()
+
+
+def _end(sites: Collection[Site]) -> None:
+    """End their threads; several that hang take no longer than one."""
+    for site in sites:
+        site.loop.stop(timeout=0)
+    deadline = time.monotonic() + _CLOSE_TIMEOUT
+    for site in sites:
+        site.loop.stop(max(0.0, deadline - time.monotonic()))
