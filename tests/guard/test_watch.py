@@ -155,8 +155,10 @@ def test_bytes_go_there_and_back():
     answer = Answer(3.5, 8, False, "sömebody fell")
     assert unpack_answer(pack_answer(answer)) == answer
     assert unpack_note(pack_note("the laser is blind")) == "the laser is blind"
-    data = protocol.pack_command(7, 8, 3.5, Velocity(0.1, -0.2))
-    assert protocol.unpack_command(data, Hand.AGENT, 4.0) == Command(Hand.AGENT, 0.1, -0.2, 7, 8, 3.5, 0.0, 4.0)
+    for decided in (True, False):
+        data = protocol.pack_command(7, 8, 3.5, Velocity(0.1, -0.2), decided)
+        command = Command(Hand.AGENT, 0.1, -0.2, 7, 8, 3.5, 0.0, 4.0, decided=decided)
+        assert protocol.unpack_command(data, Hand.AGENT, 4.0) == command
 
 
 @pytest.mark.parametrize("reason", ["ö" * 400, "\udcff" * 400, "\n\0", "🤖" * 100])

@@ -32,7 +32,7 @@ FEW = (
     "guard-frozen-1",
     "guard-gate-killed",
     "stop-gate-killed",
-    "reset-alone",
+    "reset-agent-frozen",
     "wheels-gone-0.5",
     "pipe-full",
 )

@@ -21,6 +21,8 @@ class PushedBase:
     def __init__(self) -> None:
         self.push = 12.0
         self.written: list[tuple[float, float]] = []
+        self.why: list[bool] = []
+        """Of each velocity written: whether a standstill is what somebody wants."""
         self.on_read: Callable[[], None] = lambda: None
         self.on_write: Callable[[], None] = lambda: None
 
@@ -31,6 +33,9 @@ class PushedBase:
     def write(self, twist: Twist) -> None:
         self.on_write()
         self.written.append((twist.linear.x, twist.angular.z))
+
+    def decided(self, decided: bool) -> None:
+        self.why.append(decided)
 
     @property
     def velocity(self) -> tuple[float, float]:

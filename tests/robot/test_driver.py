@@ -140,6 +140,38 @@ def test_silence_hands_over_to_the_person_within_300_ms_without_a_jump_and_back(
         assert abs(w1 - w0) <= limits.angular_acceleration * TICK + 1e-9
 
 
+def test_a_standstill_is_wanted_by_who_drives_or_by_nobody_while_no_service_has_spoken(base, make_cloud, bridge):
+    """What is told because the service is not heard is no decision: it may want to drive all the time."""
+    rig = Rig(base, make_cloud, Stop())
+    rig.run(0.1)
+    assert base.why[-1], "no service"
+    rig.connect(bridge)
+    rig.run(0.1)
+    assert base.why[-1], "it has not spoken yet"
+    rig.run(1.5, linear=0.2, angular=0.0)
+    rig.run(1.5)
+    assert base.velocity == (0.0, 0.0)
+    assert not base.why[-1], "it has fallen silent"
+    rig.run(1.5, linear=0.0, angular=0.0)
+    assert base.why[-1], "it wants a standstill"
+    rig.run(1.5)
+    assert not base.why[-1]
+    rig.driver.let_go()
+    rig.run(0.1)
+    assert base.why[-1], "it was let go"
+
+
+def test_a_standstill_of_a_fallback_without_readings_is_not_wanted(base, make_cloud, monkeypatch):
+    rig = Rig(base, make_cloud)
+    base.push = 0.0
+    rig.run(0.5)
+    assert base.why[-1]
+    monkeypatch.setattr(base, "read", lambda now: [])
+    rig.run(1.0)
+    assert base.velocity == (0.0, 0.0)
+    assert not base.why[-1]
+
+
 def test_a_session_that_ends_hands_over_at_the_next_tick(driven):
     driven.cloud.session.notify(Disconnected("silent"))
     status = driven.run(TICK, linear=0.2)

@@ -74,6 +74,28 @@ def test_after_a_gap_the_robot_begins_from_standstill(robot, gap, slept):
     assert robot.driver.status().stalls == 1
 
 
+@pytest.mark.parametrize("gap", [0.11, 0.3, 2.0])
+def test_a_standstill_after_a_gap_is_not_one_that_somebody_wants(robot, gap):
+    """Else a robot that was reset would drive because its agent hung for a moment."""
+    begin = len(robot.told)
+    robot.tick(gap)
+    robot.run(3.0)
+    assert robot.told[-1] == pytest.approx(0.2)
+    stood = [why for told, why in zip(robot.told[begin:], robot.base.why[begin:], strict=True) if not told]
+    assert len(stood) > 1
+    assert not any(stood)
+
+
+def test_who_is_stopped_before_writing_writes_a_standstill_that_nobody_wants(robot):
+    robot.speed = robot.base.push = 0.0
+    robot.run(1.0)
+    assert robot.base.why[-1]
+    robot.driver._clocks = lambda: (robot.now + 1.0, robot.boot + 1.0)
+    robot.tick()
+    assert robot.told[-1] == 0.0
+    assert not robot.base.why[-1]
+
+
 def test_a_service_that_is_gone_after_the_gap_is_found_out(robot):
     begin = len(robot.told)
     robot.tick(2.0)

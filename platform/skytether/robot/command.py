@@ -36,6 +36,7 @@ class Command:
         sent_at_error: Bound of the error of ``sent_at`` [s]; inf while the peer's clock is not known.
         received_at: When it reached this robot.
         unused: What it wants along `UNUSED_AXES`, all added up [m/s, rad/s].
+        decided: Whether a standstill is what somebody wants; else it is told because nothing better is known.
     """
 
     source: str
@@ -47,6 +48,7 @@ class Command:
     sent_at_error: float
     received_at: float
     unused: float = 0.0
+    decided: bool = True
 
 
 def unused_axes(twist: Twist) -> float:

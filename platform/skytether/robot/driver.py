@@ -27,7 +27,7 @@ from .service_manager import Terms
 from .session import LiveSession
 from .stall import StallWatch
 from .supervisor import Limits, Objection, Supervised
-from .told import TellsBack, Told, rebase
+from .told import AsksWhy, TellsBack, Told, rebase
 
 _log = logging.getLogger(__name__)
 
@@ -158,7 +158,10 @@ class Driver:
         self._base = base
         self._fallback = fallback
         self._tells_back = base if isinstance(base, TellsBack) else None
+        self._asks_why = base if isinstance(base, AsksWhy) else None
         self._told: Told | None = None
+        self._spoke = False
+        """A service has sent commands, in a session that there is or one before it without a break."""
         self._watching = fallback if isinstance(fallback, Watching) else None
         self._own_limits = self._limits = limits
         """As configured, and with what was learned of the commands' gaps."""
@@ -219,12 +222,13 @@ class Driver:
             self._take_commands(now)
             self._choose(now)
             velocity = self._drive(now)
+            decided = self._decided(now)
         except Exception as error:  # a plug-in, a driver, a bug: none of them may keep the wheels turning
             self._caught("control", error)
-            velocity = self._brake(now)
+            velocity, decided = self._brake(now), False
         self._now = now
         self._ticks += 1
-        self._write(velocity)
+        self._write(velocity, decided)
 
     def offer(self, session: LiveSession) -> None:
         """Another session, instead of the one that there is; it gets the same readings until it takes over."""
@@ -332,6 +336,7 @@ class Driver:
             command = replace(command, received_at=now, sent_at=command.sent_at - late)
         objection = self._admit(command, now)
         if objection is None:
+            self._spoke = True
             before = self._command_before
             lost = command.sequence - before[1] - 1 if before[0] == command.epoch else 0
             self._command_before = command.epoch, command.sequence
@@ -419,10 +424,22 @@ class Driver:
             self._supervised = Supervised()
             return STANDSTILL
 
-    def _write(self, velocity: Velocity) -> None:
+    def _decided(self, now: float) -> bool:
+        """Whether a standstill is what the one who drives wants; else it is told because nothing better is known."""
+        source = self._choice.source
+        if now < self._believed_from:
+            return False
+        if source is Source.STOP:  # a service that has spoken, and is not heard now, may want to drive all the time
+            self._spoke = self._spoke and self.session is not None
+            return not self._spoke
+        return supervisor.wants_standstill(self._limits, self._supervised, source, self._max_age(source), now)
+
+    def _write(self, velocity: Velocity, decided: bool = False) -> None:
         if self._clocks is not None and self._stall.late(*self._clocks()):
-            velocity = STANDSTILL  # what was computed before the gap; the next tick finds it
+            velocity, decided = STANDSTILL, False  # what was computed before the gap; the next tick finds it
         try:
+            if self._asks_why is not None:
+                self._asks_why.decided(decided)
             self._base.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
             self._written_at = self._now
         except Exception as error:  # tried again at the next tick

@@ -181,6 +181,14 @@ def step(
     return replace(state, velocity=velocity), objections
 
 
+def wants_standstill(limits: Limits, state: Supervised, charge: str, max_age_s: float, now: float) -> bool:
+    """Whether a command is followed, and it is one to stand. Arguments as those of `step`."""
+    command = state.held.get(charge)
+    if command is None or _objection_while_held(limits, command, max_age_s, now) is not None:
+        return False
+    return max(abs(command.linear), abs(command.angular)) <= _STANDS
+
+
 def begin_anew(state: Supervised, now: float) -> Supervised:
     """The loop stood still, and so do the wheels: nothing that is held is followed, nor what was sent before now.
 
@@ -206,6 +214,8 @@ DEFAULT_MAX_RTT_S = 1.0
 """For services that state no need: no robot is driven by what is older."""
 
 
+_STANDS = 1e-3
+"""A speed that counts as a standstill: the rest of a ramp, a stick that is not quite in its middle [m/s, rad/s]."""
 _UNUSED_MOST = 1e-3
 """A speed along an axis that the wheels do not have which is some planner's rounding [m/s, rad/s]."""
 

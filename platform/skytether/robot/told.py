@@ -44,6 +44,19 @@ class TellsBack(Protocol):
         ...
 
 
+@runtime_checkable
+class AsksWhy(Protocol):
+    """What a `Base` may have besides."""
+
+    def decided(self, decided: bool) -> None:
+        """Whether a standstill that is written from now on is what somebody wants.
+
+        Else it is told because nothing better is known: that is not what somebody has to want before a robot that was
+        reset begins to drive.
+        """
+        ...
+
+
 def rebase(limits: Limits, state: Supervised, told: Told) -> Supervised:
     """Go on from what the wheels were told.
 

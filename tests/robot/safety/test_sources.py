@@ -223,6 +223,19 @@ def test_a_source_is_neutral_when_it_wanted_nothing_else_for_long_enough(wants):
         assert (not state.why) is free
 
 
+def test_a_standstill_that_nobody_wants_is_not_neutral():
+    """An agent that hung, or whose service is not heard, says it for want of a better word."""
+    state = neutral.require("a reset")
+    for turn in range(100):
+        state = neutral.want(state, STANDSTILL, 10.0 + 0.02 * turn, decided=False)
+    assert neutral.look(state, 20.0).why
+    state = neutral.want(state, STANDSTILL, 20.0)
+    state = neutral.want(state, STANDSTILL, 20.1, decided=False)
+    state = neutral.want(state, STANDSTILL, 20.15)
+    assert neutral.look(state, 20.3).why
+    assert not neutral.look(state, 20.4).why
+
+
 @pytest.mark.parametrize("now", [inf, -inf, nan])
 def test_a_clock_that_is_no_number_makes_nobody_neutral(now):
     state = neutral.want(neutral.require("a reset"), STANDSTILL, 10.0)

@@ -20,6 +20,10 @@ _REASONS = {
     "zeros": "a\0b\0",
     "long": "x" * 3000,
 }
+_FREEZES_S = (0.3, 0.12, 0.5)
+"""The first begins right at the reset."""
+_NOTICED_S = 0.6
+"""An agent that goes on after a freeze would drive within this."""
 _IDLE_CLIENTS = 6
 _IDLE_S = 0.5
 """An answer that takes longer waits for somebody else."""
@@ -41,6 +45,12 @@ def enter(attacks: Attacks) -> None:
         attacks.add(f"stop-reason-{name}", f"a stop whose reason is {_named(reason)}", _reason(reason), seconds=4)
     attacks.add("button-gate-frozen", "the button is pressed while the gate is frozen", _button, seconds=4)
     attacks.add("button-silent", "the button falls silent", _silent, seconds=2)
+    attacks.add(
+        "reset-agent-frozen",
+        "a reset, nobody says start, and the agent is frozen for 0.12 to 0.5 s, and goes on",
+        _reset_and_freeze,
+        seconds=5,
+    )
     attacks.add("reset-alone", "a reset, and nobody says start", _reset, seconds=3)
 
 
@@ -142,6 +152,19 @@ def _silent(stage: Stage) -> None:
         stage.robot.pressed = None
         stage.sleep(1.2)
     stage.robot.pressed = False
+
+
+def _reset_and_freeze(stage: Stage) -> None:
+    agent = stage.robot.pid("agent")
+    with stage.stands(stage.promised.stop, "a stop, then a reset, nobody says start, and the agent hangs"):
+        stage.stop()
+        stage.sleep(0.4)
+        stage.robot.reset()
+        for seconds in _FREEZES_S:
+            stage.robot.kill(agent, signal.SIGSTOP)
+            stage.sleep(seconds)
+            stage.robot.kill(agent, signal.SIGCONT)
+            stage.sleep(_NOTICED_S)
 
 
 def _reset(stage: Stage) -> None:

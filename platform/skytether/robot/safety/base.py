@@ -28,6 +28,7 @@ class GatedBase:
         self.topics: Mapping[str, type[Message]] = base.topics
         self._base = base
         self._link = link
+        self._decided = True
 
     def read(self, now: float) -> Iterable[tuple[str, Message]]:
         """Base: the other's readings."""
@@ -44,7 +45,11 @@ class GatedBase:
             raise ValueError(
                 f"a velocity along {UNUSED_AXES} cannot be asked of the gate: the wheels do not have these"
             )
-        self._link.send(Velocity(twist.linear.x, twist.angular.z))
+        self._link.send(Velocity(twist.linear.x, twist.angular.z), self._decided)
+
+    def decided(self, decided: bool) -> None:
+        """Whether a standstill that is written from now on is what somebody wants."""
+        self._decided = decided
 
     def told(self, _now: float) -> Told | None:
         """What the gate told the wheels last, if it has answered lately."""

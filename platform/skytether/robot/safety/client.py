@@ -55,8 +55,13 @@ class GateLink:
         """Who may be the gate; empty: its folder has not been looked at."""
         self._socket.bind("")  # the kernel gives it a name, for the gate to answer to
 
-    def send(self, velocity: Velocity) -> None:
+    def send(self, velocity: Velocity, decided: bool = True) -> None:
         """Ask the gate for a velocity.
+
+        Args:
+            velocity: Wanted.
+            decided: Whether a standstill is what somebody wants. One that is told because nothing better is known does
+                not let this source drive after a reset.
 
         Raises:
             OSError: There is no gate, its queue is full, or anybody could be it.
@@ -67,7 +72,7 @@ class GateLink:
             self._trusted = trusted(self._folder)
         self.state()  # what is not taken in time would leave no room for newer ones
         self._sequence += 1
-        self._socket.sendto(pack_command(self._epoch, self._sequence, self._clock(), velocity), self._address)
+        self._socket.sendto(pack_command(self._epoch, self._sequence, self._clock(), velocity, decided), self._address)
 
     def state(self) -> GateState | None:
         """The newest that the gate answered; None: nothing yet. Its ``at`` says how old it is. Never waits."""

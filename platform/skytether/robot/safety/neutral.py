@@ -36,12 +36,19 @@ def require(why: str) -> Neutral:
     return Neutral(why=why)
 
 
-def want(before: Neutral, velocity: Velocity, now: float) -> Neutral:
-    """The source wants a velocity; it is neutral when it goes on to another one after a long enough standstill."""
+def want(before: Neutral, velocity: Velocity, now: float, decided: bool = True) -> Neutral:
+    """The source wants a velocity; it is neutral when it goes on to another one after a long enough standstill.
+
+    Args:
+        before: What is remembered.
+        velocity: Wanted.
+        now: [s]
+        decided: False: a standstill is told because nothing better is known; nobody wants it.
+    """
     before = look(before, now)
     if not before.why:
         return before
-    if not all(abs(value) <= most for value, most in zip(velocity, _STANDSTILL, strict=True)):
+    if not decided or not all(abs(value) <= most for value, most in zip(velocity, _STANDSTILL, strict=True)):
         return replace(before, still_since=nan)
     return before if before.still_since <= now else replace(before, still_since=now)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from skytether.guard.velocity import Velocity
 from skytether.robot.command import Command
 
-_COMMAND = struct.Struct("<4sQQddd")
-_MAGIC = b"SkG1"
+_COMMAND = struct.Struct("<4sQQddd?")
+_MAGIC = b"SkG2"
 _STATE = struct.Struct("<4sdddd16s")
 _STATE_MAGIC = b"SkS1"
 _REASON_BYTES = 200
@@ -62,7 +62,7 @@ def unpack_state(data: bytes) -> GateState | None:
     return GateState(at, Velocity(linear, angular), told_at, reason, hand.rstrip(b"\0").decode(errors="replace"))
 
 
-def pack_command(epoch: int, sequence: int, sent_at: float, velocity: Velocity) -> bytes:
+def pack_command(epoch: int, sequence: int, sent_at: float, velocity: Velocity, decided: bool = True) -> bytes:
     """A velocity that the agent wants.
 
     Args:
@@ -70,16 +70,17 @@ def pack_command(epoch: int, sequence: int, sent_at: float, velocity: Velocity) 
         sequence: Counts its commands.
         sent_at: By `skytether.guard.clock` [s].
         velocity: Wanted.
+        decided: See `Command`.
     """
-    return _COMMAND.pack(_MAGIC, epoch, sequence, sent_at, *velocity)
+    return _COMMAND.pack(_MAGIC, epoch, sequence, sent_at, *velocity, decided)
 
 
 def unpack_command(data: bytes, source: StrEnum, now: float) -> Command | None:
     """The command that arrived now from the agent; None: the bytes are none."""
     if len(data) != _COMMAND.size or data[:4] != _MAGIC:
         return None
-    _, epoch, sequence, sent_at, linear, angular = _COMMAND.unpack(data)
-    return Command(source, linear, angular, epoch, sequence, sent_at, 0.0, now)
+    _, epoch, sequence, sent_at, linear, angular, decided = _COMMAND.unpack(data)
+    return Command(source, linear, angular, epoch, sequence, sent_at, 0.0, now, decided=decided)
 
 
 def default_folder() -> Path:

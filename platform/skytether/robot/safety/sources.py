@@ -235,7 +235,10 @@ class Sources:
         if source is not None:
             wanted = Velocity(command.linear, command.angular)
             self._sources[command.source] = replace(
-                source, wanted=wanted, heard_at=now, neutral=neutral.want(source.neutral, wanted, now)
+                source,
+                wanted=wanted,
+                heard_at=now,
+                neutral=neutral.want(source.neutral, wanted, now, command.decided),
             )
 
     def look(self, now: float, troubles: dict[str, str]) -> str:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import http.client
+import socket
+import time
 import xmlrpc.client
 from typing import Any
 from urllib.parse import urlsplit
-from xml.parsers.expat import ExpatError
 
 TIMEOUT_S = 3.0
-"""Of a request; a master answers within milliseconds."""
+"""Of a request, to the end of its answer; a master answers within milliseconds."""
+LARGEST = 4 << 20
+"""Bytes of an answer: the state of a graph of thousands of topics is smaller."""
+_SAID = 500
+"""Characters of what somebody else says that are told."""
 
 
 class MasterError(Exception):
@@ -20,15 +25,53 @@ class RefusedError(MasterError):
     """It answers, and says no."""
 
 
+class _Bounded(socket.socket):
+    """All that comes is there in time, and not too much: a timeout of `socket` is for each read alone."""
+
+    end = 0.0
+    """By when [s]."""
+    room = LARGEST
+    """Bytes that may still come."""
+
+    def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
+        left = self.end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("the answer does not end")
+        self.settimeout(left)
+        count = super().recv_into(buffer, nbytes, flags)
+        self.room -= count
+        if self.room < 0:
+            raise OSError(f"the answer has more than {LARGEST} bytes")
+        return count
+
+
+class _Connection(http.client.HTTPConnection):
+    def connect(self) -> None:
+        end = time.monotonic() + (self.timeout or TIMEOUT_S)
+        super().connect()
+        bounded = _Bounded(fileno=self.sock.detach())
+        bounded.settimeout(self.timeout)
+        bounded.end = end
+        self.sock = bounded
+
+
 class _Transport(xmlrpc.client.Transport):
+    accept_gzip_encoding = False
+
     def __init__(self, timeout: float) -> None:
         super().__init__()
         self._timeout = timeout
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
-        connection: http.client.HTTPConnection = super().make_connection(host)
-        connection.timeout = self._timeout
-        return connection
+        address, self._extra_headers, _ = self.get_host_info(host)
+        made = _Connection(address, timeout=self._timeout)
+        self._connection = host, made  # for its own `close`
+        return made
+
+    def parse_response(self, response: Any) -> Any:
+        if response.getheader("content-encoding", "identity") != "identity":
+            raise ValueError("the answer is packed, and nobody knows how large it is")
+        return super().parse_response(response)
 
 
 def call(uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> Any:
@@ -42,7 +85,7 @@ def call(uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> 
 
     Raises:
         RefusedError: The answer is no.
-        MasterError: There is no answer, or it is none of ROS.
+        MasterError: There is no answer, it does not end in time or is too large, or it is none of ROS.
     """
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Transport(timeout), allow_none=True) as proxy:
@@ -50,11 +93,15 @@ def call(uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> 
         code, status, value = answer
     except (OSError, http.client.HTTPException) as error:
         raise MasterError(f"nobody answers at {uri}: {error}") from error
-    except (xmlrpc.client.Error, ExpatError, TypeError, ValueError, UnicodeError) as error:
-        raise MasterError(f"{uri} does not speak as ROS does ({method}): {error}") from error
+    except Exception as error:  # bytes of somebody else, and the library raises whatever its parts do
+        raise MasterError(f"{uri} does not speak as ROS does ({method}): {str(error)[:_SAID]}") from error
     if code != 1:
-        raise RefusedError(f"{uri}: {status}")
+        raise RefusedError(f"{uri}: {str(status)[:_SAID]}")
     return value
+
+
+def _is_list(found: Any, of: int | None = None) -> bool:
+    return isinstance(found, list) and (of is None or len(found) == of)
 
 
 class Master:
@@ -70,6 +117,13 @@ class Master:
     def _call(self, method: str, *arguments: Any) -> Any:
         return call(self.uri, method, self._node, *arguments)
 
+    def _list(self, method: str, *arguments: Any, of: int = 0) -> list[Any]:
+        """An answer that is a list; of lists that are so long, if that is given."""
+        found = self._call(method, *arguments)
+        if _is_list(found) and (not of or all(_is_list(one, of) for one in found)):
+            return found  # type: ignore[no-any-return]
+        raise MasterError(f"{self.uri} does not speak as ROS does ({method}): it answers no such list")
+
     def knows(self, node: str) -> str:
         """Address of a node; empty if the master knows no such node."""
         try:
@@ -79,7 +133,7 @@ class Master:
 
     def register_subscriber(self, topic: str, kind: str, uri: str) -> list[str]:
         """Take part; gives the publishers' addresses."""
-        return [str(found) for found in self._call("registerSubscriber", topic, kind, uri)]
+        return [str(found) for found in self._list("registerSubscriber", topic, kind, uri)]
 
     def register_publisher(self, topic: str, kind: str, uri: str) -> None:
         """Offer a topic."""
@@ -115,15 +169,17 @@ class Master:
 
     def topic_types(self) -> dict[str, str]:
         """Types by topic, of all that was ever offered or taken."""
-        return {str(name): str(kind) for name, kind in self._call("getTopicTypes")}
+        return {str(name): str(kind) for name, kind in self._list("getTopicTypes", of=2)}
 
     def published(self) -> dict[str, str]:
         """Types by topic, of all that somebody offers now."""
-        return {str(name): str(kind) for name, kind in self._call("getPublishedTopics", "")}
+        return {str(name): str(kind) for name, kind in self._list("getPublishedTopics", "", of=2)}
 
     def publishers(self, topic: str) -> list[str]:
         """Names of the nodes that offer a topic now."""
-        offered, _, _ = self._call("getSystemState")
+        offered: Any = next(iter(self._list("getSystemState")), None)
+        if not _is_list(offered) or not all(_is_list(row, 2) and _is_list(row[1]) for row in offered):
+            raise MasterError(f"{self.uri} does not speak as ROS does (getSystemState): it answers no such list")
         return [str(node) for name, nodes in offered if name == topic for node in nodes]
 
     def get_param(self, name: str) -> Any:
