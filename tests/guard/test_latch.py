@@ -113,6 +113,19 @@ def test_what_cannot_be_kept_is_said(tmp_path):
     assert "directory" in latch.unkept
 
 
+def test_what_could_not_be_kept_is_tried_again_when_somebody_asks_again(tmp_path):
+    folder = tmp_path / "latch"
+    folder.mkdir()
+    keeper = Keeper(str(folder), BOOT, lambda why: None)
+    latch = Latch(keeper)
+    keeper.start()
+    wait(lambda: bool(latch.unkept))
+    folder.rmdir()
+    assert not latch.stop("somebody fell")
+    latch.renew()
+    wait(lambda: latch.kept)
+
+
 def test_where_nothing_can_be_written_a_release_is_taken_away(tmp_path, monkeypatch):
     path = tmp_path / "latch"
     path.write_bytes(encode("", BOOT))

@@ -168,8 +168,14 @@ class Latch:
         return True
 
     def renew(self) -> None:
-        """A person stops a robot that is stopped already: a reset that was asked for before does not end this."""
+        """A person stops a robot that is stopped already: a reset that was asked for before does not end this.
+
+        What could not be kept before is tried again: the disk may have room by now.
+        """
         self.generation += 1
+        if self.unkept:
+            self._changes += 1
+            self._keeper.keep(self._changes, self.reason)
 
     def reset(self, generation: int) -> bool:
         """End the stop that whoever asks knows of; a newer one stays. True if it was stopped and is no more."""

@@ -1,5 +1,6 @@
 """Stop from afar: obeyed once, never undone, and nothing happens while the orchestrator is away."""
 
+import os
 from datetime import UTC, datetime
 
 import pytest
@@ -36,12 +37,20 @@ class Gate:
     def __init__(self):
         self.stops = []
         self.error = None
+        self.stopped = ""
+        self.disk = True
 
     def stop(self, folder, reason):
         if self.error is not None:
             raise self.error
         self.stops.append(reason)
-        return {}
+        self.stopped = reason
+        return {} if self.disk else {"note": "the stop is in effect, but could not be kept: the disk is full"}
+
+    def status(self, folder):
+        if self.error is not None:
+            raise self.error
+        return {"stopped": self.stopped, "guard": {"stopped": self.stopped, "kept": self.disk}}
 
 
 def order(id_="a", **changes):
@@ -61,7 +70,7 @@ def gate():
 @pytest.fixture
 def agent(orchestrator, gate, tmp_path):
     """Makes an agent, as after each of its starts."""
-    return lambda: StopFromAfar(orchestrator, "walker", tmp_path, stop=gate.stop, clock=lambda: 1.0)
+    return lambda: StopFromAfar(orchestrator, "walker", tmp_path, stop=gate.stop, status=gate.status, clock=lambda: 1.0)
 
 
 def test_an_order_is_obeyed_and_acknowledged_once(agent, orchestrator, gate):
@@ -116,6 +125,33 @@ def test_what_could_not_be_obeyed_is_not_acknowledged_and_tried_again(agent, orc
     assert orchestrator.acknowledged == [("walker", "a")]
 
 
+def test_what_could_not_be_kept_is_not_acknowledged_until_it_is(agent, orchestrator, gate):
+    orchestrator.order = order()
+    gate.disk = False
+    afar = agent()
+    for _ in range(3):
+        afar.step()
+    assert gate.stopped
+    assert orchestrator.acknowledged == []
+    gate.error = GateError("it does not answer")
+    afar.step()
+    assert orchestrator.acknowledged == []
+    gate.error, gate.disk = None, True
+    afar.step()
+    assert orchestrator.acknowledged == [("walker", "a")]
+
+
+def test_what_could_not_be_kept_does_not_stop_again_after_a_reset(agent, orchestrator, gate):
+    orchestrator.order = order()
+    gate.disk = False
+    afar = agent()
+    afar.step()
+    gate.stopped = ""  # a person at the robot has reset it
+    afar.step()
+    assert len(gate.stops) == 1
+    assert orchestrator.acknowledged == [("walker", "a")]
+
+
 def test_orders_to_others_and_what_was_acknowledged_is_left_alone(agent, orchestrator, gate):
     orchestrator.order = order(robot="stranger")
     agent().step()
@@ -124,9 +160,41 @@ def test_orders_to_others_and_what_was_acknowledged_is_left_alone(agent, orchest
     assert gate.stops == []
 
 
-@pytest.mark.parametrize("text", ["", "{", "{}", "[1, 2]", "null"])
+def test_a_reason_is_one_short_line(agent, orchestrator, gate):
+    orchestrator.order = order(reason="fire\n\x1b[2J" + "x" * 100_000, by="a\nb")
+    agent().step()
+    assert gate.stops[0].startswith("stopped from afar by a b: fire [2J")
+    assert gate.stops[0].isprintable()
+    assert len(gate.stops[0]) <= 200
+
+
+@pytest.mark.parametrize("text", ["", "{", "{}", "[1, 2]", "null", "[" * 60_000, '["a"' + " " * 70_000 + "]"])
 def test_a_file_that_is_damaged_is_none(agent, orchestrator, gate, tmp_path, text):
     (tmp_path / FILE).write_text(text)
+    orchestrator.order = order()
+    agent().step()
+    assert len(gate.stops) == 1
+
+
+@pytest.mark.parametrize("name", [FILE, FILE + ".new"])
+@pytest.mark.parametrize("made", [os.mkfifo, lambda path: path.symlink_to(path.with_name("other"))])
+def test_a_pipe_or_a_link_in_the_place_of_the_file_holds_up_nothing(agent, orchestrator, gate, tmp_path, name, made):
+    other = tmp_path / "other"
+    other.write_text('["a"]')
+    made(tmp_path / name)
+    orchestrator.order = order()
+    agent().step()
+    assert len(gate.stops) == 1
+    assert orchestrator.acknowledged == [("walker", "a")]
+    assert other.read_text() == '["a"]', "written through a link"
+    orchestrator.order = order()
+    agent().step()
+    assert len(gate.stops) == 1, "it is remembered"
+
+
+def test_a_file_of_somebody_else_is_none(agent, orchestrator, gate, tmp_path, monkeypatch):
+    (tmp_path / FILE).write_text('["a"]')
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     orchestrator.order = order()
     agent().step()
     assert len(gate.stops) == 1

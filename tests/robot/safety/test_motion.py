@@ -181,6 +181,38 @@ def test_silence_and_the_same_reading_again_are_not_known():
     assert motion.look(-50.0).unknown
 
 
+@pytest.mark.parametrize(
+    ("stamps", "wrong"),
+    [
+        (lambda turn: 50.0 + turn % 2, "older"),  # a driver that sends two readings in turn
+        (lambda turn: 50.0 - turn / 10, "older"),
+        (lambda turn: 0.0 if turn else 50.0, "without a stamp"),
+    ],
+)
+def test_readings_that_are_not_newer_are_silence_and_hide_no_runaway(stamps, wrong):
+    motion, now = Motion(PARAMS, LIMITS, 0.1), 100.0
+    for turn in range(200):
+        now += READING
+        motion.told(Velocity(0.2, 0.0), now)
+        said = motion.measure(odometry(0.2, 0.0, stamps(turn)), now)
+        if turn > 1:
+            assert wrong in said or "same reading" in said
+    assert "is silent" in motion.look(now).unknown
+
+
+def test_a_clock_of_the_readings_that_is_set_back_is_believed_again_after_a_second():
+    motion, now = Motion(PARAMS, LIMITS, 0.1), 100.0
+    known = []
+    for turn in range(100):
+        now += READING
+        motion.measure(odometry(0.2, 0.0, now - (50.0 if turn > 20 else 0.0)), now)
+        known.append(not motion.look(now).unknown)
+    assert known[:21] == [True] * 21
+    lost = known.index(False)
+    assert 1.0 <= (known.index(True, lost) - 21) * READING <= 1.2
+    assert all(known[known.index(True, lost) :])
+
+
 def test_the_drives_own_velocity_will_do():
     motion = Motion(PARAMS, LIMITS, 0.1)
     twist = Twist(linear=Vector3(x=0.2), angular=Vector3(z=0.1))

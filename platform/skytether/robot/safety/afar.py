@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable
@@ -18,9 +19,10 @@ from typing import Any, Protocol
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import StopOrder
+from skytether.guard.latch import clean
 from skytether.robot.notices import Notices
 
-from .client import GateError, stop
+from .client import GateError, ask, stop
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +32,8 @@ FILE = "afar.json"
 """In the gate's folder: ids of orders that were obeyed."""
 _REMEMBERED = 64
 """Orders; an orchestrator gives a robot one at a time."""
+_LARGEST = 64 * 1024
+"""Bytes of the file: as many ids as are remembered, and more."""
 
 
 class Orders(Protocol):
@@ -52,6 +56,7 @@ class StopFromAfar:
         robot: Its name.
         folder: The gate's.
         stop: Stops the robot; raises GateError if nobody took it.
+        status: Of the gate, and under ``guard`` of the guard; raises GateError.
         clock: Monotonic seconds.
     """
 
@@ -62,15 +67,19 @@ class StopFromAfar:
         folder: Path,
         *,
         stop: Callable[[Path, str], dict[str, Any]] = stop,
+        status: Callable[[Path], dict[str, Any]] = lambda folder: ask(folder, {"do": "status"}),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._client = client
         self._robot = robot
         self._folder = folder
         self._stop = stop
+        self._status = status
         self._clock = clock
         self._notices = Notices(_log)
         self._obeyed = self._read()
+        self._unkept = ""
+        """An order that was obeyed, but is on no disk yet."""
 
     def step(self) -> None:
         """Look once."""
@@ -79,6 +88,8 @@ class StopFromAfar:
             if order is None or order.acknowledged_at is not None or order.robot != self._robot:
                 return
             if order.id not in self._obeyed and not self._obey(order):
+                return
+            if order.id == self._unkept and not self._kept(order):
                 return
             self._client.acknowledge_stop(self._robot, order.id)
         except (ApiError, Unreachable) as error:
@@ -93,28 +104,58 @@ class StopFromAfar:
                 self._notices.say("strange", f"an order to stop could not be read: {error!r}", self._clock())
 
     def _obey(self, order: StopOrder) -> bool:
+        """Whether the robot is stopped, and that is on a disk."""
         try:
-            self._stop(self._folder, f"stopped from afar by {order.by}: {order.reason}")
+            answer = self._stop(self._folder, _reason(order))
         except GateError as error:
             self._notices.say("gate", f"an order to stop could not be obeyed: {error}", self._clock())
             return False
-        _log.warning("stopped from afar by %s: %s", order.by, order.reason)
+        _log.warning("%s", _reason(order))
+        self._unkept = order.id if "note" in answer else ""
         self._obeyed = [*self._obeyed, order.id][-_REMEMBERED:]
         self._write()
+        return not self._unkept
+
+    def _kept(self, order: StopOrder) -> bool:
+        """Whether the stop is on a disk by now, or over: a person has reset the robot. Else it is asked for again."""
+        try:
+            status = self._status(self._folder)
+            guard = status.get("guard") or status
+            if guard.get("stopped") and not guard.get("kept") and "note" in self._stop(self._folder, _reason(order)):
+                sentence = "a stop from afar is in effect, but could not be kept: it is not acknowledged yet"
+                self._notices.say("kept", sentence, self._clock())
+                return False
+        except GateError as error:
+            self._notices.say("gate", f"whether an order to stop was kept is not known: {error}", self._clock())
+            return False
+        self._unkept = ""
         return True
 
     def _read(self) -> list[str]:
+        """Nothing, if it is not a file of this user: a pipe would never end, and another user's ids are not ours."""
         try:
-            found = json.loads((self._folder / FILE).read_text())
-        except (OSError, ValueError):
+            file = os.open(self._folder / FILE, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
+            with open(file, "rb") as opened:
+                about = os.fstat(file)
+                if not stat.S_ISREG(about.st_mode) or about.st_uid != os.geteuid():
+                    return []
+                found = json.loads(opened.read(_LARGEST))
+        except (OSError, ValueError, RecursionError):
             return []
         return [str(one) for one in found][-_REMEMBERED:] if isinstance(found, list) else []
 
     def _write(self) -> None:
         part = self._folder / (FILE + ".new")
         try:
-            part.write_text(json.dumps(self._obeyed))
+            part.unlink(missing_ok=True)  # whatever is there, a link to another file say
+            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as opened:
+                opened.write(json.dumps(self._obeyed))
             os.replace(part, self._folder / FILE)
         except OSError as error:
             sentence = f"an order that was obeyed cannot be kept: {error}; it may stop the robot again once"
             self._notices.say("disk", sentence, self._clock())
+
+
+def _reason(order: StopOrder) -> str:
+    """On one line, and short: it goes to logs and terminals."""
+    return clean(f"stopped from afar by {order.by}: {order.reason}")

@@ -24,6 +24,8 @@ from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Message, Odometry, Twist, TwistStamped
 from skytether.robot.supervisor import Limits
 
+from .stamps import Stamp, StampRule, Stamps, date
+
 _LAGS = 4.0
 _PIECES = 4096
 """Changes of the told velocity that are kept: 8 s at 500 Hz."""
@@ -120,7 +122,7 @@ class Motion:
         self._told: deque[_Piece] = deque(maxlen=_PIECES)
         self._measured = STANDSTILL
         self._measured_at = nan
-        self._stamp = (0, 0)
+        self._stamps = Stamps()
         self._nonsense = ""
         self._since: dict[bool, float] = {}  # of what is outside: whether it is a wheel that stands -> since when
         self._stood = [False, False]
@@ -152,9 +154,11 @@ class Motion:
         twist, stamp = twist_of(message), _stamp(message)
         if twist is None:
             return f"a {message.TYPE} is no odometry"
-        if any(stamp) and stamp == self._stamp:
-            return "sends the same reading again, which counts as silence"
-        self._stamp, self._measured_at = stamp, now
+        dated = date(StampRule.ORDER, self._stamps, stamp, now, self._params.max_age_s)
+        self._stamps = dated.stamps
+        if dated.wrong:
+            return f"{_NOT_NEWER[dated.wrong]}, which counts as silence"
+        self._measured_at = now
         self._measured = Velocity(float(twist.linear.x), float(twist.angular.z))
         finite = isfinite(self._measured.linear) and isfinite(self._measured.angular)
         self._nonsense = "" if finite else "reports a velocity that is no number"
@@ -226,12 +230,18 @@ def twist_of(message: Message) -> Twist | None:
     return message if isinstance(message, Twist) else None
 
 
-def _stamp(message: Message) -> tuple[int, int]:
+def _stamp(message: Message) -> Stamp:
     if isinstance(message, Odometry | TwistStamped):
         return message.header.stamp.sec, message.header.stamp.nanosec
     return 0, 0
 
 
+_NOT_NEWER: Mapping[str, str] = {
+    "repeated": "sends the same reading again",
+    "older": "sends a reading that is older than one before",
+    "unstamped": "sends a reading without a stamp, and had stamps before",
+}
+"""What is wrong with a reading's stamp, by the kind that `stamps.date` tells."""
 _SAYS: Mapping[Fault, str] = {
     Fault.RUNAWAY: "the wheels do not do what they were told",
     Fault.BRAKING: "the wheels do not brake",
