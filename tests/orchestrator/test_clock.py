@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 from nothing_lost import assert_nothing_lost, processes, told
-from orchestrator_program import Program, until, with_toy
+from orchestrator_program import PATIENCE, Program, until, with_toy
 from reconcile_bench import Bench, add
 
-from skytether.api.client import ApiError, Client
+from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
 from skytether.orchestrator.clocks import SetClock
 from skytether.orchestrator.records import Record
@@ -103,7 +103,7 @@ class Faked:
         for name, value in {
             "LD_PRELOAD": library,
             "FAKETIME_TIMESTAMP_FILE": str(self._offset),
-            "FAKETIME_NO_CACHE": "1",
+            "FAKETIME_CACHE_DURATION": "1",  # seconds; without a cache each look at the clock reads the file
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
         }.items():
             monkeypatch.setenv(name, value)
@@ -125,11 +125,12 @@ def test_the_clock_of_a_machine_is_set_under_an_orchestrator(
     runs = processes(program.folder)
     try:
         with with_toy(program.start(), manifest) as client:
-            made = client.wait_running(client.create_instance(InstanceCreate(robot="w", service="toy", lease_s=60)).id)
+            made = client.wait_running(
+                client.create_instance(InstanceCreate(robot="w", service="toy", lease_s=60)).id, PATIENCE
+            )
             at_work = runs()
             asked = TokenCreate(name="short", scopes=("read",), ttl_s=3600)
-            address = (program.folder / "address").read_text().strip()
-            with Client(address, client.create_token(asked).token) as reader:
+            with program.client(client.create_token(asked).token) as reader:
                 for number, (by, good) in enumerate([(HOURS, False), (-HOURS, True)], start=1):
                     faked.set_by(by)
                     until(lambda n=number: program.log.count("leases and waits count anew") == n, program)
@@ -145,5 +146,7 @@ def test_the_clock_of_a_machine_is_set_under_an_orchestrator(
             assert client.get_instance(made.id).restarts == 0
             client.renew_instance(made.id, Renew(lease_s=1))
             assert_nothing_lost(told(client), {made.id: State.STOPPED}, runs)
+    except Exception as error:
+        raise AssertionError(program.last_words()) from error
     finally:
         program.clean_up()

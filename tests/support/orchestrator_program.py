@@ -41,7 +41,10 @@ class Program:
         path = os.pathsep.join([*([str(self.code)] if self.code else []), os.environ.get("PYTHONPATH", "")])
         with (self.folder.parent / "log").open("ab") as log:
             self.process = subprocess.Popen(
-                [*command, "--port", "0", *self.options], stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": path}
+                [*command, "--port", "0", *self.options],
+                stdout=log,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": path, "PYTHONFAULTHANDLER": "1"},
             )
         return self.process
 
@@ -49,9 +52,19 @@ class Program:
         (self.folder / "address").unlink(missing_ok=True)
         self.spawn()
         until(lambda: (self.folder / "address").exists(), self)
-        return Client(
-            (self.folder / "address").read_text().strip(), (self.folder / "operator.token").read_text().strip()
-        )
+        return self.client((self.folder / "operator.token").read_text().strip())
+
+    def client(self, token: str) -> Client:
+        """A patient one: it is not told of a slow machine that nobody answers."""
+        return Client((self.folder / "address").read_text().strip(), token, timeout=PATIENCE)
+
+    def last_words(self) -> str:
+        """End one that did not do what it should; its log, with what each of its threads was at."""
+        assert self.process is not None
+        with contextlib.suppress(ProcessLookupError):
+            self.process.send_signal(signal.SIGABRT)
+        status = self.process.wait(PATIENCE)
+        return f"{self.log}\nstatus {status}"
 
     def end(self, number: int = signal.SIGTERM) -> int:
         assert self.process is not None
