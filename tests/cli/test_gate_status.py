@@ -20,6 +20,7 @@ STATUS = {
     "pid": 8,
     "guard": {"pid": 7, "gate_restarts": 2, "troubles": ["the wheels cannot be told anything"], "not_permitted": []},
 }
+STATUS["guard"]["notes"] = ["the event record /run/x is on a tmpfs"]
 
 
 @pytest.mark.parametrize(
@@ -43,6 +44,7 @@ def test_what_is_not_seen_is_called_unknown(monkeypatch, changes, ahead):
         ({}, "guard     process 7, gate 8, after 2 deaths of the gate"),
         ({}, "trouble   the wheels cannot be told anything"),
         ({}, "note      locking memory is not permitted"),
+        ({}, "note      the event record /run/x is on a tmpfs"),
         ({"guard": None}, "guard     does not answer; the gate stops the wheels itself"),
         (
             {"stopped": "x", "kept": False},

@@ -4,6 +4,9 @@ import fcntl
 import json
 import os
 import socket
+import subprocess
+import sys
+import tempfile
 import time
 
 import pytest
@@ -129,6 +132,61 @@ def test_the_oldest_events_go(monkeypatch, tmp_path):
         assert time.monotonic() < end
         time.sleep(0.001)
     assert [e["detail"] for e in record.decode(path.read_bytes())] == ["6", "7", "8", "9"]
+
+
+def recorded(events, detail="x"):
+    events.add("gate", "trouble", detail, 0.0, 0.0)
+    end = time.monotonic() + 30
+    while not events.written:
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_two_guards_do_not_write_into_one_record(tmp_path):
+    """Each would overwrite the slots of the other."""
+    path = tmp_path / "record"
+    held = (
+        "import fcntl, sys\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "fcntl.lockf(file, fcntl.LOCK_EX)\n"
+        "print('held', flush=True)\n"
+        "sys.stdin.read()"
+    )
+    other = subprocess.Popen([sys.executable, "-c", held, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with other:
+        assert other.stdout.readline() == b"held\n"
+        events = record.Record(str(path), "boot")
+        recorded(events, "lost")
+        assert "another robot's guard writes it" in events.trouble
+        assert path.read_bytes() == b""
+    recorded(events, "kept")
+    assert events.trouble == ""
+    (event,) = record.decode(path.read_bytes())
+    assert (event["detail"], event["lost_before"]) == ("kept", 1)
+
+
+@pytest.mark.parametrize(("kind", "lost"), [("tmpfs", True), ("ramfs", True), ("ext4", False), ("overlay", False)])
+def test_a_record_that_a_reboot_empties_is_found_by_its_file_system(tmp_path, kind, lost):
+    device = os.stat(tmp_path).st_dev
+    mounts = tmp_path / "mountinfo"
+    mounts.write_text(
+        "22 27 0:0 / /proc rw,relatime - proc proc rw\n"
+        f"25 24 {os.major(device)}:{os.minor(device)} / /a\\040b rw shared:7 - {kind} {kind} rw,size=5k\n"
+        "damaged\n"
+    )
+    for path in (tmp_path, tmp_path / "record", tmp_path / "not" / "yet" / "there"):
+        said = record.lost_at_reboot(str(path), str(mounts))
+        assert bool(said) is lost
+        assert not lost or (kind in said and "safety.record" in said)
+    assert record.lost_at_reboot(str(tmp_path), str(tmp_path / "none")) == ""
+
+
+@pytest.mark.skipif(not os.path.ismount("/dev/shm"), reason="no tmpfs here")
+def test_the_guard_knows_that_its_record_is_in_memory():
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        events = record.Record(f"{folder}/record", "boot")
+        recorded(events)
+        assert "is on a tmpfs" in events.note
 
 
 def test_a_record_that_cannot_be_written_is_said(tmp_path):

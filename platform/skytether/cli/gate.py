@@ -106,7 +106,8 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
     troubles = [*answer["troubles"], *(guard["troubles"] if guard else [])]
     for sentence in dict.fromkeys(troubles):
         print(f"trouble   {sentence}")
-    for sentence in dict.fromkeys([*answer["not_permitted"], *(guard["not_permitted"] if guard else [])]):
+    notes = [*answer["not_permitted"], *(guard["not_permitted"] + guard["notes"] if guard else [])]
+    for sentence in dict.fromkeys(notes):
         print(f"note      {sentence}")
 
 

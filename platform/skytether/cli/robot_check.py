@@ -11,6 +11,7 @@ from rich.table import Table
 
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
+from skytether.guard.record import lost_at_reboot
 from skytether.messages import hash_of
 from skytether.robot.ros1 import Ros1RobotConfig
 from skytether.robot.safety.client import GateError, ask, listens
@@ -63,7 +64,7 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         if graph.wheels is not None:
             own = graph.drivers or [resolve(settings.ros1.node if settings.ros1 else "", "/")]
             findings += other_publishers(graph.wheels, node.master.publishers(graph.wheels), own)
-    return [*findings, *plausible(settings), look_at_gate(settings)]
+    return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
 
 
 def plausible(settings: RobotConfig) -> list[Finding]:
@@ -170,6 +171,13 @@ def look_at_gate(settings: RobotConfig) -> Finding:
         return Finding("gate", where, "", str(error), good=False)
     says = f"has the wheels, and is stopped: {stopped}" if stopped else "has the wheels"
     return Finding("gate", where, "", f"{says}{assumed}", good=not stopped)
+
+
+def look_at_record(settings: RobotConfig) -> list[Finding]:
+    """Whether what stopped the robot will be known after a reboot; a warning, for the gate does its work without."""
+    safety = settings.safety
+    lost = "" if safety is None else lost_at_reboot(str(safety.record_file()))
+    return [Finding("event record", "", "", f"warning: {lost}")] if lost else []
 
 
 def _wheels(cmd_vel: str, graph: Ros1RobotConfig, node: Node) -> Finding:

@@ -20,6 +20,7 @@ from .robot_check import (
     forbidden,
     look_at_gate,
     look_at_orchestrator,
+    look_at_record,
     other_publishers,
     plausible,
     show,
@@ -105,7 +106,7 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
                 findings.append(_wheels(config, config.cmd_vel, node))
             found = [endpoint.node for endpoint in node.endpoints(config.wheels, Kind.PUBLISHER)]
             findings += other_publishers(config.wheels, found, config.drivers)
-    return [*findings, *plausible(settings), look_at_gate(settings)]
+    return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
 
 
 def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) -> Finding:

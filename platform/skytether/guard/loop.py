@@ -370,6 +370,7 @@ class Guard:
 
     def _status(self) -> dict[str, object]:
         told, latch = self._watch.told, self._latch
+        self._troubles.pop("record", None)
         if self._record.trouble:
             self._troubles["record"] = self._record.trouble
         return {
@@ -386,5 +387,6 @@ class Guard:
             "seconds": round(self._clock() - self._started, 1),
             "enabled": None if self._enable is None else self._enable.on,
             "not_permitted": list(self._refused),
+            "notes": [self._record.note] if self._record.note else [],
             "troubles": [*self._troubles.values(), *([self._display.trouble] if self._display.trouble else [])],
         }

@@ -6,6 +6,8 @@ line of JSON. Nothing waits for it: a thread writes, and what it cannot write in
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import threading
@@ -16,6 +18,7 @@ SLOTS = 4096
 SLOT_BYTES = 512
 """2 MiB in all: years of a robot that is stopped now and then, hours of one that is ill."""
 _WAITING = 256
+_IN_MEMORY = ("tmpfs", "ramfs", "devtmpfs")
 _DETAIL = 300
 """Characters of a detail; as JSON each may take six bytes, so it is cut again until it fits."""
 
@@ -41,6 +44,34 @@ def decode(data: bytes) -> list[dict[str, object]]:
     return sorted(found, key=lambda event: int(str(event["n"])))
 
 
+def lost_at_reboot(path: str, mounts: str = "/proc/self/mountinfo") -> str:
+    """Says that a reboot empties the file system that a file is on, or will be on; empty: it does not, as far as known.
+
+    By what the kernel says of the file system, whatever the path looks like.
+
+    Args:
+        path: Of the file.
+        mounts: The kernel's list.
+    """
+    place = os.path.abspath(path)
+    while not os.path.exists(place):
+        place = os.path.dirname(place)
+    try:
+        device = os.stat(place).st_dev
+        with open(mounts, encoding="utf-8", errors="replace") as lines:
+            found = [line.split() for line in lines]
+    except OSError:
+        return ""
+    for fields in found:
+        if fields[2:3] == [f"{os.major(device)}:{os.minor(device)}"] and "-" in fields[:-1]:
+            kind = fields[fields.index("-") + 1]
+            if kind in _IN_MEMORY:
+                return (
+                    f"the event record {path} is on a {kind}: a reboot empties it; name a file on a disk: safety.record"
+                )
+    return ""
+
+
 class Record:
     """Writes events.
 
@@ -52,6 +83,8 @@ class Record:
     def __init__(self, path: str, boot: str) -> None:
         self.trouble = ""
         """Why nothing is recorded at the moment; empty: it is."""
+        self.note = ""
+        """What people should know of where it is."""
         self._path = path
         self._boot = boot
         self._waiting: deque[dict[str, object]] = deque()
@@ -95,6 +128,7 @@ class Record:
             try:
                 if file < 0:
                     file = self._open()
+                    self.note = lost_at_reboot(self._path)
                 os.pwrite(file, encode({"n": self._next} | event), self._next % SLOTS * SLOT_BYTES)
                 self._next += 1
                 if not self._waiting:
@@ -110,6 +144,7 @@ class Record:
         os.makedirs(folder, mode=0o750, exist_ok=True)
         file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
         try:
+            self._claim(file)
             os.posix_fallocate(file, 0, SLOTS * SLOT_BYTES)
             events = decode(os.pread(file, SLOTS * SLOT_BYTES, 0))
         except OSError:
@@ -117,3 +152,13 @@ class Record:
             raise
         self._next = int(str(events[-1]["n"])) + 1 if events else 0
         return file
+
+    def _claim(self, file: int) -> None:
+        """Two that write into one file overwrite each other's slots."""
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                return  # a file system without locks
+            sentence = "another robot's guard writes it; name one of this robot's own: safety.record"
+            raise OSError(errno.EBUSY, sentence) from error

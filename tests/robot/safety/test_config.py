@@ -271,6 +271,32 @@ def test_the_usual_record_is_where_a_person_looks_for_it(monkeypatch):
     assert default_record() == of_the_unit == Path("/var/lib/skytether/safety-record")
 
 
+def test_two_gates_of_one_user_have_a_record_each(monkeypatch):
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/walker/state")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1000")
+    usual = default_record()
+    found = []
+    for folder in (
+        "/run/user/1000/skytether",
+        "/run/walkers/one",
+        "/run/walkers/two",
+        "/run/strollers/one",
+        "/run/a b*",
+    ):
+        monkeypatch.setenv("SKYTETHER_GATE_FOLDER", folder)
+        found.append(default_record())
+    assert found[0] == usual
+    assert len(set(found)) == len(found)
+    assert {record.parent for record in found} == {usual.parent}
+    assert [record.name.rpartition("-")[0] for record in found[1:]] == [
+        "safety-record-one",
+        "safety-record-two",
+        "safety-record-one",
+        "safety-record-a_b_",
+    ]
+
+
 @pytest.mark.parametrize(
     ("enable", "words"),
     [

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
 from enum import StrEnum
+from hashlib import sha256
 from pathlib import Path
 
 from skytether.guard.velocity import Velocity
@@ -89,8 +91,10 @@ def default_folder() -> Path:
     Never below a folder that all users share: another one could have been there before, and take a stop in our stead.
     """
     named = os.environ.get("SKYTETHER_GATE_FOLDER")
-    if named:
-        return Path(named)
+    return Path(named) if named else _usual_folder()
+
+
+def _usual_folder() -> Path:
     if os.geteuid() == 0:
         return Path("/run/skytether")
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}")
@@ -100,13 +104,21 @@ def default_folder() -> Path:
 
 
 def default_record() -> Path:
-    """Where the event record is unless it is told otherwise: on a disk that a reboot leaves as it is."""
+    """Where the event record is unless it is told otherwise: on a disk that a reboot leaves as it is.
+
+    A gate in a folder of its own has one of its own: two in one file overwrite each other's events.
+    """
+    name = "safety-record"
+    folder = default_folder().absolute()
+    if folder != _usual_folder().absolute():
+        told_apart = sha256(bytes(folder)).hexdigest()[:8]
+        name = f"{name}-{re.sub('[^A-Za-z0-9_.-]', '_', folder.name)[:32]}-{told_apart}"
     if os.geteuid() == 0:
-        return Path("/var/lib/skytether/safety-record")
+        return Path("/var/lib/skytether") / name
     own = os.environ.get("STATE_DIRECTORY")  # StateDirectory= of systemd: the service's own, and nobody else's
     if own:
-        return Path(own.split(":")[0]) / "safety-record"
-    return _state_folder() / "safety-record"
+        return Path(own.split(":")[0]) / name
+    return _state_folder() / name
 
 
 def _state_folder() -> Path:

@@ -6,6 +6,7 @@ import os
 import sys
 from typing import NoReturn
 
+from skytether.guard.record import lost_at_reboot
 from skytether.guard.settings import Settings, dump, freeze
 
 from .address import address
@@ -50,6 +51,9 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
     wheels = str(config.place() / WHEELS_SOCKET) if sockets.wheels is None else address(sockets.wheels)
     say = [f"guards the wheels; its sockets are in {config.place()}"]
     say += [f"safety.{note}" for note in config.notes()]
+    lost = lost_at_reboot(str(config.record_file()))
+    if lost:
+        say.append(lost)
     if not config.sensors:
         say.append("safety.sensors is empty: the robot does not see what it drives into")
     return Settings(
