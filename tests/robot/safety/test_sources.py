@@ -1,6 +1,7 @@
 """Who drives, with made-up time: sequences of presses, losses, resets, locks and commands, against plain oracles."""
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from math import inf, nan
 
 import numpy as np
@@ -22,6 +23,8 @@ from skytether.robot.safety.sources import Hand, LockParams, OnSilence, SourcePa
 from skytether.robot.supervisor import Limits
 
 PERIOD = 0.01
+TIMEOUT = 0.5
+"""Of the source that is looked at."""
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
 PAD = JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4, deadzone=0.0)
 NAVIGATION, KEYBOARD = SourceParams("navigation", 20, 0.5), SourceParams("keyboard", 50, 0.3, stamped=True)
@@ -211,37 +214,82 @@ def test_a_button_that_is_down_at_the_start_holds_the_robot_until_it_is_let_go()
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from([0.0, 0.0005, 0.2, -0.1]), st.floats(0.01, 0.3)), max_size=30))
-def test_a_source_is_neutral_when_it_wanted_nothing_else_for_long_enough(wants):
-    state, now, since = neutral.require("a reset"), 10.0, None
-    free = False
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.0005, 0.0, 0.2]), st.sampled_from([0.02, 0.06, 0.1, 0.3, 0.6]))))
+def test_a_source_is_neutral_when_it_said_nothing_else_for_long_enough(wants):
+    """The oracle looks back from each message: how much of the time since the last other one, or silence, was said."""
+    state, now, heard, free = neutral.require("a reset"), 10.0, [], False
     for value, then in wants:
         now += then
-        free = free or (since is not None and now - since >= NEUTRAL_S)
-        since = None if abs(value) > 0.001 else (now if since is None else since)
-        state = neutral.want(state, Velocity(value, 0.0), now)
+        if abs(value) > 0.001 or then > TIMEOUT:
+            heard = []
+        if abs(value) <= 0.001:
+            heard.append(now)
+        free = free or sum(min(0.1, later - earlier) for earlier, later in pairwise(heard)) >= NEUTRAL_S - 1e-6
+        state = neutral.want(state, Velocity(value, 0.0), now, TIMEOUT)
         assert (not state.why) is free
+
+
+@pytest.mark.parametrize(("rate_hz", "messages"), [(50, 11), (20, 5), (10, 3), (5, 3), (2.5, 3)])
+def test_how_many_messages_make_a_source_neutral(rate_hz, messages):
+    state = neutral.require("a reset")
+    for k in range(messages):
+        assert state.why
+        state = neutral.want(state, STANDSTILL, 10.0 + k / rate_hz, TIMEOUT)
+    assert not state.why
 
 
 def test_a_standstill_that_nobody_wants_is_not_neutral():
     """An agent that hung, or whose service is not heard, says it for want of a better word."""
     state = neutral.require("a reset")
     for turn in range(100):
-        state = neutral.want(state, STANDSTILL, 10.0 + 0.02 * turn, decided=False)
-    assert neutral.look(state, 20.0).why
-    state = neutral.want(state, STANDSTILL, 20.0)
-    state = neutral.want(state, STANDSTILL, 20.1, decided=False)
-    state = neutral.want(state, STANDSTILL, 20.15)
-    assert neutral.look(state, 20.3).why
-    assert not neutral.look(state, 20.4).why
+        state = neutral.want(state, STANDSTILL, 10.0 + 0.02 * turn, TIMEOUT, decided=False)
+        assert state.why
+    for at, decided in ((20.0, True), (20.1, False), (20.15, True), (20.25, True)):
+        state = neutral.want(state, STANDSTILL, at, TIMEOUT, decided)
+        assert state.why
+    assert not neutral.want(state, STANDSTILL, 20.35, TIMEOUT).why
 
 
 @pytest.mark.parametrize("now", [inf, -inf, nan])
 def test_a_clock_that_is_no_number_makes_nobody_neutral(now):
-    state = neutral.want(neutral.require("a reset"), STANDSTILL, 10.0)
-    assert neutral.look(state, now).why
+    state = neutral.require("a reset")
+    for when in (10.0, 10.09, now, now, 10.09, now):
+        state = neutral.want(state, STANDSTILL, when, TIMEOUT)
+        assert state.why
     up, _ = joystick.hear(PAD, Joystick(), joy(0.0, 0.0, held=False), 10.0)
     assert joystick.hear(PAD, up, joy(1.0, 0.0), now)[0].grip is not Grip.HELD
+
+
+@pytest.mark.parametrize(("said_s", "silent_s"), [(0.12, 0.14), (0.12, 0.44), (0.02, 0.4)])
+def test_a_standstill_that_is_only_held_is_not_wanted(said_s, silent_s):
+    """Within its timeout (0.5 s) such a source counts as wanting a standstill, but it does not say so."""
+    bench = Bench()
+    bench.says["nav_vel"] = twist(0.3)
+    bench.run(0.5)
+    bench.says["nav_vel"] = twist(0.0)
+    bench.run(said_s)
+    del bench.says["nav_vel"]
+    bench.run(silent_s)
+    bench.says["nav_vel"] = twist(0.3)
+    assert bench.run(1.0).velocity == STANDSTILL
+    assert "navigation" in bench.gate.waiting
+    bench.says["nav_vel"] = twist(0.0)
+    bench.run(0.24)
+    bench.says["nav_vel"] = twist(0.3)
+    bench.run(1.5)
+    assert bench.wheels == pytest.approx(0.3)
+
+
+def test_a_standstill_before_a_silence_does_not_count_after_it():
+    bench = Bench()
+    bench.says["nav_vel"] = twist(0.0)
+    bench.run(0.1)
+    del bench.says["nav_vel"]
+    bench.run(0.6)
+    bench.says["nav_vel"] = twist(0.0)
+    bench.run(0.1)
+    bench.says["nav_vel"] = twist(0.3)
+    assert bench.run(1.0).velocity == STANDSTILL
 
 
 def test_a_gate_that_was_started_lets_nobody_go_on_with_what_was_before():
@@ -408,9 +456,10 @@ def test_the_highest_that_wants_to_drives_and_gives_back_when_it_falls_silent():
 def test_a_source_that_sends_one_stamp_again_and_again_is_silent():
     bench = Bench()
     bench.agent = None
-    bench.says["key_vel"] = stamped(0.0, 7.0)
-    bench.run(0.3)
-    bench.says["key_vel"] = stamped(0.4, 8.0)
+    for _ in range(30):
+        bench.gate.sense("key_vel", stamped(0.0, bench.now), bench.now)
+        bench.run()
+    bench.says["key_vel"] = stamped(0.4, bench.now + 8.0)
     bench.run(0.1)
     assert bench.wheels > 0
     assert bench.run(1.0).velocity == STANDSTILL

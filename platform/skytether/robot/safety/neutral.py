@@ -7,13 +7,18 @@ after a standstill does, for somebody decided on it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf, nan
+from math import nan
 
 from skytether.control.admittance import Velocity
 
 NEUTRAL_S = 0.2
 """How long a source must have wanted a standstill, and nothing else [s]. Longer than a queue on the way holds, shorter
 than a person notices."""
+_VOUCHED_S = NEUTRAL_S / 2
+"""How much of the time before it a message speaks for at most [s]: a value that is only held is not said, so it takes
+three messages, however far apart they are."""
+_ROUNDING_S = 1e-6
+"""Of sums of times."""
 _STANDSTILL = Velocity(1e-3, 1e-3)
 """What counts as one [m/s, rad/s]: the rest of a ramp, a stick that is not quite in its middle."""
 
@@ -23,11 +28,13 @@ class Neutral:
     """What is remembered of one source.
 
     Attributes:
-        still_since: Since when it has wanted nothing but a standstill; NaN: it has not.
+        said_s: For how long it has said standstill and nothing else [s].
+        heard_at: When it said so last; NaN: it did not, or said something else since.
         why: What it has to be neutral after, for people; empty: it may drive.
     """
 
-    still_since: float = nan
+    said_s: float = 0.0
+    heard_at: float = nan
     why: str = ""
 
 
@@ -36,23 +43,20 @@ def require(why: str) -> Neutral:
     return Neutral(why=why)
 
 
-def want(before: Neutral, velocity: Velocity, now: float, decided: bool = True) -> Neutral:
-    """The source wants a velocity; it is neutral when it goes on to another one after a long enough standstill.
+def want(before: Neutral, velocity: Velocity, now: float, timeout_s: float, decided: bool = True) -> Neutral:
+    """The source wants a velocity; it may drive once it was neutral for long enough.
 
     Args:
         before: What is remembered.
         velocity: Wanted.
-        now: [s]
+        now: When it was heard [s].
+        timeout_s: A source that was silent for longer begins anew [s].
         decided: False: a standstill is told because nothing better is known; nobody wants it.
     """
-    before = look(before, now)
     if not before.why:
         return before
     if not decided or not all(abs(value) <= most for value, most in zip(velocity, _STANDSTILL, strict=True)):
-        return replace(before, still_since=nan)
-    return before if before.still_since <= now else replace(before, still_since=now)
-
-
-def look(before: Neutral, now: float) -> Neutral:
-    """Whether it may drive by now. One that wanted a standstill and then fell silent wants it still."""
-    return Neutral() if before.why and NEUTRAL_S <= now - before.still_since < inf else before
+        return require(before.why)
+    gap = now - before.heard_at
+    said = before.said_s + min(gap, _VOUCHED_S) if 0 <= gap <= timeout_s else 0.0
+    return Neutral() if said >= NEUTRAL_S - _ROUNDING_S else replace(before, said_s=said, heard_at=now)

@@ -234,12 +234,8 @@ class Sources:
         source = self._sources.get(command.source)
         if source is not None:
             wanted = Velocity(command.linear, command.angular)
-            self._sources[command.source] = replace(
-                source,
-                wanted=wanted,
-                heard_at=now,
-                neutral=neutral.want(source.neutral, wanted, now, command.decided),
-            )
+            heard = neutral.want(source.neutral, wanted, now, source.timeout_s, command.decided)
+            self._sources[command.source] = replace(source, wanted=wanted, heard_at=now, neutral=heard)
 
     def look(self, now: float, troubles: dict[str, str]) -> str:
         """Who drives now.
@@ -252,8 +248,6 @@ class Sources:
         if rules.joystick is not None:
             self._joystick = joystick.look(rules.joystick, self._joystick, now)
         floor = max(self._floor_of_locks(now, troubles), self._floor_of_joystick(troubles))
-        for name, source in self._sources.items():
-            self._sources[name] = replace(source, neutral=neutral.look(source.neutral, now))
         if self._stops(now, troubles):
             return Hand.NOBODY
         return self._first(floor, now, troubles)
