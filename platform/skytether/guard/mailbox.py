@@ -10,6 +10,7 @@ import os
 import socket
 from contextlib import suppress
 
+from .descriptors import refuse
 from .wheels import Address
 
 MODE = 0o660
@@ -25,6 +26,8 @@ def bind(address: Address, mode: int = MODE) -> socket.socket:
     family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET6 if ":" in address[0] else socket.AF_INET
     made = socket.socket(family, socket.SOCK_DGRAM)
     made.setblocking(False)
+    if family == socket.AF_UNIX:
+        refuse(made)
     try:
         if isinstance(address, str):
             with suppress(FileNotFoundError):

@@ -12,6 +12,7 @@ import socket
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
+from .descriptors import receive, refuse
 from .folder import peer
 
 _CLIENTS = 16
@@ -44,6 +45,7 @@ class Requests:
             os.unlink(path)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.setblocking(False)
+        refuse(self._listener)  # its clients are as it is
         before = os.umask(0o177)
         try:
             self._listener.bind(path)
@@ -91,7 +93,7 @@ class Requests:
 
     def _take(self, client: socket.socket) -> None:
         try:
-            data = client.recv(_LARGEST)
+            data, _, _ = receive(client, _LARGEST)
         except BlockingIOError:
             return
         except OSError:

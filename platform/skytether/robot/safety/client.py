@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.guard.clock import now as boottime
+from skytether.guard.descriptors import receive, refuse
 from skytether.guard.folder import objection, peer, sender, trusted
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.velocity import Velocity
@@ -50,6 +51,7 @@ class GateLink:
         self._state: GateState | None = None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        refuse(self._socket)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         self._trusted: tuple[int, ...] = ()
         """Who may be the gate; empty: its folder has not been looked at."""
@@ -78,7 +80,7 @@ class GateLink:
         """The newest that the gate answered; None: nothing yet. Its ``at`` says how old it is. Never waits."""
         for _ in range(_MOST_STATES):
             try:
-                data, ancillary, _, name = self._socket.recvmsg(_LARGEST_STATE, _ANCILLARY)
+                data, ancillary, name = receive(self._socket, _LARGEST_STATE, _ANCILLARY)
             except OSError:  # nothing waits
                 break
             # The name of our socket is open to everybody; the gate's is not, but for who has folders of his own.

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from skytether.guard import teller, wheels
+from skytether.guard.descriptors import receive as receive_one
 from skytether.guard.mailbox import bind
 from skytether.messages import Message, PointCloud2
 
@@ -147,7 +148,8 @@ def receive_from(source: socket.socket, largest: int, most: int) -> list[tuple[b
     found: list[tuple[bytes, object]] = []
     while len(found) < most:
         try:
-            found.append(source.recvfrom(largest))
+            data, _, sender = receive_one(source, largest)
+            found.append((data, sender))
         except BlockingIOError:
             break
         except OSError:  # what was sent before found nobody
@@ -157,12 +159,4 @@ def receive_from(source: socket.socket, largest: int, most: int) -> list[tuple[b
 
 def receive(source: socket.socket, largest: int, most: int) -> list[bytes]:
     """What waits in a socket that never waits, at most so many."""
-    found: list[bytes] = []
-    while len(found) < most:
-        try:
-            found.append(source.recv(largest))
-        except BlockingIOError:
-            break
-        except OSError:  # what was sent before found nobody: that is said by the next write
-            continue
-    return found
+    return [data for data, _ in receive_from(source, largest, most)]
