@@ -8,10 +8,12 @@ import pytest
 from skytether.bridge import BridgeError, Relay, RelayLimits
 from skytether.bridge.datagrams import DatagramSocket
 from skytether.lab.link import LinkEmulator
+from skytether.wire import packet
 from skytether.wire.events import Connected, PeerMoved
 from skytether.wire.topic import Role
 
 LOCAL = ("127.0.0.1", 0)
+HELLO = bytes([packet.HELLO])
 SESSION = "0000000000000007"
 """Of the fixture `ends`."""
 
@@ -157,7 +159,7 @@ def test_floods_of_unknown_and_forged_packets_disturb_no_session(ends, relays, t
     answered = relay.stats().newcomers.packets_down  # the handshake
     strangers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(100)]
     try:
-        unknown, forged = b"\x10" + bytes(1100), b"\x10" + bytes.fromhex(SESSION) + os.urandom(1100)
+        unknown, forged = b"\x10" + bytes(1100), HELLO + bytes.fromhex(SESSION) + os.urandom(1100)
         for _ in range(20):
             for stranger in strangers:
                 stranger.sendto(unknown, relay.address)
@@ -189,7 +191,7 @@ def test_who_is_not_the_target_cannot_speak_to_a_robot_through_its_leg(ends, rel
     leg = service.stats().paths[0].address
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for _ in range(10):
-            stranger.sendto(b"\x10" + bytes.fromhex(SESSION) + bytes(100), ("127.0.0.1", leg[1]))
+            stranger.sendto(HELLO + bytes.fromhex(SESSION) + bytes(100), ("127.0.0.1", leg[1]))
     wait_for(lambda: relay.stats().rejected.get("stranger") == 10)
     assert not robot.stats().rejected
     assert robot.stats().paths[0].packets_received >= received
@@ -205,7 +207,7 @@ def test_without_descriptors_newcomers_are_refused_and_counted(ends, relays, thr
 
     monkeypatch.setattr("skytether.bridge.relay.DatagramSocket", refuse)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        stranger.sendto(b"\x10" + bytes.fromhex(SESSION) + bytes(100), relay.address)
+        stranger.sendto(HELLO + bytes.fromhex(SESSION) + bytes(100), relay.address)
         wait_for(lambda: relay.stats().rejected.get("no_port") == 1)
     exchange(service, robot)
     assert relay.stats().legs == 1

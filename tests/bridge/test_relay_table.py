@@ -21,7 +21,13 @@ ROBOT = ("192.0.2.1", 5000)
 
 
 def packet(session_id, size=100):
-    return (b"\x10" + session_id.to_bytes(8, "big")).ljust(size, b"x")
+    """HELLO of a robot."""
+    return (b"\x21" + session_id.to_bytes(8, "big")).ljust(size, b"x")
+
+
+def data(session_id, size=100, handshake=0):
+    """Any other packet of that session, under the keys of one of its handshakes."""
+    return (b"\x20" + (1000 * (handshake + 1) + session_id).to_bytes(8, "big")).ljust(size, b"x")
 
 
 def table(*routes, **limits):
@@ -33,7 +39,7 @@ def table(*routes, **limits):
 
 def admit(relay, session_id=7, source=ROBOT, now=0.0):
     leg = relay.up(packet(session_id), source, now)
-    assert relay.down(leg, packet(session_id), leg.route.target, now)
+    assert relay.down(leg, data(session_id), leg.route.target, now)
     assert relay.up(packet(session_id), source, now) is leg
     return leg
 
@@ -82,8 +88,8 @@ def test_a_target_may_move_and_its_sessions_go_on():
     leg = admit(relay)
     relay.add(Prefix.parse("*"), OTHER, 1.0)
     assert relay.up(packet(7), ROBOT, 1.0) is leg
-    assert relay.down(leg, packet(7), OTHER, 1.0)
-    assert not relay.down(leg, packet(7), SERVICE, 1.0)
+    assert relay.down(leg, data(7), OTHER, 1.0)
+    assert not relay.down(leg, data(7), SERVICE, 1.0)
 
 
 def test_a_new_route_takes_its_sessions_and_a_removed_one_ends_them():
@@ -104,27 +110,29 @@ def test_a_new_route_takes_its_sessions_and_a_removed_one_ends_them():
 def test_only_the_target_gets_through_to_a_robot_and_only_with_its_session():
     relay = table()
     leg = admit(relay)
-    assert not relay.down(leg, packet(7), OTHER, 1.0)
-    assert not relay.down(leg, packet(8), SERVICE, 1.0)
+    admit(relay, 8)
+    assert not relay.down(leg, data(7), OTHER, 1.0)
+    assert not relay.down(leg, data(8), SERVICE, 1.0)
+    assert not relay.down(leg, packet(7), SERVICE, 1.0)  # a target asks for nothing
     assert not relay.down(leg, b"short", SERVICE, 1.0)
-    assert relay.rejected == {"stranger": 1, "session": 2}
+    assert relay.rejected == {"stranger": 1, "session": 3}
 
 
 def test_a_newcomer_gets_a_small_multiple_of_what_it_sent_until_it_speaks_after_an_answer():
     relay = table()
     leg = relay.up(packet(7, 100), ROBOT, 0.0)
-    assert relay.down(leg, packet(7, 300), SERVICE, 0.0)
-    assert not relay.down(leg, packet(7, 100), SERVICE, 0.0)
+    assert relay.down(leg, data(7, 300), SERVICE, 0.0)
+    assert not relay.down(leg, data(7, 100), SERVICE, 0.0)
     assert relay.rejected == {"amplification": 1}
     assert relay.up(packet(7, 100), ROBOT, 0.1) is leg
-    assert relay.down(leg, packet(7, 5000), SERVICE, 0.1)
+    assert relay.down(leg, data(7, 5000), SERVICE, 0.1)
 
 
 def test_a_robot_on_the_move_is_not_held_up():
     relay = table()
     admit(relay)
     leg = relay.up(packet(7, 100), ("198.51.100.9", 1), 1.0)
-    assert relay.down(leg, packet(7, 50_000), SERVICE, 1.0)
+    assert relay.down(leg, data(7, 50_000), SERVICE, 1.0)
     assert leg.session is relay.sessions[7]
 
 
@@ -138,7 +146,7 @@ def test_addresses_of_a_session_have_legs_of_their_own():
 def test_the_address_that_was_not_answered_for_longest_makes_room():
     relay = table(addresses=2)
     first, second = admit(relay, 7, ("a", 1), 0.0), admit(relay, 7, ("b", 1), 1.0)
-    relay.down(first, packet(7), SERVICE, 2.0)  # the robot is still there
+    relay.down(first, data(7), SERVICE, 2.0)  # the robot is still there
     third = admit(relay, 7, ("c", 1), 3.0)
     assert list(relay.closed) == [second]
     assert set(relay.sessions[7].legs.values()) == {first, third}
@@ -161,7 +169,7 @@ def test_further_sessions_than_there_is_room_for_disturb_none():
     relay = table(sessions=1)
     admit(relay, 7)
     late = relay.up(packet(8), ROBOT, 0.0)
-    assert relay.down(late, packet(8), SERVICE, 0.0)
+    assert relay.down(late, data(8), SERVICE, 0.0)
     assert relay.up(packet(8), ROBOT, 0.0) is late
     assert set(relay.sessions) == {7}
     assert relay.rejected == {"sessions_full": 1}
@@ -180,7 +188,7 @@ def test_a_session_has_a_rate_in_each_direction_and_others_have_theirs():
     relay = table(rate_bps=8e4, burst=0.1)  # 10 kB/s, 1 kB at once
     leg, other = admit(relay, 7), admit(relay, 8)
     up = sum(relay.up(packet(7, 500), ROBOT, 1.0) is not None for _ in range(100))
-    down = sum(relay.down(leg, packet(7, 500), SERVICE, 1.0) for _ in range(100))
+    down = sum(relay.down(leg, data(7, 500), SERVICE, 1.0) for _ in range(100))
     assert (up, down) == (2, 2)
     assert relay.sessions[7].dropped == 196
     assert relay.up(packet(8, 500), ROBOT, 1.0) is other
@@ -197,10 +205,52 @@ def test_a_flood_from_made_up_addresses_touches_no_session_that_runs():
         through += relay.up(packet(7, 1200), (f"198.51.100.{i % 256}", i % 40_000), now) is not None
         if i % 100 == 0:
             assert relay.up(packet(7, 200), ROBOT, now) is leg
-            assert relay.down(leg, packet(7, 200), SERVICE, now)
+            assert relay.down(leg, data(7, 200), SERVICE, now)
     assert through * 1200 <= 2 * 1e6 + 1e6 * 0.05 + 1200  # the target gets no more of it than one session's rate
     assert len(relay.legs) <= 1 + 16
     assert leg in relay.legs
+
+
+# --- ids that change with each handshake ---------------------------------------------------------------------------
+
+
+def test_packets_are_known_by_the_ids_that_their_target_uses():
+    relay = table()
+    assert relay.up(data(7), ROBOT, 0.0) is None  # before any handshake
+    leg = admit(relay)
+    assert relay.up(data(7), ROBOT, 1.0) is leg
+    assert relay.up(data(7, handshake=1), ROBOT, 1.0) is None
+    assert relay.down(leg, data(7, handshake=1), SERVICE, 1.0)  # WELCOME
+    moved = relay.up(data(7, handshake=1), ("198.51.100.9", 1), 1.0)
+    assert (moved.session_id, moved.route.target) == (7, SERVICE)
+    assert relay.rejected == {"unknown": 2}
+
+
+def test_a_session_id_is_good_for_nothing_but_a_hello():
+    relay = table()
+    admit(relay)
+    assert relay.up(b"\x20" + packet(7)[1:], ROBOT, 1.0) is None
+
+
+def test_a_target_cannot_take_another_sessions_packets():
+    relay = table(("0000000000000007", SERVICE), ("*", OTHER))
+    leg, hostile = admit(relay, 7), admit(relay, 8)
+    assert not relay.down(hostile, data(7), OTHER, 1.0)
+    assert relay.up(data(7), ("198.51.100.9", 1), 1.0).route.target == SERVICE
+    # Not even by an id that is a session's own.
+    assert relay.down(hostile, b"\x20" + packet(7)[1:], OTHER, 1.0)
+    assert relay.up(packet(7), ROBOT, 1.0) is leg
+
+
+def test_ids_are_few_and_end_with_their_addresses():
+    relay = table()
+    leg = admit(relay)
+    for handshake in range(1, 9):
+        assert relay.down(leg, data(7, handshake=handshake), SERVICE, 1.0)
+    assert relay.up(data(7, handshake=8), ROBOT, 1.0) is leg
+    assert relay.up(data(7, handshake=1), ROBOT, 1.0) is None
+    relay.close(leg)
+    assert relay.up(data(7, handshake=8), ROBOT, 1.0) is None
 
 
 # --- any packets in any order --------------------------------------------------------------------------------------
@@ -225,9 +275,9 @@ class RelayMachine(RuleBasedStateMachine):
 
     @rule(session_id=IDS, source=SOURCES, size=SIZES)
     def from_a_robot(self, session_id, source, size):
-        data = packet(session_id, size)[:size]
+        sent = packet(session_id, size)[:size]
         before = self.relay.rejected.total()
-        leg = self.relay.up(data, source, self.now)
+        leg = self.relay.up(sent, source, self.now)
         assert (leg is None) == (self.relay.rejected.total() > before) or "sessions_full" in self.relay.rejected
         if leg is not None:
             assert (leg.session_id, leg.source) == (session_id, source)
@@ -241,11 +291,10 @@ class RelayMachine(RuleBasedStateMachine):
     )
     def from_a_target(self, pick, session_id, origin, size):
         leg = self.relay.legs[pick % len(self.relay.legs)]
-        data = packet(session_id or leg.session_id, size)[:size]
+        answer = data(session_id or leg.session_id, size)[:size]
         newcomer = leg.session_id not in self.relay.sessions
-        if self.relay.down(leg, data, origin or leg.route.target, self.now):
+        if self.relay.down(leg, answer, origin or leg.route.target, self.now):
             assert origin in (None, leg.route.target)
-            assert session_id in (None, leg.session_id)
             self.went[leg] = self.went.get(leg, 0) + size
             if newcomer:
                 assert self.went[leg] <= AMPLIFICATION * self.came[leg]

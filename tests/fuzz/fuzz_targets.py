@@ -31,6 +31,7 @@ from skytether.wire.handshake import (
     _key,
     _pack,
 )
+from skytether.wire.message import Message
 from skytether.wire.reassembly import Reassembly
 from skytether.wire.receiver import Receiver
 from skytether.wire.table import MAX_TOPICS, index_topics, pull_answer, pull_offer
@@ -72,7 +73,7 @@ class Script:
 def headers(data: bytes) -> None:
     """Codecs of the clear header, and how a relay splits a batch."""
     fields = packet.pull_header(data)
-    assert (fields is None) == (packet.peek_session_id(data) is None) == (len(data) < packet.HEADER_SIZE)
+    assert (fields is None) == (packet.peek_id(data) is None) == (len(data) < packet.HEADER_SIZE)
     if fields is not None:
         common = packet.push_common(*fields[:6])
         assert common + packet.push_shard(*fields[6:]) == data[: packet.HEADER_SIZE]
@@ -101,7 +102,7 @@ def tables(data: bytes) -> None:
 def hellos(data: bytes) -> None:
     """The service's answer to what a robot says that holds the key."""
     entropy = Random(1).randbytes
-    door = Doorkeeper(SESSION_ID, KEY, index_topics(TOPICS), entropy)
+    door = Doorkeeper(KEY, index_topics(TOPICS), entropy)
     offer = zlib.compress(data[HELLO_HEAD:])
     text = data[:HELLO_HEAD].ljust(HELLO_HEAD, b"\0") + len(offer).to_bytes(4, "big") + offer
     salt = entropy(32)
@@ -210,14 +211,16 @@ def strangers(data: bytes) -> None:
     end = ends.ends[role]
     ends.drain(role)
     before = end.stats(ends.now)
-    epoch = end._epoch.id
+    paths = [(p.packets_received, p.loss_in) for p in before.paths]
+    packet_id, epoch = end._epoch.ciphers.packet_id, end._epoch.id
     while not script.over:
         op = script.number()
         body = script.take(script.number() * (8 if op & 64 else 1))
         if op & 1:
-            header = (packet.DATA, packet.DATA, packet.HELLO, packet.WELCOME)[op >> 1 & 3]
+            header = (packet.DATA, packet.SHARD, packet.HELLO, packet.WELCOME)[op >> 1 & 3]
             length = len(body) if op & 8 else script.number(3)
-            common = packet.push_common(header, SESSION_ID, epoch, script.number(), script.number() % 8, length)
+            named = SESSION_ID if header == packet.HELLO else packet_id
+            common = packet.push_common(header, named, epoch, script.number(), script.number() % 8, length)
             body = (
                 common
                 + packet.push_shard(script.number() % 3, script.number(), 0, script.number(4), script.number(2))
@@ -234,6 +237,8 @@ def strangers(data: bytes) -> None:
     after = end.stats(ends.now)
     assert (after.connected, after.handshakes, after.clock_offset) == (True, before.handshakes, before.clock_offset)
     assert [p.address for p in after.paths] == [p.address for p in before.paths]
+    assert [(p.packets_received, p.loss_in) for p in after.paths] == paths
+    assert end._receiver.messages.used == 0
     assert [(t.delivered, t.sent) for t in after.topics] == [(t.delivered, t.sent) for t in before.topics]
     ends.check(role)
 
@@ -262,9 +267,13 @@ def peers(data: bytes) -> None:
             sequence = script.number(4) if op & 16 else number % 1000
             plaintext = struct.pack(">IQ", sequence, stamp) + script.take(script.number())
             path = script.number() if op & 32 else 0
-            common = packet.push_common(packet.DATA, SESSION_ID, peer.id, number, topic, len(plaintext) + 16)
-            sealed = peer.ciphers.seal(number, plaintext, common)
-            whole = common + packet.push_shard(0, 0, path, number, 0) + sealed
+            message = Message(peer.ciphers, peer.id, number, topic, plaintext)
+            if op & 128:
+                shards = message.shards(script.number(2) % 1200 + 240)
+                whole = bytes(shards.take(1 + script.number() % shards.remaining, path, number, 0))
+                end.receive(whole, "elsewhere", ends.now, segment=shards.packet_size)
+                continue
+            whole = message.packet(path, number, 0)
             end.receive(whole, "elsewhere" if op & 64 else other(role).value, ends.now)
         ends.drain(role)
         ends.check(role)
@@ -288,7 +297,9 @@ def relays(data: bytes) -> None:
     while not script.over:
         op = script.number()
         kind, size = op & 3, script.number(2) % 1500
-        body = (b"\x10" + bytes([op >> 2 & 3]) + bytes(6) + bytes([op >> 4])).ljust(size, b"x")[:size]
+        hello = kind == 1 and not op & 128
+        first = b"\x21" if hello else b"\x20"
+        body = (first + bytes([op >> 2 & 3]) + bytes(6) + bytes([op >> 4])).ljust(size, b"x")[:size]
         if kind == 0:
             now += size / 100
             table.expire(now)

@@ -110,7 +110,7 @@ def test_another_version_gets_no_answer(world):
     link = world.link(connect=False, record=True, up=LinkConditions(cut=True))
     link.run(0.01)
     hello = bytearray(hellos(link)[0])
-    hello[0] = 2 << 4 | 1
+    hello[0] = (packet.VERSION - 1) << 4 | 1
     link.inject(SERVICE, bytes(hello))
     assert rejected(link, SERVICE) == {"version": 1}
     assert link.sent[SERVICE] == []
@@ -305,7 +305,7 @@ def relay(link, first):
 
 
 def test_used_hellos_and_pending_handshakes_are_bounded(world, topics):
-    door = Doorkeeper(1, bytes(32), {t.name: t for t in topics}, world.random.randbytes)
+    door = Doorkeeper(bytes(32), {t.name: t for t in topics}, world.random.randbytes)
     from skytether.wire.handshake import NO_KEYS, Hello
 
     for i in range(Doorkeeper.MAX_USED + 100):

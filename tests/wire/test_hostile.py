@@ -9,15 +9,14 @@ from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Role, packet
-from skytether.wire.handshake import MAX_HANDSHAKE
 from skytether.wire.sender import OVERHEAD
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 SESSION_ID = 0x1122334455667788
 REASONS = {
     "short", "version", "session", "type", "epoch", "path", "topic", "shape", "too_large", "implausible", "old",
-    "forged", "evicted", "unasked", "control", "compressed", "hello_forged", "hello_replayed", "hello_malformed",
-    "welcome_forged",
+    "forged", "repeated", "evicted", "unasked", "control", "compressed", "hello_forged", "hello_replayed",
+    "hello_malformed", "welcome_forged",
 }  # fmt: skip
 """Bounded, for metrics."""
 
@@ -30,13 +29,14 @@ def state(link, role):
     return topics, paths, stats.connected, stats.handshakes, stats.clock_offset, len(link.events[role])
 
 
-def forged(random, epoch):
-    """A packet that is as plausible as a stranger can make it who has seen the session's packets."""
-    size = random.choice((1, 100, 300, 1170))
+def forged(random, seen):
+    """A packet that is as plausible as a stranger can make it who has seen one of the session's packets."""
+    _, packet_id, epoch, *_ = packet.pull_header(seen)
+    size = random.choice((1, 100, 300, 1168))
     length = random.choice((0, 1, size, 2 * size, 30 * size, 16 * 2**20 + OVERHEAD, 2**32 - 1))
     common = packet.push_common(
-        random.choice((packet.DATA,) * 8 + (packet.HELLO, packet.WELCOME, 0x13, 0x20)),
-        SESSION_ID if random.random() < 0.95 else random.getrandbits(64),
+        random.choice((packet.DATA, packet.SHARD) * 4 + (packet.HELLO, packet.WELCOME, 0x13, 0x2F)),
+        random.choice((packet_id,) * 16 + (SESSION_ID,) * 3 + (random.getrandbits(64),)),
         epoch if random.random() < 0.9 else random.randrange(256),
         random.choice((random.randrange(100), random.randrange(70_000), random.getrandbits(48))),
         random.choice((0, 1, 2, 3, 4, 5, 6, 65_535)),
@@ -49,7 +49,7 @@ def forged(random, epoch):
         random.getrandbits(32),
         random.getrandbits(16),
     )
-    return common + header + random.randbytes(size)
+    return common + header + random.randbytes(8 + size)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +95,10 @@ def test_plausible_forgeries_alone_and_in_batches(live, seed):
     random = Random(seed)
     for role in Role:
         other = SERVICE if role is ROBOT else ROBOT
-        epoch = packet.pull_header(live.sent[other][-1][1])[2]
+        seen = live.sent[other][-1][1]
         before, sent = state(live, role), live.sessions[role].stats(live.now).paths[0].packets_sent
         for _ in range(60):
-            one = forged(random, epoch)
+            one = forged(random, seen)
             live.inject(role, one)
             count = random.randint(2, 64)
             batch = bytearray(one * count)
@@ -108,8 +108,7 @@ def test_plausible_forgeries_alone_and_in_batches(live, seed):
                     batch[i * len(one) + random.randrange(packet.HEADER_SIZE)] ^= 1
             live.inject(role, bytes(batch[: len(batch) - random.choice((0, 1, len(one) // 2))]), segment=len(one))
         assert state(live, role) == before
-        # One ping at most, to the peer: much came, so what came of it should be told.
-        assert live.sessions[role].stats(live.now).paths[0].packets_sent <= sent + 1
+        assert live.sessions[role].stats(live.now).paths[0].packets_sent == sent
         assert set(live.sessions[role].stats(live.now).rejected) <= REASONS
 
 
@@ -139,18 +138,18 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     delay = LinkConditions(delay=0.005)
     robot = {"config": Config(rate_bps=1e9)}  # a message that takes long to send is evicted by the flood meanwhile
     link = world.link(robot=robot, service={"config": config}, up=delay, down=delay, record=True)
-    epoch = packet.pull_header(link.sent[ROBOT][-1][1])[2]
+    _, packet_id, epoch, *_ = packet.pull_header(link.sent[ROBOT][-1][1])
     sent = []
 
     def flood():
         # 600 forged packets of a topic's own kind every 10 ms: 560 Mbit/s beside 4 Mbit/s of real messages.
         for i in range(100):
-            length = 30 * 1168
+            length = 30 * 1160
             number = world.random.randrange(60_000)
-            common = packet.push_common(packet.DATA, SESSION_ID, epoch, number, 1 + i % 2, length)
+            common = packet.push_common(packet.SHARD, packet_id, epoch, number, 1 + i % 2, length)
             rows = b"".join(common + packet.push_shard(0, j, 0, j, 0) + bytes(1168) for j in range(6))
             link.inject(SERVICE, rows, segment=1200)
-            assert link.sessions[SERVICE]._receiver.messages.used <= config.reassembly_limit
+            assert link.sessions[SERVICE]._receiver.messages.used <= 25_000  # of real messages only
 
     def publish():
         sent.append(world.random.randbytes(20_000))
@@ -160,23 +159,8 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     link.every(0.04, link.now + 0.4, publish)
     link.run(1.5)
     assert [bytes(m.payload) for _, m in link.messages[SERVICE]] == sent
-    rejected = link.sessions[SERVICE].stats(link.now).rejected
-    assert rejected["evicted"] > 1000
-    assert link.sessions[SERVICE]._receiver.messages.used == 0  # all of it too old by now
-
-
-def test_a_forged_shard_costs_the_message_it_claims_to_belong_to_and_no_other(world):
-    link = world.link(record=True, up=LinkConditions(delay=0.2))
-    for i in range(5):
-        link.publish(ROBOT, "camera", bytes([i + 1]) * 3000)
-        link.run(0.01)
-    victim = next(p for _, p in link.sent[ROBOT] if packet.pull_header(p)[4] == 2)
-    link.inject(SERVICE, victim[: packet.HEADER_SIZE] + bytes(len(victim) - packet.HEADER_SIZE))
-    link.run(1.0)
-    assert [m.payload[0] for _, m in link.messages[SERVICE]] == [2, 3, 4, 5]
-    row = next(t for t in link.sessions[SERVICE].stats(link.now).topics if t.topic == "camera")
-    assert (row.delivered, row.lost) == (4, 1)
-    assert link.sessions[SERVICE].stats(link.now).rejected["forged"] == 1
+    assert link.sessions[SERVICE].stats(link.now).rejected["forged"] >= 600 * 39
+    assert link.sessions[SERVICE]._receiver.messages.used == 0
 
 
 def test_a_closed_session_takes_nothing(world):
@@ -197,7 +181,8 @@ def test_a_stranger_cannot_bring_an_end_up(make_world, seed):
     world = make_world(seed)
     service = world.session(SERVICE)
     for _ in range(100):
-        service.receive(forged(world.random, world.random.randrange(256)), "stranger", 0.0)
+        seen = packet.push_common(packet.DATA, world.random.getrandbits(64), world.random.randrange(256), 0, 0, 0)
+        service.receive(forged(world.random, seen.ljust(40)), "stranger", 0.0)
         assert service.transmit(0.0) == []
     assert service.next_event() is None
     assert service.next_timer() is None
@@ -211,18 +196,16 @@ def test_memory_of_a_flooded_end_is_bounded(make_world):
     link = world.link(robot={"config": config}, service={"config": config}, record=True)
     link.publish(ROBOT, "log", bytes(5000))
     link.run(0.1)
-    epoch = packet.pull_header(link.sent[ROBOT][-1][1])[2]
+    seen = link.sent[ROBOT][-1][1]
     session, random = link.sessions[SERVICE], world.random
     recorded = [p for _, p in link.sent[ROBOT]]
 
     def flood(count):
         for i in range(count):
-            session.receive(forged(random, epoch), f"stranger {i}", link.now)
+            session.receive(forged(random, seen), f"stranger {i}", link.now)
             session.receive(random.choice(recorded), f"stranger {i}", link.now)
-            shard = packet.push_common(packet.DATA, SESSION_ID, epoch, random.randrange(60_000), 1 + i % 2, 30_000)
-            session.receive(shard + packet.push_shard(0, i % 40, 0, 0, 0) + random.randbytes(1000), "x", link.now)
             hello = packet.push_common(packet.HELLO, SESSION_ID, 0, random.getrandbits(48), 0, 182 * 1100)
-            session.receive(hello + packet.push_shard(0, i % 200, 0, 0, 0) + random.randbytes(1100), "x", link.now)
+            session.receive(hello + packet.push_shard(0, i % 200, 0, 0, 0) + random.randbytes(1108), "x", link.now)
             for _ in iter(session.next_event, None):
                 pass
             session.transmit(link.now)
@@ -234,6 +217,4 @@ def test_memory_of_a_flooded_end_is_bounded(make_world):
         used, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    # Of 16 MB that came: the messages' bound, the handshakes', and room for counters.
-    assert 400_000 < used < config.reassembly_limit + 2 * MAX_HANDSHAKE + 300_000
-    assert session.stats(link.now).rejected["evicted"] > 1000
+    assert used < 100_000  # of 10 MB that came: counters

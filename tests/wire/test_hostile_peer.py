@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from skytether.wire import Role, control, packet
+from skytether.wire import Role, control
+from skytether.wire.message import Message
 from skytether.wire.paths import MAX_PATHS
 from skytether.wire.sender import INNER
 
@@ -18,11 +19,10 @@ def say(link, role, message, *, stamp=None, path=0, address=None):
     epoch.next_number += 1
     number, stamp = epoch.next_number, round(link.now * 1e6) if stamp is None else stamp
     plaintext = INNER.pack(0, stamp) + message
-    session = link.sessions[role].session_id
-    common = packet.push_common(packet.DATA, session, epoch.id, number, 0, len(plaintext) + 16)
-    sealed = epoch.ciphers.seal(number, plaintext, common)
-    epoch.next_number += 1
-    link.inject(receiver, common + packet.push_shard(0, 0, path, number, 0) + sealed, address or link.addresses[role])
+    own = Message(epoch.ciphers, epoch.id, number, 0, plaintext)
+    known = link.sessions[role]._paths.get(path)
+    packet_number = number if known is None else known.number()
+    link.inject(receiver, own.packet(path, packet_number, 0), address or link.addresses[role])
 
 
 NOTHING = control.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)

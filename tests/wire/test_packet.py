@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.wire import packet, peek_session_id
+from skytether.wire import packet, peek_id
 
 
 @given(
@@ -25,7 +25,7 @@ def test_round_trip(kind, session_id, epoch, number, topic, length, block, index
     assert packet.pull_header(header + b"shard") == (
         kind, session_id, epoch, number, topic, length, block, index, path, packet_number, time,
     )  # fmt: skip
-    assert peek_session_id(memoryview(header)) == session_id
+    assert peek_id(memoryview(header)) == (kind % 16 == 1, session_id)
     # What `receiver` and `fragment` find by position.
     assert header[: packet.COMMON_SIZE] == common
     assert header[packet.INDEX_AT] == index
@@ -36,10 +36,13 @@ def test_round_trip(kind, session_id, epoch, number, topic, length, block, index
 
 
 def test_an_array_of_packets_has_the_same_fields():
-    common = [packet.push_common(packet.DATA, 2**64 - 1, 7, 2**40 + i, 9, 2400) for i in (1, 1, 2)]
-    rows = [c + packet.push_shard(3, i, 4, 2**31 + i, 2**15 + i) + bytes((i,)) * 100 for i, c in enumerate(common)]
-    packets = packet.pull_packets(b"".join(rows), 3, 132)
-    assert packets["keys"][0].tobytes() == packet.KEYS.pack(packet.DATA, 2**64 - 1, 7)
+    common = [packet.push_common(packet.SHARD, 2**64 - 1, 7, 2**40 + i, 9, 2400) for i in (1, 1, 2)]
+    rows = [
+        c + packet.push_shard(3, i, 4, 2**31 + i, 2**15 + i) + b"tag " * 2 + bytes((i,)) * 100
+        for i, c in enumerate(common)
+    ]
+    packets = packet.pull_packets(b"".join(rows), 3, 140)
+    assert packets["keys"][0].tobytes() == packet.KEYS.pack(packet.SHARD, 2**64 - 1, 7)
     assert [b.tobytes() for b in packets["block"]] == [row[: packet.BLOCK.size] for row in rows]
     assert packet.BLOCK.unpack(packets["block"][1].tobytes())[-1] == 3
     for name, first in (("index", 0), ("number", 2**31), ("time", 2**15)):
@@ -49,10 +52,10 @@ def test_an_array_of_packets_has_the_same_fields():
 
 
 def test_the_header_is_as_small_as_documented():
-    assert (packet.COMMON_SIZE, packet.HEADER_SIZE) == (22, 32)
+    assert (packet.COMMON_SIZE, packet.HEADER_SIZE, packet.SHARD_AT) == (22, 32, 40)
 
 
 @given(st.binary(max_size=packet.HEADER_SIZE - 1))
 def test_what_is_too_short_is_no_packet(data):
     assert packet.pull_header(data) is None
-    assert peek_session_id(data) is None
+    assert peek_id(data) is None

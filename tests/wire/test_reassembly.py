@@ -10,16 +10,16 @@ from skytether.wire import packet
 from skytether.wire.fragment import Shards, shape_for
 from skytether.wire.reassembly import Reassembly
 
-ROOM = 1170
-HEADER = packet.HEADER_SIZE
+ROOM = 1168
+HEADER = packet.SHARD_AT
 
 
 def packets_of(message, number=3, topic=4, parity=0):
     """Rows of one message, with headers."""
     shape = shape_for(len(message), ROOM)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
-    common = packet.push_common(packet.DATA, 1, 2, number, topic, len(message))
-    shards = Shards(common, padded, shape, parity)
+    common = packet.push_common(packet.SHARD, 1, 2, number, topic, len(message))
+    shards = Shards(common, padded, shape, parity, lambda rows: None)
     data = shards.take(shards.remaining, 0, 0, 0)
     return shape, np.frombuffer(data, np.uint8).reshape(-1, shards.packet_size)
 
@@ -93,7 +93,7 @@ def test_impossible_shards_are_refused():
         (100, 100, 0),
         (0, 50, 0),
         (50, 10_000, 0),
-        (1000, 2001, 0),
+        (1002, 2001, 0),
         (700, 1400, 1),
     ):
         assert reassembly.entry(b"x", size, length, 4, block, 1.0, 0.0) is None
@@ -124,7 +124,7 @@ def test_a_flood_never_exceeds_the_bound(seed):
     for i in range(1500):
         length = random.choice((2500, 50_000, 16 * 2**20))
         shape = shape_for(length, ROOM)
-        common = packet.push_common(packet.DATA, 1, 2, random.randrange(50), random.randrange(5), length)
+        common = packet.push_common(packet.SHARD, 1, 2, random.randrange(50), random.randrange(5), length)
         block = random.randrange(shape.blocks)
         entry = reassembly.entry(common, shape.size, length, random.randrange(5), block, 1.0, i * 1e-3)
         if random.random() < 0.5:
@@ -144,7 +144,7 @@ def test_a_flood_of_one_topic_leaves_the_others_alone():
     for i, row in enumerate(rows):
         for j in range(100):  # 100 forged shards for every real one
             length = 2 * ROOM
-            common = packet.push_common(packet.DATA, 1, 2, 100 * i + j, 2, length)
+            common = packet.push_common(packet.SHARD, 1, 2, 100 * i + j, 2, length)
             entry = reassembly.entry(common, ROOM, length, 2, 0, 1.0, 0.0)
             reassembly.add(entry, 0, 0, memoryview(bytes(ROOM)))
         whole = add(reassembly, shape, row, topic=1)

@@ -20,7 +20,7 @@ from skytether.wire.control import (
 from skytether.wire.epoch import SendTopic
 from skytether.wire.fragment import shape_for
 from skytether.wire.measure import Outbound
-from skytether.wire.packet import HEADER_SIZE, pull_header, push_common
+from skytether.wire.packet import SHARD_AT, pull_header, push_common
 from skytether.wire.parcel import Parcel
 from skytether.wire.reliable import PREFIX, WINDOW, WINDOW_BYTES, Inbox, Outbox
 from skytether.wire.retransmit import FIRST, LONGEST, RoundTrip
@@ -156,7 +156,7 @@ def parcel(shards=250, size=300):
     shape = shape_for(shards * size, size)
     sealed = memoryview(bytes(range(250)) * (shards * size // 250))
     common = push_common(16, 1, 2, 99, 3, shape.length)
-    return Parcel(99, common, sealed, shape, lambda parcel, now: None), shape, sealed
+    return Parcel(99, common, sealed, shape, lambda rows: None, lambda parcel, now: None), shape, sealed
 
 
 def take_all(parcel, now):
@@ -173,14 +173,14 @@ def take_all(parcel, now):
 def test_a_parcel_sends_all_then_what_is_missing_and_only_once_a_round_trip():
     sending, _, sealed = parcel()
     first = take_all(sending, 0.0)
-    assert b"".join(p[HEADER_SIZE:] for p in first) == bytes(sealed)
+    assert b"".join(p[SHARD_AT:] for p in first) == bytes(sealed)
     rows = ((0, bytes([0b101] + [0] * 12)), (2, bytes([1] + [0] * 12)))
     assert sending.missing(3, rows, 0.05, 0.1) == 0  # they may still be on their way
     assert sending.missing(3, rows, 0.2, 0.1) == 3
     assert sending.missing(3, rows, 0.2, 0.1) == 0
     again = take_all(sending, 0.2)
     assert [pull_header(p)[6:8] for p in again] == [(0, 0), (0, 2), (2, 0)]
-    assert all(p[HEADER_SIZE:] in bytes(sealed) for p in again)
+    assert all(p[SHARD_AT:] in bytes(sealed) for p in again)
 
 
 def test_a_parcel_nobody_tells_about_is_probed_with_one_shard():

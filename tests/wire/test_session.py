@@ -101,15 +101,17 @@ def test_on_any_link_only_what_was_published_arrives_and_at_most_once(make_world
 
 
 def check_nonces(link):
-    """Under one epoch's keys, one number seals one message."""
+    """Under one handshake's keys, one number seals one message, and one packet number of a path one packet."""
     for role in Role:
-        sealed = {}
+        sealed, packets = {}, {}
         for _, data in link.sent[role]:
-            kind, _, epoch, number, _, length, block, index, _, _, _ = packet.pull_header(data)
-            if kind == packet.DATA:
-                message = (data[: packet.COMMON_SIZE], data[packet.HEADER_SIZE :])
-                assert sealed.setdefault((epoch, number, block, index), message) == message
-                assert sealed.setdefault((epoch, number), (length, data[: packet.COMMON_SIZE]))[0] == length
+            kind, packet_id, _, number, _, length, block, index, path, packet_number, _ = packet.pull_header(data)
+            if kind in (packet.DATA, packet.SHARD):
+                assert packets.setdefault((packet_id, path, packet_number), data) == data
+            if kind == packet.SHARD:
+                shard = data[: packet.COMMON_SIZE], len(data), data[packet.SHARD_AT :]
+                assert sealed.setdefault((packet_id, number, block, index, len(data)), shard) == shard
+                assert sealed.setdefault((packet_id, number), (length, shard[0])) == (length, shard[0])
 
 
 def check_accounts(link, settled):

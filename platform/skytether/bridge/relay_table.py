@@ -1,9 +1,10 @@
 """What a relay forwards, and where to (rule 9): pure, with time as an argument. The sockets are in `relay`.
 
-A relay holds no key and opens no packet. It reads the session id, which every packet carries in clear, and looks for
-the route of that id: where the service's end (or the next relay) is. Every address on the robot's side has a *leg*, a
-port of its own towards that target, as behind a NAT. So the two ends themselves decide who is who: the service's
-end answers to the leg from which authentic packets come, and whoever else has seen the id gets nothing.
+A relay holds no key and opens no packet. Of a HELLO it reads the session id and looks for the route of that id: where
+the service's end (or the next relay) is. All other packets have an id that changes with each handshake. To which
+session that belongs, the relay learns from the target, whose WELCOME has it first. Every address on the robot's side
+has a *leg*, a port of its own towards that target, as behind a NAT. So the two ends themselves decide who is who: the
+service's end answers to the leg from which authentic packets come, and whoever else has seen the id gets nothing.
 
 A leg begins as a newcomer. Newcomers of a route are few and share a budget of their own, so that no flood of
 them touches a session that runs. What goes back to one is bounded by what came from it, until it speaks again after
@@ -21,11 +22,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from skytether.wire.packet import HEADER_SIZE, peek_session_id
+from skytether.wire.packet import HEADER_SIZE, peek_id
 
 from .datagrams import Address
 
 ID_DIGITS = 16
+MAX_IDS = 4
+"""Ids of packets that a leg's target may have used of late: handshakes overlap."""
 AMPLIFICATION = 3
 """Bytes sent to an address for each byte from it, until it is admitted (as in RFC 9000, section 8)."""
 NEWCOMER_IDLE = 10.0
@@ -153,6 +156,7 @@ class Leg:
         "bytes_down",
         "bytes_up",
         "heard_at",
+        "ids",
         "port",
         "route",
         "session",
@@ -170,6 +174,8 @@ class Leg:
         self.bytes_up = self.bytes_down = 0
         self.heard_at = 0.0
         self.answered_at: float | None = None
+        self.ids: deque[int] = deque()
+        """That the target's packets had, newest last."""
         self.port: Any = None
         """Whatever its owner keeps with it; nothing here looks at it."""
 
@@ -188,6 +194,8 @@ class RelayTable:
         self._lengths: list[int] = []
         """Digits of the prefixes, longest first."""
         self._legs: dict[tuple[int, Address], Leg] = {}
+        self._ids: dict[int, list[Leg]] = {}
+        """Legs of a session by an id that its packets have."""
         self.sessions: dict[int, SessionFlow] = {}
         self.closed: deque[Leg] = deque()
         self.rejected: Counter[str] = Counter()
@@ -224,10 +232,17 @@ class RelayTable:
         Returns:
             The leg through which to send it to ``leg.route.target``; None (counted): to be dropped.
         """
-        session_id = peek_session_id(data)
-        if session_id is None:
+        peeked = peek_id(data)
+        if peeked is None:
             self.rejected["short"] += packets
             return None
+        hello, session_id = peeked
+        if not hello:
+            known = self._ids.get(session_id)
+            if known is None:
+                self.rejected["unknown"] += packets
+                return None
+            session_id = known[0].session_id
         leg = self._legs.get((session_id, source))
         route = leg.route if leg is not None else self._find(session_id)
         if route is None:
@@ -256,7 +271,8 @@ class RelayTable:
         if source != leg.route.target:
             self.rejected["stranger"] += packets
             return False
-        if peek_session_id(data) != leg.session_id:
+        peeked = peek_id(data)
+        if peeked is None or peeked[0] or not self._learn(leg, peeked[1]):
             self.rejected["session"] += packets
             return False
         leg.answered_at = now
@@ -287,6 +303,8 @@ class RelayTable:
         key = leg.session_id, leg.source
         if self._legs.pop(key, None) is None:
             return
+        while leg.ids:
+            self._unlearn(leg)
         if leg.session is None:
             del leg.route.newcomers[key]
         else:
@@ -294,6 +312,27 @@ class RelayTable:
             if not leg.session.legs:
                 del self.sessions[leg.session_id]
         self.closed.append(leg)
+
+    def _learn(self, leg: Leg, packet_id: int) -> bool:
+        """Take note of an id that a leg's target uses; False if it is that of another session."""
+        if packet_id in leg.ids:
+            return True
+        legs = self._ids.setdefault(packet_id, [])
+        if legs and legs[0].session_id != leg.session_id:
+            return False
+        legs.append(leg)
+        leg.ids.append(packet_id)
+        if len(leg.ids) > MAX_IDS:
+            self._unlearn(leg)
+        return True
+
+    def _unlearn(self, leg: Leg) -> None:
+        """Forget the oldest id of a leg."""
+        packet_id = leg.ids.popleft()
+        legs = self._ids[packet_id]
+        legs.remove(leg)
+        if not legs:
+            del self._ids[packet_id]
 
     def _find(self, session_id: int) -> Route | None:
         for digits in self._lengths:
@@ -343,7 +382,7 @@ def same_session(data: memoryview, segment: int | None) -> Iterator[tuple[memory
     if segment is None or segment >= len(data):
         yield data, None, 1
         return
-    ids = [bytes(data[at + 1 : at + 9]) for at in range(0, len(data), segment)]
+    ids = [bytes(data[at : at + 9]) for at in range(0, len(data), segment)]
     if ids.count(ids[0]) == len(ids) and (len(data) % segment or segment) >= HEADER_SIZE:
         yield data, segment, len(ids)
         return

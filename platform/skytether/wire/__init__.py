@@ -6,7 +6,7 @@ Nothing here opens a socket, reads a clock, starts a thread or draws a random nu
 
 from .config import Config
 from .events import Connected, Disconnected, Event, MessageReceived, PathSwitched, PeerMoved, Refused
-from .packet import peek_session_id
+from .packet import peek_id
 from .path import Transmit
 from .session import Session
 from .stats import PathStats, SessionStats, TopicStats
@@ -30,5 +30,5 @@ __all__ = [
     "Topic",
     "TopicStats",
     "Transmit",
-    "peek_session_id",
+    "peek_id",
 ]

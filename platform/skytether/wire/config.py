@@ -10,9 +10,12 @@ MIN_MTU = 512
 MAX_MTU = 65_507
 """Largest UDP payload over IPv4."""
 MAX_COPIES = 100
+MAX_REKEY_BYTES = 2**36
+"""64 GiB are 2**32 blocks of AES under one key: they can be told from random ones with a chance of 2**-65 (of n blocks
+n**2 / 2**129). No packet has less than 60 bytes, so they are fewer than 2**31, and numbers of 32 bits do not repeat."""
 _POSITIVE = (
     "rate_bps", "keepalive", "report_interval", "probe_after", "probe_interval", "silence", "hello_retry",
-    "hello_retry_max",
+    "hello_retry_max", "rekey_after",
 )  # fmt: skip
 _NOT_NEGATIVE = "max_parity", "copy_spacing", "old_keys", "path_stable", "path_overlap"
 
@@ -55,7 +58,11 @@ class Config:
     """Time between handshakes at first; 5 % of that since the first one later, at most ``hello_retry_max``."""
     hello_retry_max: float = 1.0
     old_keys: float = 2.0
-    """How long the keys before a new handshake still open packets that were on their way."""
+    """How long the keys before a new handshake still open packets that were on their way, after the last of them."""
+    rekey_after: float = 3600.0
+    """The robot's end makes new keys after this time: who gets hold of some reads an hour, and an id lasts as long."""
+    rekey_bytes: int = MAX_REKEY_BYTES
+    """The same after so many bytes in either direction."""
     assumed_loss: float = 0.05
     """Share of packets taken to be lost on a path before anything is known of it (rule 5)."""
     max_copies: int = 12
@@ -91,6 +98,8 @@ class Config:
         for name in _NOT_NEGATIVE:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more and finite, not {getattr(self, name)}")
+        if not 0 < self.rekey_bytes <= MAX_REKEY_BYTES:
+            raise ValueError(f"rekey_bytes must be 1 to {MAX_REKEY_BYTES}, not {self.rekey_bytes}")
         if not 0 <= self.assumed_loss < 0.9:
             raise ValueError(f"assumed_loss must be 0 to below 0.9, not {self.assumed_loss}")
         if not 1 <= self.max_copies <= MAX_COPIES:

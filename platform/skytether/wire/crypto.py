@@ -3,15 +3,22 @@
 One 256-bit session key (made by the orchestrator) proves both ends. Handshake messages are sealed under keys
 derived from it and 32 fresh random bytes, so that their nonce 0 is never used twice with one key; data keys also
 depend on an ephemeral X25519 exchange, so that a session key stolen later opens no recorded traffic.
+
+Of each handshake every direction has keys of its own: one seals large messages (nonce: message number), one seals
+packets with a whole message each (nonce: path and packet number), two more are for the tags of shards (`tags`).
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import CTR, ECB
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
@@ -19,32 +26,30 @@ KEY_SIZE = 32
 SALT_SIZE = 32
 TAG_SIZE = 16
 RESUME_SIZE = 8
-_LABEL = b"skytether 1 "
+ID_SIZE = 8
+_LABEL = b"skytether 2 "
 
 
-class Ciphers:
-    """What one handshake gave: a key to seal with, a key to open with, and a public name for the pair."""
+class Aead:
+    """AES-256-GCM under one key. No nonce may ever be used twice to seal."""
 
-    __slots__ = ("_open", "_seal", "resume")
+    __slots__ = ("_cipher",)
 
-    def __init__(self, seal_key: bytes, open_key: bytes, resume: bytes) -> None:
-        self._seal = AESGCM(seal_key)
-        self._open = AESGCM(open_key)
-        self.resume = resume
-        """Tells the peer which keys this end still holds without telling anything of the keys."""
+    def __init__(self, key: bytes) -> None:
+        self._cipher = AESGCM(key)
 
-    def seal(self, number: int, plaintext: bytes, common: bytes) -> bytes:
-        """Seal one message; ``number`` must never have been used with these keys."""
-        return self._seal.encrypt(number.to_bytes(12, "big"), plaintext, common)
+    def seal(self, nonce: bytes, plaintext: bytes, data: bytes) -> bytes:
+        """Ciphertext and tag; ``data`` is authenticated as well."""
+        return self._cipher.encrypt(nonce, plaintext, data)
 
-    def seal_into(self, number: int, plaintext: bytes, common: bytes, out: memoryview) -> None:
+    def seal_into(self, nonce: bytes, plaintext: bytes, data: bytes, out: memoryview) -> None:
         """The same into a buffer of ``len(plaintext) + TAG_SIZE`` bytes."""
-        self._seal.encrypt_into(number.to_bytes(12, "big"), plaintext, common, out)
+        self._cipher.encrypt_into(nonce, plaintext, data, out)
 
-    def open(self, number: int, sealed: memoryview | bytes, common: memoryview | bytes) -> bytes | None:
+    def open(self, nonce: bytes, sealed: memoryview | bytes, data: memoryview | bytes) -> bytes | None:
         """Plaintext, or None if it is not authentic."""
         try:
-            return self._open.decrypt(number.to_bytes(12, "big"), sealed, common)
+            return self._cipher.decrypt(nonce, sealed, data)
         except (InvalidTag, ValueError):
             return None
 
@@ -81,7 +86,27 @@ def exchange(private: bytes, peer_public: bytes) -> bytes | None:
 
 
 def data_keys(key: bytes, shared: bytes, hello: bytes, welcome: bytes) -> tuple[bytes, bytes, bytes]:
-    """Keys robot to service and service to robot, and the name of the pair, bound to both handshake messages."""
+    """Secrets robot to service and service to robot, and the name of the pair, bound to both handshake messages."""
     transcript = hashlib.sha256(hashlib.sha256(hello).digest() + hashlib.sha256(welcome).digest()).digest()
     material = derive(key + shared, transcript, b"data", 2 * KEY_SIZE + RESUME_SIZE)
     return material[:KEY_SIZE], material[KEY_SIZE : 2 * KEY_SIZE], material[2 * KEY_SIZE :]
+
+
+def packet_id(key: bytes, shared: bytes, hello: bytes) -> int:
+    """Id that packets of a handshake have: nobody else can tell to which session or handshake it belongs."""
+    return int.from_bytes(derive(key + shared, hashlib.sha256(hello).digest(), b"id", ID_SIZE))
+
+
+def short_mac(key: bytes, data: bytes, size: int) -> bytes:
+    """Keyed BLAKE2s, for what is rare: needs no nonce."""
+    return hashlib.blake2s(data, key=key, digest_size=size).digest()
+
+
+def block_cipher(key: bytes) -> Callable[[bytes], bytes]:
+    """AES on any number of whole blocks, each by itself; no mode of operation, so not for secrets."""
+    return Cipher(AES(key), ECB()).encryptor().update  # noqa: S305 - a pseudo-random function is what is wanted
+
+
+def key_stream(key: bytes, size: int) -> bytes:
+    """So many pseudo-random bytes; more of the same key begin with those."""
+    return Cipher(AES(key), CTR(bytes(16))).encryptor().update(bytes(size))

@@ -41,6 +41,10 @@ class Delivery:
         self._epoch = epoch
         self.clock = ClockOffset()
 
+    def change_keys(self, epoch: Epoch) -> None:
+        """The same peer has new keys."""
+        self._epoch = epoch
+
     def end_epoch(self) -> None:
         """No keys are in use."""
         self._epoch = None
@@ -90,7 +94,7 @@ class Delivery:
                 return
             payload = whole
         micros, clock = stamp & ~FLAG, self.clock
-        if epoch is self._epoch and clock.known:
+        if epoch.belongs_with(self._epoch) and clock.known:
             sent_at = micros / 1e6 - clock.offset
             error = clock.error_at(sent_at)
         else:
@@ -104,7 +108,7 @@ class Delivery:
 
     def _outdated(self, epoch: Epoch, index: int) -> bool:
         """Whether a message of the keys before comes after a newer one under the present keys."""
-        if epoch is self._epoch or self._epoch is None:
+        if self._epoch is None or epoch.belongs_with(self._epoch):
             return False
         present = self._epoch.receive.get(index)
         return present is not None and present.newest >= 0

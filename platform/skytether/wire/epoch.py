@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING
 
-from .crypto import Ciphers
+from .ciphers import Ciphers
+from .config import MAX_REKEY_BYTES
 from .measure import Inbound, Outbound, SequenceTracker
-from .replay import ReplayWindow
+from .replay import PacketWindow, ReplayWindow
 from .topic import Direction, PathUse, Topic
 
 if TYPE_CHECKING:
@@ -17,6 +19,9 @@ CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, deli
 """Pings, reports and goodbye: sealed and numbered like a topic, both ways."""
 CONTROL_PRIORITY = 128
 """Above every topic's."""
+
+MAX_BYTES = 2 * MAX_REKEY_BYTES
+"""Nothing more is sent under the same keys: twice what a new handshake is asked for at."""
 
 Waiting = tuple[bytes, float, int | None]
 """Payload, time of publishing, extra packets (None: as the redundancy policy says)."""
@@ -124,7 +129,20 @@ class ReceiveTopic:
 class Epoch:
     """The state that a handshake begins and the next one ends."""
 
-    __slots__ = ("ciphers", "id", "life", "next_number", "receive", "replay", "send", "topics")
+    __slots__ = (
+        "_packets",
+        "bytes_received",
+        "bytes_sent",
+        "ciphers",
+        "heard_at",
+        "id",
+        "life",
+        "next_number",
+        "receive",
+        "replay",
+        "send",
+        "topics",
+    )
 
     def __init__(
         self,
@@ -136,13 +154,48 @@ class Epoch:
         life: bytes,
     ) -> None:
         self.id = epoch_id
-        """One byte that tells its packets from those of the epochs before and after."""
+        """One byte that tells it from those before and after."""
         self.ciphers = ciphers
         self.next_number = 0
         """Of the next message sealed, whatever its topic: the nonce."""
         self.replay = ReplayWindow()
+        self._packets: dict[int, PacketWindow] = {}
+        self.heard_at = -math.inf
+        """When the last packet came that was new."""
+        self.bytes_sent = self.bytes_received = 0
         self.topics = topics
         self.life = life
         """The peer's (see `handshake`)."""
         self.send = {t.name: t for t in send}
         self.receive = {t.index: t for t in receive}
+
+    def packets(self, path: int) -> PacketWindow:
+        """Packet numbers that arrived by that path; to be asked about authentic packets only."""
+        window = self._packets.get(path)
+        if window is None:
+            window = self._packets[path] = PacketWindow()
+        return window
+
+    @property
+    def spent(self) -> bool:
+        """Whether nothing more may be sent under these keys."""
+        return self.bytes_sent >= MAX_BYTES
+
+    @property
+    def volume(self) -> int:
+        """Bytes in the direction that has more."""
+        return max(self.bytes_sent, self.bytes_received)
+
+    def belongs_with(self, other: Epoch | None) -> bool:
+        """Whether both are of the same two ends and topics, with nothing between them but new keys."""
+        return other is not None and self.receive is other.receive
+
+    def take_over(self, before: Epoch) -> bool:
+        """Go on where other keys end: same topics, numbers and counters. False: the peer is another, or has others."""
+        if before.life != self.life or before.topics != self.topics:
+            return False
+        self.send, self.receive = before.send, before.receive
+        self.next_number = before.next_number
+        # What confirmed these keys was accepted just now: going back would take its copies for new ones.
+        self.replay.highest = max(self.replay.highest, before.replay.highest)
+        return True

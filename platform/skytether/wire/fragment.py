@@ -1,30 +1,34 @@
 """A sealed message as equal shards in blocks, with parity: what the sender cuts and the receiver reassembles.
 
-A message of ``length`` bytes in shards of ``size`` bytes has ``ceil(length / size)`` data shards, in as few blocks
-of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from two numbers. Parity is
-systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row only, so the receiver
-need not know how many parity shards there are.
+A message of ``length`` bytes in shards of ``size`` bytes (a multiple of 4, for the tags) has ``ceil(length / size)``
+data shards, in as few blocks of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from
+two numbers. Parity is systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row
+only, so the receiver need not know how many parity shards there are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 import zfec
 
-from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT, TIME_AT
+from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT, SHARD_AT, TIME_AT
 
 Bytes = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 """Of data shards in their message."""
+Tagger = Callable[[Bytes], None]
+"""Writes the tags of packets, one in each row."""
 
 BLOCK_SHARDS = 100
 """Data shards of a block: the cost of coding grows with k times m, and one block may have 256 shards in all."""
 MAX_SHARDS = 256
 """Shards of a block with parity: what GF(256) allows."""
-MIN_SHARD = 240
+STEP = 4
+MIN_SHARD = 236
 """A message of several shards has none smaller than this: half of what fits the smallest mtu."""
 MAX_BLOCKS = 65_535
 
@@ -45,9 +49,8 @@ class Shape:
 
     @property
     def valid(self) -> bool:
-        """Whether a sender of this protocol would cut a message like this."""
-        fits = -(-self.length // self.shards) == self.size
-        return fits and self.shards > 1 and self.size >= MIN_SHARD and self.blocks <= MAX_BLOCKS
+        """Whether a sender of this protocol may cut a message like this."""
+        return self.size % STEP == 0 and self.shards > 1 and self.size >= MIN_SHARD and self.blocks <= MAX_BLOCKS
 
     def block_k(self, block: int) -> int:
         """Data shards of one block."""
@@ -60,8 +63,8 @@ class Shape:
 
 def shape_for(length: int, room: int) -> Shape:
     """Fewest equal shards that hold ``length`` bytes with at most ``room`` bytes each."""
-    shards = -(-length // room)
-    return Shape(length, -(-length // shards))
+    shards = -(-length // (room // STEP * STEP))
+    return Shape(length, -(-length // (shards * STEP)) * STEP)
 
 
 @lru_cache(maxsize=BLOCK_SHARDS)
@@ -114,9 +117,20 @@ def _order(count: int, parity: int) -> Bytes:
 class Shards:
     """One sealed message on its way out. Packets are made as they are sent, parity when it is needed."""
 
-    __slots__ = ("_common", "_data", "_parity", "_sent", "_shape", "_tails", "length", "packet_size", "remaining")
+    __slots__ = (
+        "_common",
+        "_data",
+        "_parity",
+        "_sent",
+        "_shape",
+        "_tails",
+        "length",
+        "packet_size",
+        "remaining",
+        "tagger",
+    )
 
-    def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int) -> None:
+    def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int, tagger: Tagger) -> None:
         """Take a sealed message.
 
         Args:
@@ -124,15 +138,17 @@ class Shards:
             sealed: ``shape.shards * shape.size`` bytes, zeros after ``shape.length``.
             shape: Its layout, with more than one shard.
             parity: Parity shards of each block.
+            tagger: Of the keys that the common part names.
         """
         self._common = np.frombuffer(common, np.uint8)
         self._data: Bytes = np.frombuffer(sealed, np.uint8).reshape(shape.shards, shape.size)
         self._shape = shape
+        self.tagger = tagger
         self._tails = _order(shape.shards, parity)
         self._parity: dict[tuple[int, int], bytes] = {}
         self._sent = 0
         self.length = shape.length
-        self.packet_size = HEADER_SIZE + shape.size
+        self.packet_size = SHARD_AT + shape.size
         self.remaining = len(self._tails)
         """Packets not yet taken."""
 
@@ -147,13 +163,14 @@ class Shards:
         rows = self._headers(self._tails[start:end], path, first_number, time)
         data_end = min(end, shards)
         if start < data_end:
-            rows[: data_end - start, HEADER_SIZE:] = self._data[start:data_end]
+            rows[: data_end - start, SHARD_AT:] = self._data[start:data_end]
         if end > shards:
             first = max(start, shards)
             parity = b"".join([self._parity_shard(i) for i in range(first, end)])
-            rows[first - start :, HEADER_SIZE:] = np.frombuffer(parity, np.uint8).reshape(end - first, -1)
+            rows[first - start :, SHARD_AT:] = np.frombuffer(parity, np.uint8).reshape(end - first, -1)
         self._sent = end
         self.remaining -= count
+        self.tagger(rows)
         return rows.reshape(-1).data
 
     def sent(self, count: int, now: float) -> None:
@@ -166,16 +183,19 @@ class Shards:
         """All of the message once more, in shards of at most ``room`` bytes: of the same size if they fit."""
         shape = self._shape if self._shape.size <= room else shape_for(self._shape.length, room)
         parity = (len(self._tails) - self._shape.shards) // self._shape.blocks
-        return shards_of(self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity)
+        return shards_of(
+            self._common.tobytes(), self._data.reshape(-1).data[: shape.length], shape, parity, self.tagger
+        )
 
     def pick(self, positions: Positions, path: int, first_number: int, time: int) -> memoryview:
         """Packets of any data shards, by their positions in the message, as `take` returns them."""
         rows = self._headers(self._tails[positions], path, first_number, time)
-        rows[:, HEADER_SIZE:] = self._data[positions]
+        rows[:, SHARD_AT:] = self._data[positions]
+        self.tagger(rows)
         return rows.reshape(-1).data
 
     def _headers(self, tails: Bytes, path: int, first_number: int, time: int) -> Bytes:
-        """Rows for packets, without the shards."""
+        """Rows for packets, without tags and shards."""
         count = len(tails)
         rows = np.empty((count, self.packet_size), np.uint8)
         rows[:, :COMMON_SIZE] = self._common
@@ -199,8 +219,8 @@ class Shards:
         return self._parity.pop((block, turn))
 
 
-def shards_of(common: bytes, sealed: memoryview | bytes, shape: Shape, parity: int) -> Shards:
+def shards_of(common: bytes, sealed: memoryview | bytes, shape: Shape, parity: int, tagger: Tagger) -> Shards:
     """A sealed message in that layout."""
     padded = memoryview(bytearray(shape.shards * shape.size))
     padded[: shape.length] = sealed
-    return Shards(common, padded, shape, parity)
+    return Shards(common, padded, shape, parity, tagger)

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Hashable
 
+from .ciphers import HandshakeTags
 from .config import MIN_MTU
 from .epoch import Epoch
 from .events import Event, Refused
 from .handshake import NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
 from .ledger import Ledger
-from .packet import HEADER_SIZE, HELLO, WELCOME
+from .packet import HELLO, SHARD_AT, WELCOME
 from .path import Path, Transmit
 from .paths import Paths
 from .seeker import Seeker
@@ -36,6 +37,7 @@ class Greeter:
         paths: Where to send.
         sender: Seals what is said under keys.
         ledger: For the topics of a new epoch.
+        tags: Of handshake packets that this end sends.
         events: Where refusals go.
         rejected: Counters of what is refused.
         welcomed: Called at the robot's end with the epoch that a handshake made, time stamps of that round trip (None
@@ -49,6 +51,7 @@ class Greeter:
         paths: Paths,
         sender: Sender,
         ledger: Ledger,
+        tags: HandshakeTags,
         events: deque[Event],
         rejected: Counter[str],
         welcomed: Callable[[Epoch, Times | None, float], None],
@@ -58,6 +61,7 @@ class Greeter:
         self._paths = paths
         self._sender = sender
         self._ledger = ledger
+        self._tags = tags
         self._events = events
         self._rejected = rejected
         self._welcomed = welcomed
@@ -122,7 +126,7 @@ class Greeter:
         previous: Epoch | None,
         now: float,
     ) -> None:
-        held = NO_KEYS if epoch is None else epoch.ciphers.resume
+        held = NO_KEYS if epoch is None or epoch.spent else epoch.ciphers.resume
         taken = {e.id for e in (epoch, previous) if e is not None}
         answer = door.answer(common, message, held, taken, now)
         if isinstance(answer, str):
@@ -177,7 +181,7 @@ class Greeter:
     def _send(self, common: bytes, message: bytes, path: Path, address: Hashable) -> None:
         if len(self.waiting) >= MAX_RAW:
             return
-        packets, size = cut(common, message, MIN_MTU - HEADER_SIZE, path.redundancy.parity)
+        packets, size = cut(common, message, MIN_MTU - SHARD_AT, path.redundancy.parity, self._tags)
         path.pacer.spend(len(packets))
         path.packets_sent += -(-len(packets) // size)
         path.bytes_sent += len(packets)

@@ -7,6 +7,8 @@ Messages (each is 32 clear random bytes, then a text sealed under a key derived 
 
 A life is 8 random bytes that name one end from its start to its end, so that the peer knows a restarted one.
 
+Their packets have tags under a key derived from the session key, so that nobody else's shard is taken for one of them.
+HELLO has the session's id, by which relays find the way; WELCOME has the one that packets under the new keys have.
 WELCOME's key depends on HELLO, so it answers this one only. HELLO is padded so that WELCOME is at most three
 times as long. The service answers a repeated HELLO with the same WELCOME and keeps its old keys until a
 message sealed with the new ones arrives, so a replayed HELLO disturbs nothing. If the service still holds the keys
@@ -22,9 +24,10 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from . import crypto
+from .ciphers import Ciphers, HandshakeTags
 from .epoch import Epoch
-from .fragment import Shards, shape_for
-from .packet import HEADER_SIZE, HELLO, WELCOME, push_common, push_shard
+from .fragment import Shape, Shards, shape_for
+from .packet import HELLO, WELCOME, push_common
 from .table import TablesDifferError, join, pull_answer, pull_offer, push_answer, push_offer
 from .topic import Topic
 
@@ -52,19 +55,21 @@ def _key(key: bytes, salt: bytes, label: bytes, hello: bytes = b"") -> bytes:
     return crypto.derive(key, salt, label + hashlib.sha256(hello).digest())
 
 
-def _pack(kind: int, session_id: int, salt: bytes, key: bytes, plaintext: bytes) -> tuple[bytes, bytes]:
+def _pack(kind: int, packet_id: int, salt: bytes, key: bytes, plaintext: bytes) -> tuple[bytes, bytes]:
     length = len(salt) + len(plaintext) + crypto.TAG_SIZE
-    common = push_common(kind, session_id, 0, int.from_bytes(salt[:6], "big"), 0, length)
+    common = push_common(kind, packet_id, 0, int.from_bytes(salt[:6], "big"), 0, length)
     return common, salt + crypto.seal_once(key, plaintext, common)
 
 
-def cut(common: bytes, message: bytes, room: int, parity: Callable[[int, int, float], int]) -> tuple[memoryview, int]:
+def cut(
+    common: bytes, message: bytes, room: int, parity: Callable[[int, int, float], int], tags: HandshakeTags
+) -> tuple[memoryview, int]:
     """Packets of a handshake message, one after the other, and their size. Their numbers are 0: no path yet."""
-    if len(message) <= room:
-        return memoryview(common + push_shard(0, 0, 0, 0, 0) + message), HEADER_SIZE + len(message)
-    shape = shape_for(len(message), room)
+    whole = len(message) <= room
+    shape = Shape(len(message), len(message)) if whole else shape_for(len(message), room)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
-    shards = Shards(common, padded, shape, parity(shape.block_k(0), shape.blocks, 0.9))
+    more = 0 if whole else parity(shape.block_k(0), shape.blocks, 0.9)
+    shards = Shards(common, padded, shape, more, tags.put)
     return shards.take(shards.remaining, 0, 0, 0), shards.packet_size
 
 
@@ -73,7 +78,7 @@ class Outcome:
     """What both ends know after a handshake."""
 
     epoch: int
-    ciphers: crypto.Ciphers
+    ciphers: Ciphers
     topics: list[tuple[int, Topic]]
     """Agreed topics by index."""
     life: bytes
@@ -139,7 +144,8 @@ class Hello:
         except ValueError:
             return None
         to_service, to_robot, name = crypto.data_keys(self._key, shared, self.message, message)
-        return Welcome(Outcome(epoch, crypto.Ciphers(to_service, to_robot, name), topics, life), "", times)
+        packet_id = crypto.packet_id(self._key, shared, self.message)
+        return Welcome(Outcome(epoch, Ciphers(to_service, to_robot, name, packet_id), topics, life), "", times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +195,7 @@ class Doorkeeper:
     PENDING_TIME = 10.0
     """Seconds until an unconfirmed handshake is forgotten. The robot makes a new HELLO sooner than that."""
 
-    def __init__(self, session_id: int, key: bytes, topics: Mapping[str, Topic], entropy: Entropy) -> None:
-        self._session_id = session_id
+    def __init__(self, key: bytes, topics: Mapping[str, Topic], entropy: Entropy) -> None:
         self._key = key
         self._topics = topics
         self._entropy = entropy
@@ -250,19 +255,20 @@ class Doorkeeper:
         )
         salt = self._entropy(crypto.SALT_SIZE)
         key = _key(self._key, salt, b"welcome", message)
-        welcome_common, welcome = _pack(WELCOME, self._session_id, salt, key, head + text)
+        packet_id = crypto.packet_id(self._key, shared, message)
+        welcome_common, welcome = _pack(WELCOME, packet_id, salt, key, head + text)
         outcome = None
         if not reason:
             to_service, to_robot, resume = crypto.data_keys(self._key, shared, message, welcome)
-            outcome = Outcome(epoch, crypto.Ciphers(to_robot, to_service, resume), agreed, life)
+            outcome = Outcome(epoch, Ciphers(to_robot, to_service, resume, packet_id), agreed, life)
         pending = Pending(welcome_common, welcome, outcome, reason, now)
         self._pending[name] = pending
         return pending
 
-    def pending(self, epoch_id: int) -> Epoch | None:
-        """The epoch of that id, of a handshake not confirmed yet."""
+    def pending(self, packet_id: int) -> Epoch | None:
+        """The epoch whose packets have that id, of a handshake not confirmed yet."""
         for pending in self._pending.values():
-            if pending.epoch is not None and pending.epoch.id == epoch_id:
+            if pending.epoch is not None and pending.epoch.ciphers.packet_id == packet_id:
                 return pending.epoch
         return None
 

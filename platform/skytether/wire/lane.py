@@ -8,8 +8,9 @@ from collections import deque
 from collections.abc import Hashable
 
 from .epoch import SendTopic
-from .fragment import Shards, shape_for, shards_of
-from .packet import HEADER_SIZE
+from .fragment import Shards
+from .message import LoneShard, Message
+from .packet import HEADER_SIZE, SHARD_AT
 from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
@@ -30,29 +31,25 @@ RECENT_BYTES = 2**20
 
 
 class Copy:
-    """A sealed one-shard message that is sent again; or one shard of a larger one that is sent later."""
+    """A message of one packet that is sent again; or one shard of a larger one that is sent later."""
 
-    __slots__ = ("common", "deadline", "due", "left", "sealed", "shard", "spacing", "topic")
+    __slots__ = ("content", "deadline", "due", "left", "spacing", "topic")
 
     def __init__(
         self,
         topic: SendTopic,
-        common: bytes,
-        sealed: bytes,
+        content: Message | LoneShard,
         left: int,
         spacing: float,
         due: float,
         deadline: float,
-        shard: int = 0,
     ) -> None:
         self.topic = topic
-        self.common = common
-        self.sealed = sealed
+        self.content = content
         self.left = left
         self.spacing = spacing
         self.due = due
         self.deadline = deadline
-        self.shard = shard
 
     def __lt__(self, other: Copy) -> bool:
         return self.due < other.due
@@ -60,7 +57,7 @@ class Copy:
     @property
     def size(self) -> int:
         """Bytes that it holds."""
-        return len(self.sealed)
+        return self.content.size
 
 
 class Flight:
@@ -140,8 +137,13 @@ class Lane:
 
     @property
     def room(self) -> int:
-        """Largest shard."""
+        """Largest sealed message of one packet."""
         return self.path.mtu.size - HEADER_SIZE
+
+    @property
+    def shard_room(self) -> int:
+        """Largest shard."""
+        return self.path.mtu.size - SHARD_AT
 
     def clear(self) -> None:
         """Drop everything."""
@@ -166,14 +168,14 @@ class Lane:
         """Send a message that another path has as well; a small one that many times."""
         topic, deadline = message.topic, message.deadline
         if isinstance(message, Flight):
-            shards = message.shards.again(self.room)
-        elif message.size <= self.room:
+            shards = message.shards.again(self.shard_room)
+        elif message.size > self.room and isinstance(message.content, Message):
+            shards = message.content.shards(self.shard_room)
+        else:
             if len(self.queue) < MAX_TAKEN:
-                copy = Copy(topic, message.common, message.sealed, times, message.spacing, now, deadline)
+                copy = Copy(topic, message.content, times, message.spacing, now, deadline)
                 self.queue.put_other(topic.priority, copy)
             return
-        else:
-            shards = shards_of(message.common, message.sealed, shape_for(message.size, self.room), 0)
         insort_left(self.flights, Flight(topic, shards, deadline), key=_priority)
         del self.flights[:-MAX_FLIGHTS]
         self.wake = now

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .fragment import Positions, Shape, Shards
+from .fragment import Positions, Shape, Shards, Tagger
 
 
 class Parcel(Shards):
@@ -22,7 +22,13 @@ class Parcel(Shards):
     )  # fmt: skip
 
     def __init__(
-        self, number: int, common: bytes, sealed: memoryview, shape: Shape, landed: Callable[[Parcel, float], None]
+        self,
+        number: int,
+        common: bytes,
+        sealed: memoryview,
+        shape: Shape,
+        tagger: Tagger,
+        landed: Callable[[Parcel, float], None],
     ) -> None:
         """Take a sealed message; all of it is to be sent.
 
@@ -31,9 +37,10 @@ class Parcel(Shards):
             common: The header's common part.
             sealed: ``shape.shards * shape.size`` bytes, zeros after ``shape.length``.
             shape: Its layout, with more than one shard.
+            tagger: Of the keys that the common part names.
             landed: Called when nothing is left to be sent for now.
         """
-        super().__init__(common, sealed, shape, 0)
+        super().__init__(common, sealed, shape, 0, tagger)
         self.number = number
         self._landed = landed
         self._missing = np.ones(shape.shards, bool)

@@ -83,6 +83,8 @@ class Paths:
         self._moved = moved
         self._tell = tell
         self._paths: dict[int, Path] = {0: Path(0, config, now)}
+        self._numbers: dict[int, int] = {}
+        """Next packet numbers of paths that are closed: none is used twice with the same keys."""
         self.choice = Choice(self._paths[0], None, False)
         self._overlap_until = -math.inf
         self._previous: Path | None = None
@@ -111,6 +113,7 @@ class Paths:
                 spare = [p for p in self if p is not self.choice.active]
                 self.close(min(spare, key=lambda p: (p.address is not None, p.heard_at)).id, now)
             path = self._paths[path_id] = Path(path_id, self._config, now)
+            path.next_number = self._numbers.pop(path_id, 0)
             if self._up:
                 path.start_epoch(now)
             self._changed(self.choice, now)
@@ -135,6 +138,7 @@ class Paths:
         if path is None or len(self._paths) == 1:
             return
         del self._paths[path_id]
+        self._numbers[path_id] = path.next_number
         if path is self._previous:
             self._previous = None
         if path is self.choice.active:

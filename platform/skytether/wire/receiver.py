@@ -1,7 +1,7 @@
-"""The receiving half of a session: packets -> reassembly -> open -> quality of service -> events.
+"""The receiving half of a session: packets -> authentic ones -> statistics, reassembly -> open -> events.
 
-Total: any bytes may come, at any time; what is refused counts under a bounded reason. Nothing but an authentic,
-complete message changes more than a counter or a bounded buffer.
+Total: any bytes may come, at any time; what is refused counts under a bounded reason. Nothing but an authentic packet
+that was not here before changes more than such a counter.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Hashable
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
+from .ciphers import HandshakeTags
 from .config import Config
 from .epoch import CONTROL, Epoch
 from .handshake import MAX_HANDSHAKE
@@ -24,10 +26,11 @@ from .packet import (
     HELLO,
     KEYS,
     PATH_AT,
+    SHARD,
+    SHARD_AT,
     VERSION,
     WELCOME,
     Packets,
-    peek_session_id,
     pull_packets,
 )
 from .path import Path
@@ -50,14 +53,26 @@ TakeHandshake = Callable[[int, bytes, bytes, int, Hashable, float], None]
 """Type, common part of the header, message, path, address, time of arrival."""
 
 
+class Origin(NamedTuple):
+    """How packets came."""
+
+    address: Hashable
+    path: int | None
+    """By which path; None: the headers say it."""
+    now: float
+    waited: float
+    """Seconds for which this end did not get round to it."""
+
+
 class Receiver:
     """Takes packets of one session on all its paths.
 
     Args:
-        session_id: Of the session.
+        session_id: Id that HELLO must have; None: none is expected, but WELCOME, with any id.
+        tags: Of the handshake packets that are expected.
         config: Bounds.
         find_path: Path by its id, or None.
-        find_epoch: Epoch by its id, or None.
+        find_epoch: Epoch by the id of its packets, or None.
         accept: Called with each authentic message, once.
         handshake: Called with each complete, not yet authenticated handshake message.
         on_expired: Called with the topic index of each message that stayed incomplete for too long.
@@ -66,7 +81,8 @@ class Receiver:
 
     def __init__(
         self,
-        session_id: int,
+        session_id: int | None,
+        tags: HandshakeTags,
         config: Config,
         find_path: Callable[[int], Path | None],
         find_epoch: Callable[[int], Epoch | None],
@@ -76,6 +92,7 @@ class Receiver:
         rejected: Counter[str],
     ) -> None:
         self._session_id = session_id
+        self._tags = tags
         self._max_length = config.max_message + PREFIX.size + OVERHEAD
         self._find_path = find_path
         self._find_epoch = find_epoch
@@ -99,103 +116,128 @@ class Receiver:
         Args:
             data: The bytes.
             address: Where they came from.
-            path: By which path they came; None: the headers say it, and all of a batch came by the same.
+            path: By which path they came; None: the headers say it.
             now: Time.
             segment: Size of the datagrams of a batch.
             waited: Seconds for which this end did not get round to it.
         """
+        origin = Origin(address, path, now, waited)
         total = len(data)
-        by = path if path is not None else data[PATH_AT] if total > PATH_AT else 0
-        known = self._find_path(by)
-        several = segment is not None and 0 < segment < total
-        if known is not None and peek_session_id(data) == self._session_id:
-            known.comes(total, -(-total // segment) if several and segment else 1, now, waited)
-        if not several or segment is None:
-            self._packet(data, address, by, known, now)
+        if segment is None or not 0 < segment < total:
+            self._packet(data, origin)
             return
         whole = total // segment
-        batch = self._batch(data, whole, segment, by)
-        if batch is None:
-            for start in range(0, total, segment):
-                self._packet(data[start : start + segment], address, by, known, now)
-            return
-        if known is not None:
-            numbers, times = batch["number"].astype(np.uint32), batch["time"].astype(np.uint16)
-            known.arrived_all(numbers.tobytes(), times.tobytes(), segment)
-        block = batch["block"]
-        change = np.flatnonzero(block[1:] != block[:-1]) + 1
-        for start, end in pairwise((0, *change.tolist(), whole)):
-            if end - start < MIN_RUN or not self._run(batch[start:end], address, by, now):
-                for i in range(start, end):
-                    self._packet(data[i * segment : (i + 1) * segment], address, by, None, now)
+        if whole < MIN_RUN or not self._shards(data, whole, segment, origin):
+            for start in range(0, whole * segment, segment):
+                self._packet(data[start : start + segment], origin)
         if total > whole * segment:
-            self._packet(data[whole * segment :], address, by, known, now)
+            self._packet(data[whole * segment :], origin)
 
     def sweep(self, now: float) -> None:
         """Drop incomplete messages that are too old."""
         self.messages.expire_all(now)
         self._handshakes.expire_all(now)
 
-    def _batch(self, data: memoryview, whole: int, segment: int, by: int) -> Packets | None:
-        """A batch's packets of that size, if all are of this session's messages under the same keys by one path."""
-        if whole < MIN_RUN or segment <= HEADER_SIZE:
-            return None
-        kind, session_id, epoch_id = KEYS.unpack_from(data)
-        if kind != DATA or session_id != self._session_id or self._find_epoch(epoch_id) is None:
-            return None
+    def _shards(self, data: memoryview, whole: int, segment: int, origin: Origin) -> bool:
+        """Packets of that size with shards under the same keys; False if they have to be looked at one by one."""
+        if segment <= SHARD_AT:
+            return False
+        kind, packet_id, _ = KEYS.unpack_from(data)
+        epoch = self._find_epoch(packet_id) if kind == SHARD else None
+        if epoch is None:
+            return False
         batch = pull_packets(data, whole, segment)
-        keys = batch["keys"]
-        return None if (keys != keys[0]).any() or (batch["path"] != by).any() else batch
+        paths = data[PATH_AT : whole * segment : segment].tobytes()
+        block = batch["block"]
+        change = np.flatnonzero(block[1:] != block[:-1]) + 1
+        if paths.count(paths[0]) < whole or (len(change) and (batch["keys"][change] != batch["keys"][0]).any()):
+            return False
+        good = epoch.ciphers.check(data, whole, segment)
+        if good is None:
+            return False
+        if not good.all():
+            self.rejected["forged"] += whole - int(np.count_nonzero(good))
+            batch = batch[good]
+            if not len(batch):
+                return True
+        by = paths[0]
+        if origin.path not in (None, by):
+            self.rejected["path"] += len(batch)
+            return True
+        numbers = batch["number"].astype(np.uint32)
+        new = epoch.packets(by).accept_all(numbers)
+        if new is not None:
+            self.rejected["repeated"] += len(batch) - int(np.count_nonzero(new))
+            batch, numbers = batch[new], numbers[new]
+            if not len(batch):
+                return True
+        epoch.heard_at = origin.now
+        epoch.bytes_received += len(batch) * segment
+        known = self._find_path(by)
+        if known is not None:
+            known.comes(len(batch) * segment, len(batch), origin.now, origin.waited)
+            known.arrived_all(numbers.tobytes(), batch["time"].astype(np.uint16).tobytes(), segment)
+        if len(batch) < whole:
+            block = batch["block"]
+            change = np.flatnonzero(block[1:] != block[:-1]) + 1
+        for start, end in pairwise((0, *change.tolist(), len(batch))):
+            self._run(epoch, batch[start:end], segment - SHARD_AT, by, origin)
+        return True
 
-    def _packet(self, data: memoryview, address: Hashable, by: int, path: Path | None, now: float) -> None:
-        """One packet; ``path`` is None if there is none or it knows of the packet already."""
-        size = len(data) - HEADER_SIZE
-        if size <= 0:
+    def _packet(self, data: memoryview, origin: Origin) -> None:
+        """One packet."""
+        size = len(data)
+        if size <= HEADER_SIZE:
             self.rejected["short"] += 1
             return
-        kind, session_id, epoch_id, high, low, topic, length, block, index, path_id, packet, time = HEADER.unpack_from(
-            data
-        )
-        if kind != DATA or session_id != self._session_id:
-            self._other(data, kind, session_id, size, length, block, index, by, address, now)
+        kind, packet_id, _, high, low, topic, length, block, index, path, packet, time = HEADER.unpack_from(data)
+        if kind not in (DATA, SHARD):
+            self._other(bytes(data), kind, packet_id, origin)
             return
-        epoch = self._find_epoch(epoch_id)
+        epoch = self._find_epoch(packet_id)
         if epoch is None:
-            self.rejected["epoch"] += 1
+            self.rejected["session"] += 1
             return
-        if path_id != by:
+        plaintext: bytes | None = None
+        if kind == DATA:
+            plaintext = epoch.ciphers.open_packet(data)
+        if plaintext is None and (kind == DATA or not epoch.ciphers.check_one(data)):
+            self.rejected["forged"] += 1
+            return
+        if origin.path not in (None, path):
             self.rejected["path"] += 1
             return
-        if path is not None:
-            path.arrived(packet, time, len(data))
+        if not epoch.packets(path).accept(packet):
+            self.rejected["repeated"] += 1
+            return
+        epoch.heard_at = now = origin.now
+        epoch.bytes_received += size
+        known = self._find_path(path)
+        if known is not None:
+            known.comes(size, 1, now, origin.waited)
+            known.arrived(packet, time, size)
         number = high << 32 | low
-        if length != size:
-            entry = self._entry(epoch, number, topic, length, block, bytes(data[:COMMON_SIZE]), size, 1, now)
-            if entry is not None:
-                sealed = self.messages.add(entry, block, index, data[HEADER_SIZE:])
-                if sealed is not None:
-                    self._open(epoch, number, topic, sealed, entry.key[0], by, address, now)
-        elif not self._refused(epoch, number, topic, 1, now):
-            if block or index:
-                self.rejected["shape"] += 1
-            else:
-                self._open(epoch, number, topic, data[HEADER_SIZE:], data[:COMMON_SIZE], by, address, now)
+        if plaintext is not None:
+            if not self._refused(epoch, number, topic, 1, now):
+                self._open(epoch, number, topic, plaintext, path, origin)
+            return
+        common = bytes(data[:COMMON_SIZE])
+        entry = self._entry(epoch, number, topic, length, block, common, size - SHARD_AT, 1, now)
+        if entry is not None:
+            sealed = self.messages.add(entry, block, index, data[SHARD_AT:])
+            if sealed is not None:
+                self._open(epoch, number, topic, epoch.ciphers.open(number, sealed, common), path, origin)
 
-    def _run(self, run: Packets, address: Hashable, by: int, now: float) -> bool:
-        """Several packets of one block of a large message; False if they have to be looked at one by one."""
+    def _run(self, epoch: Epoch, run: Packets, size: int, by: int, origin: Origin) -> None:
+        """Packets of one block of a large message, with shards of that size."""
         head = run["block"][0].tobytes()
-        _, _, epoch_id, high, low, topic, length, block = BLOCK.unpack(head)
-        epoch = self._find_epoch(epoch_id)
-        size = run["shard"].shape[1]
-        if epoch is None or length == size:
-            return False
+        _, _, _, high, low, topic, length, block = BLOCK.unpack(head)
         number, common = high << 32 | low, head[:COMMON_SIZE]
-        entry = self._entry(epoch, number, topic, length, block, common, size, len(run), now)
+        entry = self._entry(epoch, number, topic, length, block, common, size, len(run), origin.now)
         if entry is not None:
             sealed = self.messages.add_all(entry, block, run["index"].copy(), run["shard"].copy())
             if sealed is not None:
-                self._open(epoch, number, topic, sealed, common, by, address, now)
-        return True
+                self._open(epoch, number, topic, epoch.ciphers.open(number, sealed, common), by, origin)
 
     def _entry(
         self,
@@ -243,58 +285,47 @@ class Receiver:
                 receiver.inbox.touch(now)
         return True
 
-    def _open(
-        self,
-        epoch: Epoch,
-        number: int,
-        topic: int,
-        sealed: memoryview,
-        common: memoryview | bytes,
-        by: int,
-        address: Hashable,
-        now: float,
-    ) -> None:
-        plaintext = epoch.ciphers.open(number, sealed, common)
+    def _open(self, epoch: Epoch, number: int, topic: int, plaintext: bytes | None, by: int, origin: Origin) -> None:
+        """A complete message; None: not what was sealed."""
         if plaintext is None or len(plaintext) < INNER.size:
             self.rejected["forged"] += 1
-            return
-        if epoch.replay.accept(number):
-            self._accept(epoch, topic, plaintext, number, by, address, now)
+        elif epoch.replay.accept(number):
+            self._accept(epoch, topic, plaintext, number, by, origin.address, origin.now)
 
-    def _other(
-        self,
-        data: memoryview,
-        kind: int,
-        session_id: int,
-        size: int,
-        length: int,
-        block: int,
-        index: int,
-        by: int,
-        address: Hashable,
-        now: float,
-    ) -> None:
+    def _other(self, data: bytes, kind: int, packet_id: int, origin: Origin) -> None:
         """A packet that is not of an established session's messages: a handshake, or nothing of ours."""
+        hello = self._session_id is not None
         if kind >> 4 != VERSION:
             self.rejected["version"] += 1
-        elif session_id != self._session_id:
-            self.rejected["session"] += 1
         elif kind not in (HELLO, WELCOME):
             self.rejected["type"] += 1
-        elif not size <= length <= MAX_HANDSHAKE:
-            self.rejected["shape"] += 1
+        elif (kind == HELLO) is not hello:
+            self.rejected["unasked"] += 1
+        elif hello and packet_id != self._session_id:
+            self.rejected["session"] += 1
+        elif not self._tags.check(data):
+            self.rejected["hello_forged" if hello else "welcome_forged"] += 1
         else:
-            common = bytes(data[:COMMON_SIZE])
-            if length == size:
-                self._handshake(kind, common, bytes(data[HEADER_SIZE:]), by, address, now)
-                return
-            entry = self._handshakes.entry(common, size, length, 0, block, HANDSHAKE_LIFESPAN, now)
-            if entry is None:
-                self.rejected["shape"] += 1
-                return
-            message = self._handshakes.add(entry, block, index, data[HEADER_SIZE:])
-            if message is not None:
-                self._handshake(kind, common, bytes(message), by, address, now)
+            self._shake(data, kind, origin)
+
+    def _shake(self, data: bytes, kind: int, origin: Origin) -> None:
+        """An authentic packet of a handshake."""
+        *_, length, block, index, path, _, _ = HEADER.unpack_from(data)
+        size, now, common = len(data) - SHARD_AT, origin.now, data[:COMMON_SIZE]
+        by = path if origin.path is None else origin.path
+        if not size <= length <= MAX_HANDSHAKE:
+            self.rejected["shape"] += 1
+            return
+        if length == size:
+            self._handshake(kind, common, data[SHARD_AT:], by, origin.address, now)
+            return
+        entry = self._handshakes.entry(common, size, length, 0, block, HANDSHAKE_LIFESPAN, now)
+        if entry is None:
+            self.rejected["shape"] += 1
+            return
+        message = self._handshakes.add(entry, block, index, memoryview(data)[SHARD_AT:])
+        if message is not None:
+            self._handshake(kind, common, bytes(message), by, origin.address, now)
 
 
 def _nothing(_topic: int) -> None:

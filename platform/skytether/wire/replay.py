@@ -1,8 +1,11 @@
-"""Which message numbers were accepted already: a sliding window, after RFC 6479."""
+"""Which numbers of messages and packets were accepted already: a sliding window, after RFC 6479."""
 
 from __future__ import annotations
 
 from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
 
 
 class Seen(Enum):
@@ -61,3 +64,41 @@ class ReplayWindow:
             return False
         ring[number % size] = 1
         return True
+
+
+class PacketWindow(ReplayWindow):
+    """The same for packet numbers of a path, which have 32 bits and begin anywhere."""
+
+    SIZE = 16_384
+    """More packets than any path reorders; 16 KiB for each path."""
+    NUMBERS = 2**32
+
+    __slots__ = ()
+
+    def accept(self, number: int) -> bool:
+        if number == (self.highest + 1) % self.NUMBERS:  # as nearly always
+            self.highest += 1
+            self._ring[self.highest % self.SIZE] = 1
+            return True
+        return super().accept(self._whole(number))
+
+    def accept_all(self, numbers: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_] | None:
+        """The same for several, in the order in which they came; which of them were new, None for all."""
+        first, count, size = self._whole(int(numbers[0])), len(numbers), self.SIZE
+        start = first % size
+        if first > self.highest and start + count <= size:
+            expected = np.arange(first, first + count).astype(np.uint32)
+            if numbers.tobytes() == expected.tobytes():  # as nearly always
+                super().accept(first)
+                self._ring[start : start + count] = b"\1" * count
+                self.highest = first + count - 1
+                return None
+        new = np.array([self.accept(number) for number in numbers.tolist()])
+        return None if new.all() else new
+
+    def _whole(self, number: int) -> int:
+        """With the bits that packets do not carry."""
+        if self.highest < 0:
+            return number
+        half = self.NUMBERS // 2
+        return self.highest + (number - self.highest + half) % self.NUMBERS - half

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 
+from .ciphers import Ciphers
 from .config import Config
-from .crypto import Ciphers
 from .handshake import LIFE_SIZE, NO_KEYS, Entropy, Hello
 from .topic import Topic
 
@@ -45,6 +45,8 @@ class Seeker:
         """When to call `seek`."""
         self._elsewhere = False
         """Told to look in another place, from which no answer came yet."""
+        self.rekeying = False
+        """New keys are wanted although those in use work."""
 
     def look_at(self, peers: set[Hashable], connected: bool) -> None:
         """Look there at once, even if somebody is heard from another place."""
@@ -61,10 +63,18 @@ class Seeker:
     def found(self, now: float, epoch: int) -> None:
         """The service is heard; ``epoch`` is the one in use, so that the next HELLO proposes another."""
         self.hello = None
+        self.rekeying = False
         self._elsewhere = False
         self._began = math.inf
         self._proposal = epoch
         self.due = now + self._config.probe_after if self.peers else math.inf
+
+    def rekey(self, now: float) -> None:
+        """Ask for new keys, until there are some."""
+        if not self.rekeying:
+            self.rekeying = True
+            self.hello = None
+            self.due = now
 
     def rest(self, until: float) -> None:
         """Ask again, anew, at that time."""
@@ -87,17 +97,18 @@ class Seeker:
             None if the service was heard lately.
         """
         config = self._config
-        if held is not None and self.hello is None and not self._elsewhere and last_heard + config.probe_after > now:
+        idle = self.hello is None and not self._elsewhere and not self.rekeying
+        if held is not None and idle and last_heard + config.probe_after > now:
             self.due = last_heard + config.probe_after
             return None
         if self.hello is None or self.hello.made_at + HELLO_LIFE < now:
             self._proposal = (self._proposal + 1) % 256
-            name = NO_KEYS if held is None else held.resume
+            name = NO_KEYS if held is None or self.rekeying else held.resume
             self.hello = Hello(
                 self._session_id, self._key, self._topics, self._proposal, name, self._life, self._entropy, now
             )
         self.hello.sent += 1
-        if held is None:
+        if held is None or self.rekeying:
             self._began = min(self._began, now)
             wait = max(config.hello_retry, HELLO_SHARE * (now - self._began))
             self.due = now + min(wait, config.hello_retry_max)

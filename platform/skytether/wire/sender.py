@@ -18,10 +18,11 @@ from .compression import FLAG, Compressed, original_size
 from .config import Config
 from .crypto import TAG_SIZE
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
-from .fragment import Shape, Shards, encode_sealed, shape_for
+from .fragment import Shards, encode_sealed
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
 from .measure import Outbound
-from .packet import DATA, HEADER_SIZE, push_common, push_shard, ticks
+from .message import LoneShard, Message
+from .packet import SHARD_AT, ticks
 from .parcel import Parcel
 from .path import Path, Transmit
 from .queue import SendQueue
@@ -43,13 +44,11 @@ class Sender:
     """Sends on the paths that `use` names.
 
     Args:
-        session_id: In every header.
         config: Settings.
         path: The only one at first.
     """
 
-    def __init__(self, session_id: int, config: Config, path: Path) -> None:
-        self._session_id = session_id
+    def __init__(self, config: Config, path: Path) -> None:
         self._config = config
         self.epoch: Epoch | None = None
         self._control = _control()
@@ -96,6 +95,10 @@ class Sender:
         self.epoch = epoch
         self._control = _control()
 
+    def change_keys(self, epoch: Epoch) -> None:
+        """Seal with other keys from now on; what was sealed before is sent as it is."""
+        self.epoch = epoch
+
     def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
         self._active.queue.put(topic, payload, published_at, extra)
@@ -132,11 +135,9 @@ class Sender:
     def _packet(self, message: bytes, path: Path, now: float) -> bytes | None:
         """Seal a control message of one packet; None if there are no keys."""
         epoch, topic = self.epoch, self._control
-        if epoch is None:
+        if epoch is None or epoch.spent:
             return None
-        number, common, plaintext = self._next(epoch, topic, message, now)
-        sealed = epoch.ciphers.seal(number, plaintext, common)
-        packet = b"".join((common, push_shard(0, 0, path.id, path.number(), ticks(now)), sealed))
+        packet = self._next(epoch, topic, message, now).packet(path.id, path.number(), ticks(now))
         topic.counters.bytes_sent += len(packet)
         return packet
 
@@ -149,6 +150,8 @@ class Sender:
     def next_timer(self, full: Container[int] = ()) -> float:
         """When `transmit` will have something to send by paths not ``full``; 0 for at once, inf for never."""
         due = math.inf
+        if self.epoch is not None and self.epoch.spent:
+            return due
         for lane in self._lanes.values():
             path = lane.path
             if path.address is not None and path.id not in full:
@@ -158,7 +161,7 @@ class Sender:
     def transmit(self, path: Path, now: float) -> list[Transmit]:
         """What may be sent now, at most a burst."""
         epoch, address = self.epoch, path.address
-        if epoch is None or address is None:
+        if epoch is None or address is None or epoch.spent:
             return []
         lane = self._lane(path)
         queue, flights, copies = lane.queue, lane.flights, lane.copies
@@ -175,6 +178,7 @@ class Sender:
             batches.add(packet)
             left -= len(packet)
             path.bytes_sent += len(packet)
+            epoch.bytes_sent += len(packet)
             pacer.spend(len(packet))
         lane.urgent.clear()
         while (priority := queue.priority) >= 0 or flights:
@@ -221,6 +225,7 @@ class Sender:
                     continue
             left -= sent
             path.bytes_sent += sent
+            epoch.bytes_sent += sent
             pacer.spend(sent)
         batches.flush()
         return batches.done
@@ -237,19 +242,20 @@ class Sender:
         now: float,
     ) -> int:
         """Seal a message; send it if it is one shard, else put it on top of the flights. Returns bytes sent."""
-        number, common, plaintext = self._next(epoch, topic, payload, published_at)
-        if len(plaintext) + TAG_SIZE <= lane.room:
-            deadline = published_at + topic.lifespan
-            return self._send_small(epoch, topic, number, common, plaintext, deadline, extra, lane, batches, now)
-        shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
+        message = self._next(epoch, topic, payload, published_at)
+        if message.size <= lane.room:
+            return self._send_small(topic, message, published_at + topic.lifespan, extra, lane, batches, now)
+        common, sealed, shape = message.seal(lane.shard_room)
+        tagger = message.ciphers.tagger
         redundancy, k, deadline = lane.path.redundancy, shape.block_k(0), now + topic.lifespan
         waves = redundancy.waves(k, topic.delivery, topic.lifespan) if shape.blocks == 1 else NO_WAVES
         parity = 0 if waves.more else redundancy.parity(k, shape.blocks, topic.delivery)
         rows = range(k, k + k * waves.more)
         for row, shard in zip(rows, encode_sealed(sealed, shape, rows), strict=True):
             due = now + (row // k) * waves.spacing
-            heapq.heappush(lane.copies, Copy(topic, common, shard, 1, waves.spacing, due, deadline, row))
-        flight = Flight(topic, Shards(common, sealed, shape, parity), deadline)
+            lone = LoneShard(common, row, shard, tagger)
+            heapq.heappush(lane.copies, Copy(topic, lone, 1, waves.spacing, due, deadline))
+        flight = Flight(topic, Shards(common, sealed, shape, parity, tagger), deadline)
         lane.flights.append(flight)
         if self._other is not None or topic.redundant:
             lane.remember(flight, now)
@@ -267,77 +273,68 @@ class Sender:
             return 0
         parcel = letter.parcel
         if parcel is not None and (
-            parcel.number + NUMBER_SPAN < epoch.next_number or parcel.packet_size > lane.room + HEADER_SIZE
+            parcel.number + NUMBER_SPAN < epoch.next_number
+            or parcel.packet_size > lane.shard_room + SHARD_AT
+            or (parcel.tagger is not epoch.ciphers.tagger and not parcel.flying)
         ):
             parcel.cancel()
             parcel = letter.parcel = None
         if parcel is None:
             plaintext = _inner(letter.sequence, letter.published_at, letter.payload)
             plaintext += outbox.prefix(letter) + letter.payload
-            number, common = self._name(epoch, topic, len(plaintext))
-            if len(plaintext) + TAG_SIZE <= lane.room:
+            message = self._number(epoch, topic, plaintext)
+            if message.size <= lane.room:
                 outbox.sent(letter, now)
-                deadline = letter.deadline
-                return self._send_small(epoch, topic, number, common, plaintext, deadline, None, lane, batches, now)
-            shape, sealed = self._seal_large(epoch, number, common, plaintext, lane.room)
-            parcel = letter.parcel = Parcel(number, common, sealed, shape, partial(outbox.landed, letter))
+                return self._send_small(topic, message, letter.deadline, None, lane, batches, now)
+            landed = partial(outbox.landed, letter)
+            sealed = message.seal(lane.shard_room)
+            parcel = letter.parcel = Parcel(message.number, *sealed, message.ciphers.tagger, landed)
         if not parcel.flying:
             parcel.flying = True
             lane.flights.append(Flight(topic, parcel, math.inf))
         return 0
 
-    def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> tuple[int, bytes, bytes]:
-        """Message number, common part of the header and plaintext of a topic's next message."""
+    def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> Message:
+        """A topic's next message."""
         plaintext = _inner(topic.sequence, published_at, payload) + payload
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         counters = topic.counters
         counters.sent += 1
         counters.payload_sent += original_size(payload)
-        return *self._name(epoch, topic, len(plaintext)), plaintext
+        return self._number(epoch, topic, plaintext)
 
-    def _name(self, epoch: Epoch, topic: SendTopic, size: int) -> tuple[int, bytes]:
-        """Claim a message number; returns it and the common part of the header for a plaintext of that size."""
+    @staticmethod
+    def _number(epoch: Epoch, topic: SendTopic, plaintext: bytes) -> Message:
+        """Give a plaintext its message number."""
         number = epoch.next_number
         epoch.next_number = number + 1
-        return number, push_common(DATA, self._session_id, epoch.id, number, topic.index, size + TAG_SIZE)
+        return Message(epoch.ciphers, epoch.id, number, topic.index, plaintext)
 
     def _send_small(
         self,
-        epoch: Epoch,
         topic: SendTopic,
-        number: int,
-        common: bytes,
-        plaintext: bytes,
+        message: Message,
         deadline: float,
         extra: int | None,
         lane: Lane,
         batches: Batches,
         now: float,
     ) -> int:
-        """Seal and send a message of one shard, and plan its copies. Returns bytes sent."""
-        sealed, other = epoch.ciphers.seal(number, plaintext, common), self._other
+        """Send a message of one packet, and plan its copies. Returns bytes sent."""
+        other = self._other
         planned, spacing = lane.path.redundancy.copies(topic.delivery, topic.lifespan)
         extra = planned if extra is None else extra
         if other is not None or topic.redundant:
-            message = Copy(topic, common, sealed, 0, spacing, 0.0, deadline)
-            lane.remember(message, now)
+            sent = Copy(topic, message, 0, spacing, 0.0, deadline)
+            lane.remember(sent, now)
             # every second copy goes by the other path, one at once
-            if other is not None and (self._doubled or topic.redundant or (extra and len(sealed) <= other.room)):
+            if other is not None and (self._doubled or topic.redundant or (extra and message.size <= other.room)):
                 there = max(1, (extra + 1) // 2)
-                other.take(message, now, there)
+                other.take(sent, now, there)
                 extra = max(0, extra - there)
         if extra:
-            heapq.heappush(lane.copies, Copy(topic, common, sealed, extra, spacing, now + spacing, deadline))
-        return self._send_shard(topic, common, sealed, lane.path, batches, now)
-
-    @staticmethod
-    def _seal_large(epoch: Epoch, number: int, common: bytes, plaintext: bytes, room: int) -> tuple[Shape, memoryview]:
-        """Seal a message of several shards; returns its layout and the padded bytes."""
-        length = len(plaintext) + TAG_SIZE
-        shape = shape_for(length, room)
-        sealed = memoryview(bytearray(shape.shards * shape.size))
-        epoch.ciphers.seal_into(number, plaintext, common, sealed[:length])
-        return shape, sealed
+            heapq.heappush(lane.copies, Copy(topic, message, extra, spacing, now + spacing, deadline))
+        return self._send_packet(topic, message, lane.path, batches, now)
 
     def _send_copy(self, copy: Copy, lane: Lane, batches: Batches, now: float) -> int:
         if copy.deadline < now:
@@ -346,15 +343,13 @@ class Sender:
         if copy.left:
             copy.due = now + copy.spacing
             heapq.heappush(lane.copies, copy)
-        size = self._send_shard(copy.topic, copy.common, copy.sealed, lane.path, batches, now, copy.shard)
+        size = self._send_packet(copy.topic, copy.content, lane.path, batches, now)
         copy.topic.counters.bytes_redundant += size
         return size
 
     @staticmethod
-    def _send_shard(
-        topic: SendTopic, common: bytes, sealed: bytes, path: Path, batches: Batches, now: float, shard: int = 0
-    ) -> int:
-        packet = b"".join((common, push_shard(0, shard, path.id, path.number(), ticks(now)), sealed))
+    def _send_packet(topic: SendTopic, content: Message | LoneShard, path: Path, batches: Batches, now: float) -> int:
+        packet = content.packet(path.id, path.number(), ticks(now))
         topic.counters.bytes_sent += len(packet)
         batches.add(packet)
         return len(packet)

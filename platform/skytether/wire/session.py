@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Sequence
 
 from . import control
+from .ciphers import HandshakeTags
 from .compression import Compressed, compress
 from .config import Config
 from .control import Forward, Goodbye, Ping, Report
@@ -74,20 +75,23 @@ class Session:
         self._events: deque[Event] = deque()
         self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, now)
         self._peer: Hashable | None = None
-        self._sender = Sender(session_id, self._config, self._paths.choice.active)
+        self._sender = Sender(self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
         self._delivery = Delivery(self._config.max_message, self._events, self._rejected)
+        service = role is Role.SERVICE
+        hello_tags, welcome_tags = HandshakeTags(key, b"hello"), HandshakeTags(key, b"welcome")
         self._receiver = Receiver(
-            session_id, self._config, self._paths.get, self._find_epoch, self._on_message, self._on_handshake,
+            session_id if service else None, hello_tags if service else welcome_tags, self._config, self._paths.get,
+            self._find_epoch, self._on_message, self._on_handshake,
             self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._ledger = Ledger(role)
         self._streams = Streams(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
-        self._door = Doorkeeper(session_id, key, self._table, entropy) if role is Role.SERVICE else None
+        self._door = Doorkeeper(key, self._table, entropy) if service else None
         self._seeker = Seeker(session_id, key, topics, self._config, entropy)
         self._greeter = Greeter(
-            self._door, self._seeker, self._paths, self._sender, self._ledger, self._events, self._rejected,
-            self._on_welcomed,
+            self._door, self._seeker, self._paths, self._sender, self._ledger,
+            welcome_tags if service else hello_tags, self._events, self._rejected, self._on_welcomed,
         )  # fmt: skip
 
         self._epoch: Epoch | None = None
@@ -100,6 +104,7 @@ class Session:
         self._last_heard = math.nan
         self._sweep_at = math.inf
         self._report_at = math.inf
+        self._rekey_at = math.inf
         self._check_at = math.inf
 
     # --- what the application calls
@@ -272,7 +277,7 @@ class Session:
             return None
         due = min(
             self._sender.next_timer(full), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
-            self._check_at, self._streams.due,
+            self._check_at, self._rekey_at, self._streams.due,
         )  # fmt: skip
         return due if due < math.inf else None
 
@@ -282,6 +287,9 @@ class Session:
             return
         if now >= self._check_at:
             self._check(now)
+        if now >= self._rekey_at:
+            self._rekey_at = math.inf
+            self._seeker.rekey(now)
         if now >= self._seeker.due:
             self._greeter.seek(self._epoch, self._last_heard, now)
         self._paths.handle_timer(now, now - self._last_heard, self._connected)
@@ -294,6 +302,8 @@ class Session:
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
+            if self._door is None and self._epoch is not None and self._epoch.volume >= self._config.rekey_bytes:
+                self._seeker.rekey(now)
 
     # --- keys
 
@@ -305,31 +315,41 @@ class Session:
         if times is not None:
             self._delivery.clock.exchange(*times, now)
 
-    def _find_epoch(self, epoch_id: int) -> Epoch | None:
+    def _find_epoch(self, packet_id: int) -> Epoch | None:
         epoch = self._epoch
-        if epoch is not None and epoch.id == epoch_id:
+        if epoch is not None and epoch.ciphers.packet_id == packet_id:
             return epoch
-        if self._previous is not None and self._previous.id == epoch_id:
+        if self._previous is not None and self._previous.ciphers.packet_id == packet_id:
             return self._previous
-        return self._door.pending(epoch_id) if self._door is not None else None
+        return self._door.pending(packet_id) if self._door is not None else None
 
     def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
+        before = self._epoch
+        goes_on = before is not None and epoch.take_over(before)
         self._drop_previous()
-        if self._epoch is not None:
-            self._previous, self._previous_until = self._epoch, now + self._config.old_keys
+        if before is not None:
+            self._previous, self._previous_until = before, now + self._config.old_keys
         self._epoch = epoch
+        self._handshakes += 1
+        self._greeter.done()
+        self._last_heard = now
+        self._rekey_at = now + self._config.rekey_after if self._door is None else math.inf
+        self._seeker.found(now, epoch.id)
+        if goes_on:
+            self._sender.change_keys(epoch)
+            self._delivery.change_keys(epoch)
+            self._check_at = min(self._check_at, self._previous_until)
+            if not self._connected:
+                self._connect(epoch.topics, now)
+            return
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
         restarted = self._streams.start_epoch(epoch, now)
         self._delivery.start_epoch(epoch)
         self._paths.start_epoch(now)
-        self._handshakes += 1
-        self._greeter.done()
-        self._last_heard = now
         self._sweep_at = now + self._config.keepalive
         self._report_at = now + self._config.report_interval
-        self._seeker.found(now, epoch.id)
         self._connect(epoch.topics, now, restarted)
 
     def _end_epoch(self, now: float) -> None:
@@ -340,7 +360,7 @@ class Session:
         self._delivery.end_epoch()
         self._streams.start_epoch(None, now)
         self._paths.end_epoch()
-        self._sweep_at = self._report_at = math.inf
+        self._sweep_at = self._report_at = self._rekey_at = math.inf
         if self._door is None:
             self._seeker.rest(now + self._config.hello_retry)
         if self._connected:
@@ -348,8 +368,9 @@ class Session:
 
     def _drop_previous(self) -> None:
         if self._previous is not None:
-            for receiver in self._previous.receive.values():
-                receiver.settle(math.inf)
+            if not self._previous.belongs_with(self._epoch):
+                for receiver in self._previous.receive.values():
+                    receiver.settle(math.inf)
             self._previous = None
 
     # --- connection
@@ -374,10 +395,11 @@ class Session:
             else:
                 self._check_at = silent_at
         if self._previous is not None:
-            if now >= self._previous_until:
+            until = max(self._previous_until, self._previous.heard_at + self._config.old_keys)
+            if now >= until:  # a large message that was on its way is there, or will never be
                 self._drop_previous()
             else:
-                self._check_at = min(self._check_at, self._previous_until)
+                self._check_at = min(self._check_at, until)
 
     # --- messages
 
@@ -401,7 +423,7 @@ class Session:
                 self._paths.heard(came_by, number, address, size, now, proven=address == asked_from)
             if not self._connected:
                 self._connect(epoch.topics, now)
-            if self._seeker.hello is not None:
+            if self._seeker.hello is not None and not self._seeker.rekeying:
                 self._seeker.found(now, epoch.id)
         sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
@@ -421,7 +443,7 @@ class Session:
         message = control.pull_control(data)
         if message is None:
             self._rejected["control"] += 1
-        elif epoch is not self._epoch:
+        elif not epoch.belongs_with(self._epoch):
             return
         elif isinstance(message, Ping):
             if path is not None and path.id == message.path:
