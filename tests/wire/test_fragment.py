@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from skytether.wire import fragment, packet
 from skytether.wire.fragment import BLOCK_SHARDS, Shape, Shards, shape_for
+from skytether.wire.tags import SECRET_SIZE, Tags
 from skytether.wire.reassembly import Reassembly
 
 ROOM = 1168
@@ -80,14 +81,11 @@ def test_any_k_of_a_block_will_do():
         assert [bytes(d) for d in decoded] == data
 
 
-def no_tags(rows):
-    """Nobody looks at them here."""
-
-
 def cut(message, room, parity):
     shape = shape_for(len(message), room)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
-    return shape, Shards(packet.push_common(packet.SHARD, 1, 2, 3, 4, len(message)), padded, shape, parity, no_tags)
+    tags = Tags(bytes(SECRET_SIZE))
+    return shape, Shards(packet.push_common(packet.SHARD, 1, 2, 3, 4, len(message)), padded, shape, parity, tags)
 
 
 @given(st.integers(ROOM + 1, 400_000), st.integers(0, 12), st.integers(0, 2**32))

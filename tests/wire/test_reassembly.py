@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from skytether.wire import packet
 from skytether.wire.fragment import Shards, shape_for
 from skytether.wire.reassembly import Reassembly
+from skytether.wire.tags import SECRET_SIZE, Tags
 
 ROOM = 1168
 HEADER = packet.SHARD_AT
@@ -19,7 +20,7 @@ def packets_of(message, number=3, topic=4, parity=0):
     shape = shape_for(len(message), ROOM)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
     common = packet.push_common(packet.SHARD, 1, 2, number, topic, len(message))
-    shards = Shards(common, padded, shape, parity, lambda rows: None)
+    shards = Shards(common, padded, shape, parity, Tags(bytes(SECRET_SIZE)))
     data = shards.take(shards.remaining, 0, 0, 0)
     return shape, np.frombuffer(data, np.uint8).reshape(-1, shards.packet_size)
 

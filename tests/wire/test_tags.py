@@ -22,7 +22,7 @@ def by_definition(packet, secret=SECRET):
     upper = []
     for turn in range(2):
         total = keys[turn] + count * keys[2 + turn]
-        total += sum(word * keys[4 + 2 * i + turn] for i, word in enumerate(words) if i not in (8, 9))
+        total += sum(word * keys[4 + 2 * i + turn] for i, word in enumerate(words) if not 6 <= i < 10)
         upper.append((total % 2**64 >> 32).to_bytes(4, "little"))
     block = packet[24:28] + upper[0] + packet[28:32] + upper[1]
     return Cipher(AES(secret[32:]), ECB()).encryptor().update(block)[:8]

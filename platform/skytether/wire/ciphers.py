@@ -9,7 +9,7 @@ import numpy as np
 from . import crypto
 from .fragment import Tagger
 from .packet import HEADER_SIZE, NONCE_AT, SHARD_AT, TAG_SIZE, TIME_AT
-from .tags import SECRET_SIZE, Bools, Rows, Tags
+from .tags import SECRET_SIZE, Bools, Rows, Tags, Words
 
 _PAD = bytes(12 - (TIME_AT - NONCE_AT))
 _NUMBER_SIZE = 12
@@ -43,7 +43,7 @@ class Ciphers:
         self._out, self._in = _Direction(seal_secret), _Direction(open_secret)
         self.resume = resume
         self.packet_id = packet_id
-        self.tagger: Tagger = self._out.tags.put
+        self.tagger: Tagger = self._out.tags
 
     def seal_into(self, number: int, plaintext: bytes, common: bytes, out: memoryview) -> None:
         """Seal a message of several packets; ``number`` must never have been used with these keys.
@@ -90,7 +90,10 @@ class HandshakeTags:
     def __init__(self, key: bytes, label: bytes) -> None:
         self._key = crypto.derive(key, b"", b"tags of " + label)
 
-    def put(self, rows: Rows) -> None:
+    def sums(self, _heads: Rows, _shards: Rows) -> None:
+        """Nothing is known before."""
+
+    def put(self, rows: Rows, _sums: Words | None = None) -> None:
         """Write the tags of packets in their place."""
         for row in rows:
             row[HEADER_SIZE:SHARD_AT] = np.frombuffer(self._tag(row.tobytes()), np.uint8)

@@ -11,11 +11,10 @@ packets with a whole message each (nonce: path and packet number), two more are 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
-from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers import Cipher, CipherContext
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import CTR, ECB
@@ -27,6 +26,8 @@ SALT_SIZE = 32
 TAG_SIZE = 16
 RESUME_SIZE = 8
 ID_SIZE = 8
+BLOCK_ROOM = 15
+"""Bytes that `block_cipher`'s ``update_into`` wants beyond what it writes."""
 _LABEL = b"skytether 2 "
 
 
@@ -102,9 +103,9 @@ def short_mac(key: bytes, data: bytes, size: int) -> bytes:
     return hashlib.blake2s(data, key=key, digest_size=size).digest()
 
 
-def block_cipher(key: bytes) -> Callable[[bytes], bytes]:
+def block_cipher(key: bytes) -> CipherContext:
     """AES on any number of whole blocks, each by itself; no mode of operation, so not for secrets."""
-    return Cipher(AES(key), ECB()).encryptor().update  # noqa: S305 - a pseudo-random function is what is wanted
+    return Cipher(AES(key), ECB()).encryptor()  # noqa: S305 - a pseudo-random function is what is wanted
 
 
 def key_stream(key: bytes, size: int) -> bytes:

@@ -8,20 +8,33 @@ only, so the receiver need not know how many parity shards there are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import zfec
 
-from .packet import COMMON_SIZE, HEADER_SIZE, NUMBER_AT, SHARD_AT, TIME_AT
+from .packet import COMMON_SIZE, HEADER_SIZE, INDEX_AT, NUMBER_AT, SHARD_AT, TIME_AT
 
 Bytes = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 """Of data shards in their message."""
-Tagger = Callable[[Bytes], None]
-"""Writes the tags of packets, one in each row."""
+Sums = npt.NDArray[np.uint64]
+AHEAD = 64
+"""Shards hashed at a time: many at once cost less each, and nothing waits long for them."""
+
+
+class Tagger(Protocol):
+    """Makes the tags of packets, one in each row."""
+
+    def sums(self, heads: Bytes, shards: Bytes) -> Sums | None:
+        """What can be known of them before they are sent: of their headers up to the block, and their shards."""
+
+    def put(self, rows: Bytes, sums: Sums | None = None) -> None:
+        """Write them in their place, with the `sums` of these packets or without."""
+
+
 
 BLOCK_SHARDS = 100
 """Data shards of a block: the cost of coding grows with k times m, and one block may have 256 shards in all."""
@@ -123,6 +136,8 @@ class Shards:
         "_parity",
         "_sent",
         "_shape",
+        "_summed",
+        "_sums",
         "_tails",
         "length",
         "packet_size",
@@ -147,6 +162,10 @@ class Shards:
         self._tails = _order(shape.shards, parity)
         self._parity: dict[tuple[int, int], bytes] = {}
         self._sent = 0
+        self._sums: Sums | None = None
+        """Of data shards."""
+        self._summed = 0
+        """Of how many."""
         self.length = shape.length
         self.packet_size = SHARD_AT + shape.size
         self.remaining = len(self._tails)
@@ -170,7 +189,7 @@ class Shards:
             rows[first - start :, SHARD_AT:] = np.frombuffer(parity, np.uint8).reshape(end - first, -1)
         self._sent = end
         self.remaining -= count
-        self.tagger(rows)
+        self.tagger.put(rows, self._sums_of(start, end) if end <= shards else None)
         return rows.reshape(-1).data
 
     def sent(self, count: int, now: float) -> None:
@@ -191,8 +210,25 @@ class Shards:
         """Packets of any data shards, by their positions in the message, as `take` returns them."""
         rows = self._headers(self._tails[positions], path, first_number, time)
         rows[:, SHARD_AT:] = self._data[positions]
-        self.tagger(rows)
+        sums = self._sums_of(0, int(positions.max()) + 1)
+        self.tagger.put(rows, None if sums is None else sums[positions])
         return rows.reshape(-1).data
+
+    def _sums_of(self, start: int, end: int) -> Sums | None:
+        """Of these data shards."""
+        first = self._summed
+        if end > first:
+            self._summed = last = min(max(end, first + AHEAD), self._shape.shards)
+            heads = np.empty((last - first, INDEX_AT), np.uint8)
+            heads[:, :COMMON_SIZE] = self._common
+            heads[:, COMMON_SIZE:] = self._tails[first:last, : INDEX_AT - COMMON_SIZE]
+            sums = self.tagger.sums(heads, self._data[first:last])
+            if sums is None:
+                return None
+            if self._sums is None:
+                self._sums = np.empty((self._shape.shards, 2), np.uint64)
+            self._sums[first:last] = sums
+        return None if self._sums is None else self._sums[start:end]
 
     def _headers(self, tails: Bytes, path: int, first_number: int, time: int) -> Bytes:
         """Rows for packets, without tags and shards."""

@@ -69,7 +69,7 @@ def cut(
     shape = Shape(len(message), len(message)) if whole else shape_for(len(message), room)
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
     more = 0 if whole else parity(shape.block_k(0), shape.blocks, 0.9)
-    shards = Shards(common, padded, shape, more, tags.put)
+    shards = Shards(common, padded, shape, more, tags)
     return shards.take(shards.remaining, 0, 0, 0), shards.packet_size
 
 

@@ -73,5 +73,5 @@ class LoneShard:
         """As `Message.packet`."""
         header = self._common + push_shard(0, self._index, path, number, time)
         data = bytearray(header + bytes(SHARD_TAG_SIZE) + self._shard)
-        self._tagger(np.frombuffer(data, np.uint8).reshape(1, -1))
+        self._tagger.put(np.frombuffer(data, np.uint8).reshape(1, -1))
         return bytes(data)
