@@ -35,7 +35,6 @@ class Tagger(Protocol):
         """Write them in their place, with the `sums` of these packets or without."""
 
 
-
 BLOCK_SHARDS = 100
 """Data shards of a block: the cost of coding grows with k times m, and one block may have 256 shards in all."""
 MAX_SHARDS = 256

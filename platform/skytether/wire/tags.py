@@ -165,11 +165,16 @@ class Tags:
             self._plans.clear()
         hashes = np.empty((count, 2), np.uint64)
         made = np.empty(16 * count + BLOCK_ROOM, np.uint8)
-        wide = self._scratch[: count * size].reshape(count, size)
         plan = self._plans[count, size] = _Plan(
-            wide, sized.keys, sized.constant, hashes, hashes.view(_WORD)[:, ::2], hashes.view(np.uint8).reshape(-1).data,
-            made.data, made[: 16 * count].view(_TAG)[::2],
-        )  # fmt: skip
+            wide=self._scratch[: count * size].reshape(count, size),
+            keys=sized.keys,
+            constant=sized.constant,
+            hashes=hashes,
+            nonces=hashes.view(_WORD)[:, ::2],
+            blocks=hashes.view(np.uint8).reshape(-1).data,
+            made=made.data,
+            tags=made[: 16 * count].view(_TAG)[::2],
+        )
         return plan
 
     def _prepare(self, size: int) -> _Sized:
