@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from skytether.wire import fragment, packet
 from skytether.wire.fragment import BLOCK_SHARDS, Shape, Shards, shape_for
-from skytether.wire.tags import SECRET_SIZE, Tags
 from skytether.wire.reassembly import Reassembly
+from skytether.wire.tags import SECRET_SIZE, Tags
 
 ROOM = 1168
 COMMON = packet.push_common(packet.DATA, 1, 2, 3, 4, 5)
