@@ -1,12 +1,13 @@
 import errno
 import select
 import socket
+import struct
 import sys
 import time
 
 import pytest
 
-from skytether.bridge.datagrams import MAX_SEGMENTS, DatagramSocket
+from skytether.bridge.datagrams import MAX_SEGMENTS, SO_TIMESTAMPNS, DatagramSocket
 
 
 @pytest.fixture
@@ -73,6 +74,80 @@ def test_how_long_a_datagram_waited_for_us_is_told(sockets):
     time.sleep(0.05)
     assert receiver.receive() is not None
     assert 0.045 <= receiver.waited < 30
+
+
+@pytest.mark.parametrize("batches", [True, False])
+def test_taken_ahead_nothing_is_lost_reordered_or_mixed_up(sockets, batches):
+    receiver, senders = sockets(batches=batches), [sockets(), sockets()]
+    sent = []
+    for i in range(300):
+        sender, size = senders[i // 7 % 2], 1200 if i % 23 else 40
+        sent.append((sender.address, i.to_bytes(2, "big") + bytes(size - 2)))
+        sender.send(sent[-1][1], receiver.address)
+    got = []
+    while len(got) < len(sent):
+        assert select.select([receiver], (), (), 2)[0], f"only {len(got)} datagrams came"
+        for left in (5, 4, 3, 2, 1, 0):
+            if (batch := receiver.receive(ahead=left > 0)) is None:
+                break
+            data, address, segment = batch
+            got += [(address, one) for one in cut(bytes(data), segment or len(data))]
+            if receiver.drained:
+                break
+    assert got == sent
+
+
+class ScriptedSocket:
+    """Hands over datagrams with the times at which they came, in microseconds."""
+
+    def __init__(self, real, script):
+        self._real, self._script = real, list(script)
+
+    def recvmsg_into(self, buffers, _space):
+        if not self._script:
+            raise BlockingIOError
+        data, address, micros = self._script.pop(0)
+        buffers[0][: len(data)] = data
+        stamp = struct.pack("@ll", 1_700_000_000, 1000 * micros)
+        return len(data), [(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamp)], 0, address
+
+    def __getattr__(self, name):
+        return getattr(self._real, name)
+
+
+def test_only_equal_datagrams_of_one_moment_and_address_are_put_together(sockets):
+    receiver = sockets(batches=False)
+    a, b = ("10.0.0.1", 1), ("10.0.0.2", 1)
+    script = [
+        (b"11", a, 0),
+        (b"22", a, 30),
+        (b"33", a, 50),
+        (b"44", a, 60),
+        (b"55", b, 60),
+        (b"6", b, 60),
+        (b"", b, 60),
+    ]
+    receiver._socket = ScriptedSocket(receiver._socket, script)
+    got = []
+    while (batch := receiver.receive(ahead=True)) is not None:
+        data, address, segment = batch
+        got.append((bytes(data), address, segment))
+    assert receiver.drained
+    assert got == [(b"112233", a, 2), (b"44", a, None), (b"55", b, None), (b"6", b, None), (b"", b, None)]
+
+
+def test_a_batch_put_together_has_its_bound_and_a_last_call_leaves_nothing_behind(sockets):
+    receiver = sockets(batches=False)
+    script = [(bytes([i]) * 1200, ("10.0.0.1", 1), 0) for i in range(150)]
+    receiver._socket = ScriptedSocket(receiver._socket, script)
+    sizes = []
+    for ahead in (True, True, False):
+        data, _, _ = receiver.receive(ahead=ahead)
+        sizes.append(len(data) // 1200)
+        assert bytes(data[::1200]) == bytes(range(sum(sizes[:-1]), sum(sizes)))
+    assert max(sizes) <= MAX_SEGMENTS
+    assert sizes[2] == 1
+    assert receiver._next is None
 
 
 class RefusingSocket:

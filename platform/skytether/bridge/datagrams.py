@@ -15,6 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from typing import NamedTuple
 
 # Linux numbers that Python's socket module does not name.
 UDP_SEGMENT = 103
@@ -33,12 +34,18 @@ MAX_PAYLOAD = 65_507
 SOCKET_BUFFER = 4 * 1024 * 1024
 """A burst must survive the time that other threads keep this one from running: 50 ms at 600 Mbit/s."""
 
+MAX_DATAGRAM = 65_536
+"""No datagram, and nothing that the kernel puts together, is larger."""
+TOGETHER_NS = 50_000
+"""Datagrams that came so soon after each other came at the same time to everybody who measures delays."""
+
 Address = tuple[str, int] | tuple[str, int, int, int]
 
 _SEGMENT_SIZE = struct.Struct("=H")
 _GRO_SIZE = struct.Struct("=i")
 _STAMP = struct.Struct("@ll")
 """Seconds and nanoseconds of the system's wall clock."""
+_BILLION = 1_000_000_000
 _ANCILLARY_SPACE = socket.CMSG_SPACE(_GRO_SIZE.size) + socket.CMSG_SPACE(_STAMP.size)
 _NO_BATCHES = (errno.EINVAL, errno.EIO, errno.EOPNOTSUPP)
 """What a kernel or network device answers that cannot cut this batch."""
@@ -53,6 +60,17 @@ def grow_buffers(sock: socket.socket, size: int = SOCKET_BUFFER) -> None:
             sock.setsockopt(socket.SOL_SOCKET, plain, size)
 
 
+class _Taken(NamedTuple):
+    """What the kernel handed over, in the socket's buffer."""
+
+    start: int
+    size: int
+    address: Address
+    segment: int | None
+    at: int
+    """Nanoseconds of the wall clock; 0 where the kernel does not tell."""
+
+
 class DatagramSocket:
     """A bound, non-blocking UDP socket.
 
@@ -63,6 +81,7 @@ class DatagramSocket:
         errors: Datagrams or batches that the system refused, by name of the error (``EMSGSIZE``).
         too_large: Size of the latest datagram that was refused as larger than the path takes; None if none was.
         waited: Seconds for which what `receive` returned last had been in the kernel; 0 where that does not tell.
+        drained: Whether the kernel had nothing more after what `receive` returned last.
     """
 
     def __init__(
@@ -111,7 +130,11 @@ class DatagramSocket:
         self.errors: Counter[str] = Counter()
         self.too_large: int | None = None
         self.waited = 0.0
-        self._buffer = memoryview(bytearray(65_536)) if scratch is None else scratch
+        self.drained = False
+        # room for one more while others are kept; what others share cannot keep anything
+        self._buffer = memoryview(bytearray(2 * MAX_DATAGRAM)) if scratch is None else scratch
+        self._next: _Taken | None = None
+        """Taken already, and not of those that were returned last."""
 
     @property
     def family(self) -> int:
@@ -144,30 +167,56 @@ class DatagramSocket:
         # typeshed allows for address families other than IP
         return socket.getaddrinfo(host, port, family=family, type=socket.SOCK_DGRAM, flags=flags)[0][4]  # type: ignore[return-value]
 
-    def receive(self) -> tuple[memoryview, Address, int | None] | None:
+    def receive(self, ahead: bool = False) -> tuple[memoryview, Address, int | None] | None:
         """Take what the kernel has: one datagram, or several equal ones (the last may be shorter) from one address.
+
+        Args:
+            ahead: Where the kernel hands over one by one what came together, put it together here: to handle packets
+                one by one costs several times as much. Whoever asks for it goes on until `drained`, or ends with a
+                call that does not: one datagram may have been taken already. Not for sockets with shared ``scratch``.
 
         Returns:
             Data (valid until the next call), sender, and the size of each datagram if there are several;
             None if there is nothing more.
         """
+        first, self._next = self._next or self._take(0), None
+        self.drained = first is None
+        if first is None:
+            return None
+        start, size, address, segment, at = first
+        self.waited = max(0.0, (time.time_ns() - at) / _BILLION) if at else 0.0
+        end = start + size
+        if ahead and segment is None and size:
+            while end <= MAX_DATAGRAM and end - start < MAX_SEGMENTS * size:
+                more = self._take(end)
+                if more is None:
+                    self.drained = True
+                    break
+                if (more.size, more.address, more.segment) != (size, address, None) or more.at - at > TOGETHER_NS:
+                    self._next = more
+                    break
+                end += size
+            segment = size
+        return self._buffer[start:end], address, segment if segment is not None and segment < end - start else None
+
+    def _take(self, start: int) -> _Taken | None:
+        """Have the kernel write into the buffer from there on; None if it has nothing."""
         while True:
             try:
-                size, ancillary, _, address = self._socket.recvmsg_into([self._buffer], _ANCILLARY_SPACE)
+                size, ancillary, _, address = self._socket.recvmsg_into([self._buffer[start:]], _ANCILLARY_SPACE)
             except BlockingIOError:
                 return None
             except OSError as error:  # an ICMP answer to something sent before; the next datagram is not affected
                 self._count(error)
                 continue
-            segment = None
-            self.waited = 0.0
+            segment, at = None, 0
             for level, kind, data in ancillary:
                 if kind == UDP_GRO and level == socket.IPPROTO_UDP:
                     segment = _GRO_SIZE.unpack(data)[0]
                 elif kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
                     seconds, nanoseconds = _STAMP.unpack(data)
-                    self.waited = max(0.0, time.time() - seconds - nanoseconds / 1e9)
-            return self._buffer[:size], address, segment if segment is not None and segment < size else None
+                    at = seconds * _BILLION + nanoseconds
+            return _Taken(start, size, address, segment if segment is not None and segment < size else None, at)
 
     def send(self, data: bytes | memoryview, address: Address, segment: int | None = None) -> int:
         """Send one datagram, or a batch that is cut into datagrams of `segment` bytes (the last may be shorter).

@@ -118,13 +118,15 @@ class Driver:
 
     def _on_readable(self, path: int) -> None:
         by = None if self._service else path
-        for _ in range(_TURN):
+        for left in reversed(range(_TURN)):
             sock = self._sockets.get(path)
-            if sock is None or (batch := sock.receive()) is None:
+            if sock is None or (batch := sock.receive(ahead=left > 0)) is None:
                 break
             data, address, segment = batch
             self._session.receive(data, address, time.monotonic(), segment=segment, path=by, waited=sock.waited)
             self._pass_events()
+            if sock.drained:
+                break
         self._advance()
 
     def _on_timer(self) -> None:
