@@ -1,6 +1,18 @@
 import pytest
 
-from skytether.bridge.echo import LARGEST, SMALLEST, EchoClient, EchoServer, answer, read_answer
+from skytether.bridge.echo import (
+    ADDRESS_BURST,
+    ADDRESS_RATE,
+    ADDRESSES,
+    LARGEST,
+    RATE,
+    SMALLEST,
+    Allowance,
+    EchoClient,
+    EchoServer,
+    answer,
+    read_answer,
+)
 
 NONCE = b"12345678"
 
@@ -36,3 +48,37 @@ def test_nobody_there_is_no_answer():
         address = server.address
     with EchoClient(*address) as client:
         assert client.ask(0.2) is None
+
+
+def said(allowance, size, host, now):
+    """Bytes that an address gets for one question."""
+    return size if allowance.take(answer(question(size), (host, 4242)), now) else 0
+
+
+@pytest.mark.parametrize("hosts", [["10.1.2.3"], [f"2001:db8::{i:x}" for i in range(1, 100)]])
+def test_whoever_is_named_by_a_stranger_gets_a_trickle_of_answers(hosts):
+    """Ten seconds of 9,000 bytes each millisecond: 90 MB of questions in somebody's name."""
+    allowance = Allowance(0.0)
+    got = sum(said(allowance, LARGEST, hosts[i % len(hosts)], i / 1000) for i in range(10_000))
+    assert got <= ADDRESS_BURST + 10 * ADDRESS_RATE + LARGEST
+    assert said(allowance, SMALLEST, "10.1.2.4", 10.0)  # others are answered
+
+
+def test_invented_addresses_get_no_more_than_the_whole_and_no_memory():
+    allowance = Allowance(0.0)
+    got = sum(said(allowance, LARGEST, f"10.{i >> 16}.{i >> 8 & 255}.{i & 255}", i / 20_000) for i in range(20_000))
+    assert got <= 2 * RATE + LARGEST
+    assert len(allowance._addresses) <= ADDRESSES
+
+
+def test_a_doctor_is_answered_all_that_it_asks():
+    allowance = Allowance(0.0)
+    assert all(said(allowance, SMALLEST, "10.1.2.3", i / 50) for i in range(200))
+    assert all(said(allowance, size, "10.1.2.3", 4.0 + i / 10) for i, size in enumerate((1200, 1472, LARGEST) * 5))
+
+
+def test_a_flooded_echo_counts_what_it_does_not_answer():
+    with EchoServer("127.0.0.1", 0) as server, EchoClient(*server.address) as client:
+        for _ in range(30):
+            client.ask(0.02, LARGEST)
+        assert server.refused

@@ -2,7 +2,8 @@
 
 Datagrams only, no session: ``SKYECHO?``, 8 bytes that the asker chose, padding; the answer is ``SKYECHO!``, the same
 8 bytes, the address and port that the question came from (16 bytes of IPv6, IPv4 mapped into it; 2 bytes), and padding
-to the size of the question. An answer is never longer than its question, so the echo amplifies nothing.
+to the size of the question. An answer is never longer than its question, so the echo amplifies nothing; and an address
+gets so little each second that nobody is flooded by answers to questions that another sent in his name.
 """
 
 from __future__ import annotations
@@ -14,18 +15,27 @@ import socket
 import struct
 import threading
 import time
+from collections import OrderedDict
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
 from .datagrams import IP_MTU_DISCOVER, IPV6_MTU_DISCOVER, PMTUDISC_DO
+from .relay_table import Bucket
 
 SMALLEST = 64
 """Bytes of a question; shorter ones are not answered."""
 LARGEST = 9000
+ADDRESS_RATE, ADDRESS_BURST = 32_000, 128_000
+"""Bytes a second, and at once, to one address: several times what `skytether doctor` and a probing robot ask for."""
+RATE = 4_000_000
+"""The same to all together."""
+ADDRESSES = 4096
+"""Addresses remembered."""
 _ASK, _ANSWER = b"SKYECHO?", b"SKYECHO!"
 _BODY = struct.Struct(">8s8s16sH")
 _NONCE = 8
+_IPV4 = b"\0" * 10 + b"\xff\xff"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +59,7 @@ def answer(question: bytes, source: tuple[str, int]) -> bytes | None:
         address = ipaddress.ip_address(source[0].split("%")[0])
     except ValueError:
         return None
-    packed = address.packed if address.version == 6 else b"\0" * 10 + b"\xff\xff" + address.packed
+    packed = address.packed if address.version == 6 else _IPV4 + address.packed
     nonce = question[len(_ASK) : len(_ASK) + _NONCE]
     return _BODY.pack(_ANSWER, nonce, packed, source[1]).ljust(len(question), b"\0")
 
@@ -65,11 +75,30 @@ def read_answer(data: bytes, nonce: bytes) -> tuple[str, int] | None:
     return str(address.ipv4_mapped or address), port
 
 
+class Allowance:
+    """How much an echo may say, and to whom: an IPv4 address, or a network of 64 bits of IPv6."""
+
+    def __init__(self, now: float) -> None:
+        self._all = Bucket(RATE, RATE, now)
+        self._addresses: OrderedDict[bytes, Bucket] = OrderedDict()
+
+    def take(self, said: bytes, now: float) -> bool:
+        """Whether that may be said to the address that it names."""
+        address = said[16:32]
+        key = address if address.startswith(_IPV4) else address[:8]
+        bucket = self._addresses.pop(key, None) or Bucket(ADDRESS_RATE, ADDRESS_BURST, now)
+        self._addresses[key] = bucket
+        if len(self._addresses) > ADDRESSES:
+            self._addresses.popitem(last=False)
+        return bucket.take(len(said), now) and self._all.take(len(said), now)
+
+
 class EchoServer:
     """Answers in a thread of its own until `close`.
 
     Attributes:
         address: Host and port where it listens.
+        refused: Questions that were not answered because there were too many.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -81,12 +110,14 @@ class EchoServer:
         self._socket = _open(host, port)
         name = self._socket.getsockname()
         self.address: tuple[str, int] = (name[0], name[1])
+        self.refused = 0
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"echo-{name[1]}", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         self._socket.settimeout(0.2)
+        allowance = Allowance(time.monotonic())
         while not self._closing:
             try:
                 question, source = self._socket.recvfrom(LARGEST + 1)
@@ -95,9 +126,13 @@ class EchoServer:
             except OSError:  # an ICMP answer to something sent before
                 continue
             said = answer(question, source[:2])
-            if said is not None:
+            if said is None:
+                continue
+            if allowance.take(said, time.monotonic()):
                 with contextlib.suppress(OSError):  # larger than the way back takes: silence says so
                     self._socket.sendto(said, source)
+            else:
+                self.refused += 1
 
     def close(self) -> None:
         """End. May be called again."""

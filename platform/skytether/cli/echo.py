@@ -15,7 +15,7 @@ def echo(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "0.0.0.0",  # noqa: S104 - it is for others
     port: Annotated[int, typer.Option(min=0, max=65_535, help="UDP port; 0: any free one.")] = 8600,
 ) -> None:
-    """Answer UDP echoes until interrupted. Never sends more than it gets, keeps nothing, needs no token.
+    """Answer UDP echoes until interrupted. Never sends more than it gets, little to each address, needs no token.
 
     Robots name it in robot.yaml under task.echoes, by site; `skytether doctor` uses it to look at the network.
     """
