@@ -24,6 +24,7 @@ from skytether.wire.packet import SHARD_AT, pull_header, push_common
 from skytether.wire.parcel import Parcel
 from skytether.wire.reliable import PREFIX, WINDOW, WINDOW_BYTES, Inbox, Outbox
 from skytether.wire.retransmit import FIRST, LONGEST, RoundTrip
+from skytether.wire.tags import SECRET_SIZE, Tags
 from skytether.wire.topic import Direction, Topic
 
 numbers = st.integers(0, 2**64 - 1)
@@ -156,7 +157,7 @@ def parcel(shards=250, size=300):
     shape = shape_for(shards * size, size)
     sealed = memoryview(bytes(range(250)) * (shards * size // 250))
     common = push_common(16, 1, 2, 99, 3, shape.length)
-    return Parcel(99, common, sealed, shape, lambda rows: None, lambda parcel, now: None), shape, sealed
+    return Parcel(99, common, sealed, shape, Tags(bytes(SECRET_SIZE)), lambda parcel, now: None), shape, sealed
 
 
 def take_all(parcel, now):
