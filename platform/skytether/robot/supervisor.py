@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import lru_cache
 from math import inf, isfinite, isnan, nan
 from typing import ClassVar
 
@@ -114,6 +115,12 @@ class Limits:
         check_positive(self, "limits", (name for name in self.__slots__ if name != "linear_min"))
         if self.linear_braking < self.linear_acceleration or self.angular_braking < self.angular_acceleration:
             raise ValueError("limits: braking must not be slower than ordinary acceleration")
+
+
+@lru_cache(maxsize=64)
+def with_gap(limits: Limits, max_gap_s: float) -> Limits:
+    """The same limits with another `Limits.max_gap_s`; asked several times in each turn of a loop."""
+    return replace(limits, max_gap_s=max_gap_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ class Drive:
     def run(self, message: PointCloud2 | None, wanted=(0.5, 0.0), seconds: float = 1.0) -> Decision:
         for tick in range(round(seconds / PERIOD)):
             self.now += PERIOD
-            if message is not None and tick % 2 == 0:  # at 25 Hz
+            if message is not None and tick % 4 == 0:  # at 25 Hz
                 stamp = Time(int(self.now), round(self.now % 1 * 1e9) % 10**9)
                 self.gate.sense("depth", replace(message, header=replace(message.header, stamp=stamp)), self.now)
             self.command(wanted, self.now)

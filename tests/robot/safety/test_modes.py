@@ -113,10 +113,12 @@ def test_with_a_load_that_sticks_out_the_robot_stands_that_much_earlier(load):
         bench = Bench(load())
         bench.says, bench.wanted, bench.ahead = mode, 0.2, 1.0
         x = 0.0
-        for _ in range(700):
+        for turn in range(700):
             bench.ahead = 1.0 - x
             bench.run(0.02)
             x += bench.speed * 0.02
+            if turn > 100 and bench.speed == 0:
+                break
         places[mode] = x
     # Front at 0.3 and 0.1 of room; with the load at 0.5; with people 0.3 of room.
     assert places[""] == pytest.approx(0.6, abs=0.02)
@@ -147,7 +149,7 @@ def test_without_a_topic_requests_say_it_and_all_hold_until_the_first(load):
     assert (bench.speed, bench.gate.modes) == (pytest.approx(0.3), ["loaded", "people"])
     assert bench.gate.set_modes("people", bench.now) == ""
     assert bench.gate.modes == ["people"]
-    bench.run(12.0)
+    bench.run(4.0)
     assert bench.speed == pytest.approx(0.4)
     assert "no mode 'moon'" in bench.gate.set_modes("moon", bench.now)
     bench.run(1.0)

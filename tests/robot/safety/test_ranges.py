@@ -230,3 +230,19 @@ def test_any_scan_gives_finite_points_and_never_raises(ranges, angle_min, increm
     assert seen.points.shape[1] == 2
     cone = view(Mount(), Range(field_of_view=angle_min, min_range=near, max_range=far, range=increment))
     assert np.isfinite(cone.points).all()
+
+
+def test_what_is_remembered_of_a_scans_rays_is_never_another_scans():
+    """The same rays are reckoned once: what they measure, which way they go and what is ignored counts each time."""
+    ahead = (math.radians(-5), math.radians(5))
+    rising = scan([2.0] * 100 + [nan] * 20 + [2.0] * 61)
+    falling = scan([2.0] * 181, angle_min=math.pi / 2, angle_increment=-math.radians(1))
+    asked = [(Mount(), rising), (Mount(), falling), (Mount(ignore=(ahead,)), rising), (Mount(fov=ahead), rising)]
+    first = [view(*each) for each in asked]
+    assert [seen.sight for seen in first] == [Sight.BLIND, Sight.CLEAR, Sight.BLIND, Sight.CLEAR]
+    for seen, again in zip(first[::-1], [view(*each) for each in asked[::-1]], strict=True):
+        assert again.points.tolist() == seen.points.tolist()
+        assert (again.looks == seen.looks).all()
+        assert (again.spans == seen.spans).all()
+    assert first[0].looks.sum() < first[1].looks.sum()
+    assert view(Mount(), scan([2.0] * 181)).looks.sum() == first[1].looks.sum()

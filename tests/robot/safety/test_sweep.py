@@ -37,7 +37,6 @@ def test_what_is_touched_on_the_way_is_in_the_pieces(outline, velocity, time, se
     assert (depth(swept(outline, velocity, time), points[touched]) <= ROUNDED).all()
 
 
-@settings(max_examples=50)
 @given(OUTLINES, VELOCITIES, st.floats(0, 1))
 def test_they_are_hardly_more_than_what_is_covered(outline, velocity, time):
     points = boundary(swept(outline, velocity, time))

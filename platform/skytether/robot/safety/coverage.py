@@ -101,6 +101,8 @@ def widest(cells: Cells) -> float:
     """The widest sector of neighbouring cells [rad]."""
     if cells.all():
         return tau
+    if not cells.any():
+        return 0.0
     flags = np.roll(cells, -int(np.argmin(cells)))  # begins with a cell that is none
     edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
     return float((edges[1::2] - edges[::2]).max(initial=0)) * _CELL
@@ -125,6 +127,11 @@ class Cover:
     sense: float
     reach: NDArray[np.float64]
     near: float | NDArray[np.float64] = 0.0
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it looks at every point there is."""
+        return bool((self.reach == inf).all()) and not np.any(self.near)
 
     def looks_at(self, points: Points) -> NDArray[np.bool_]:
         """Which of the points (base frame, shape (n, 2), m) are where it looks."""
@@ -173,7 +180,7 @@ class Unseen:
             way: Of the outermost corner that must be looked at: what it needs to stop, and room [m].
         """
         speed = hypot(velocity.linear, velocity.angular * self._footprint.radius)
-        if self._params.action is Action.FREE or speed == 0:
+        if self._params.action is Action.FREE or speed == 0 or any(cover.everywhere for cover in covers):
             return 1.0
         longest = max(way, 2 * self._params.near_m)
         least = inf

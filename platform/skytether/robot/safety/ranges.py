@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import lru_cache
 from math import cos, degrees, isfinite, isnan, pi, radians, sin, tau
 
 import numpy as np
@@ -23,6 +24,8 @@ from .footprint import Footprint, Points
 
 MAX_RAYS = 20_000
 """Of one scan; more would cost the loop its time."""
+_KNOWN_RAYS = 8
+"""Kinds of scans whose rays are remembered; one for each laser is enough."""
 _CONE_POINTS = 9
 """Across the cone of a sonar, which says how far but not where."""
 _ENDS_RAYS = 2.0
@@ -129,22 +132,53 @@ def view(mount: Mount, outline: Footprint, message: Message, before: Cells | Non
     return nonsense(f"a {message.TYPE} is no message of a range sensor")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rays:
+    """What a scan's rays say whatever they measure: the same for one scan after the other, so it is not made anew.
+
+    Attributes:
+        used: Which of them count, in the order of rising angles.
+        angles: Of those [rad].
+        spans: Cells that all of them are about.
+        looks: Cells that those that count look into.
+        ignored: Cells that do not count.
+        fov: Cells that `Mount.fov` asks for; None: it does not say.
+    """
+
+    used: NDArray[np.bool_]
+    angles: NDArray[np.float64]
+    spans: Cells
+    looks: Cells
+    ignored: Cells
+    fov: Cells | None
+
+
+@lru_cache(maxsize=_KNOWN_RAYS)
+def _rays(mount: Mount, first: float, increment: float, count: int) -> _Rays:
+    angles = first + increment * np.arange(count, dtype=np.float64)
+    if increment < 0:
+        angles = angles[::-1]
+    used, ignored = np.ones(count, dtype=bool), no_cells()
+    for start, end in mount.ignore:
+        used &= ~_within(angles, start, end)
+        ignored |= sector(start, end, touched=True)
+    spans, looks = (between(these, abs(increment), mount.max_gap) for these in (angles, angles[used]))
+    fov = None if mount.fov is None else sector(*mount.fov)
+    rays = _Rays(used, angles[used], spans, looks, ignored, fov)
+    for array in (rays.used, rays.angles, spans, looks, ignored):
+        array.flags.writeable = False
+    return rays
+
+
 def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | None) -> View:
     ranges = np.asarray(scan.ranges, dtype=np.float64)
     near, far = mount.range_min or scan.range_min, mount.range_max or scan.range_max
     wrong = _wrong_angles(mount, scan, ranges.size)
     if wrong or not 0 <= near < far:
         return nonsense(wrong or f"range_min {near}, range_max {far}")
-    step = abs(scan.angle_increment)
-    angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size, dtype=np.float64)
-    if scan.angle_increment < 0:
-        angles, ranges = angles[::-1], ranges[::-1]
-    spans, ignored = between(angles, step, mount.max_gap), no_cells()
-    used = np.ones(ranges.size, dtype=bool)
-    for first, last in mount.ignore:
-        used &= ~_within(angles, first, last)
-        ignored |= sector(first, last, touched=True)
-    ranges, angles = ranges[used], angles[used]
+    rays = _rays(mount, scan.angle_min, scan.angle_increment, ranges.size)
+    angles, spans = rays.angles, rays.spans
+    ranges = (ranges[::-1] if scan.angle_increment < 0 else ranges)[rays.used]
     none, close = _no_reading(ranges), ranges < near
     close &= ~none
     answered = ~none | mount.no_echo_is_free
@@ -155,13 +189,20 @@ def _of_scan(mount: Mount, outline: Footprint, scan: LaserScan, before: Cells | 
     points = np.concatenate((place(mount, ranges[seen], angles[seen]), too_close(mount, outline, angles[close], near)))
     free = answered & ~close & ~seen
     edge = place(mount, np.full(int(free.sum()), far), angles[free])
-    looks = between(angles[answered & ~close], step, mount.max_gap)
-    gap = widest(_required(mount, spans, before) & ~ignored & ~between(angles[answered], step, mount.max_gap))
+    looks = _looks(mount, scan, rays, answered & ~close)
+    heard = _looks(mount, scan, rays, answered) if close.any() else looks
+    required = _required(spans, before) if rays.fov is None else rays.fov
+    gap = widest(required & ~rays.ignored & ~heard)
     if gap > mount.max_gap:
         return View(Sight.BLIND, points, f"no reading over {degrees(gap):.0f} degrees", edge, looks, spans)
     if not seen.any() and not close.any():
         return View(Sight.EMPTY, points, f"nothing nearer than {far:g} m anywhere", edge, looks, spans)
     return View(Sight.CLEAR, points, "", edge, looks, spans)
+
+
+def _looks(mount: Mount, scan: LaserScan, rays: _Rays, which: NDArray[np.bool_]) -> Cells:
+    """Cells that some of a scan's rays look into."""
+    return rays.looks if which.all() else between(rays.angles[which], abs(scan.angle_increment), mount.max_gap)
 
 
 def _wrong_angles(mount: Mount, scan: LaserScan, rays: int) -> str:
@@ -198,7 +239,7 @@ def _of_cone(mount: Mount, outline: Footprint, message: Range, before: Cells | N
         points = place(mount, np.full(_CONE_POINTS, value), angles)
     else:
         edge = place(mount, np.full(_CONE_POINTS, far), angles)
-    missing = _required(mount, spans, before) & ~spans
+    missing = (_required(spans, before) if mount.fov is None else sector(*mount.fov)) & ~spans
     gap = widest(missing)
     if gap > mount.max_gap:
         said = f"its cone is {degrees(width):.0f} degrees wide, and {degrees(gap):.0f} degrees beside it are missing"
@@ -207,10 +248,8 @@ def _of_cone(mount: Mount, outline: Footprint, message: Range, before: Cells | N
     return View(Sight.CLEAR, points, "", edge, looks, spans)
 
 
-def _required(mount: Mount, spans: Cells, before: Cells | None) -> Cells:
-    """What the sensor must look into."""
-    if mount.fov is not None:
-        return sector(*mount.fov)
+def _required(spans: Cells, before: Cells | None) -> Cells:
+    """What the sensor must look into, where nobody configured it."""
     return spans if before is None else spans | before
 
 

@@ -251,7 +251,7 @@ class Gate:
         return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
     def _supervise(self, hand: str, now: float, troubles: dict[str, str]) -> Velocity:
-        limits = replace(self._place.limits, max_gap_s=self._sources.limits(hand).max_gap_s)
+        limits = supervisor.with_gap(self._place.limits, self._sources.limits(hand).max_gap_s)
         self._supervised, objections = supervisor.step(limits, self._supervised, hand, limits.max_gap_s, now)
         for objection in objections:
             if objection in _ORDINARY:

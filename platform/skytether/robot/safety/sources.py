@@ -15,7 +15,7 @@ from math import inf, isfinite, nan
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 from skytether.robot.command import Command, unused_axes
-from skytether.robot.supervisor import Limits
+from skytether.robot.supervisor import Limits, with_gap
 
 from . import joystick, latch, neutral
 from .joystick import Grip, Joystick, JoystickParams
@@ -256,9 +256,9 @@ class Sources:
         """The supervisor's limits while that one drives."""
         params = self._rules.joystick
         if hand == Hand.JOYSTICK and params is not None:
-            return replace(self._limits, max_gap_s=params.max_age_s)
+            return with_gap(self._limits, params.max_age_s)
         source = self._sources.get(hand)
-        return self._limits if source is None else replace(self._limits, max_gap_s=source.timeout_s)
+        return self._limits if source is None else with_gap(self._limits, source.timeout_s)
 
     def _first(self, floor: float, now: float, troubles: dict[str, str]) -> str:
         """The one of the highest priority who wants to drive and may; the agent, if nobody does."""

@@ -25,9 +25,9 @@ _SHORTEST = 1e-6
 def moved(points: Points, velocity: Velocity, time: float) -> Points:
     """Where points of the robot are after a time [s] on the same curve, in the base frame of now."""
     turn = velocity.angular * time
-    # The chord of the curve; sin(x)/x and (1 - cos(x))/x are well-behaved at zero only in this form.
+    # The chord of the curve.
     half = turn / 2
-    chord = velocity.linear * time * float(np.sinc(half / np.pi))
+    chord = velocity.linear * time * float(np.sin(half) / half if half else 1.0)
     c, s = np.cos(turn), np.sin(turn)
     x = c * points[:, 0] - s * points[:, 1] + chord * np.cos(half)
     y = s * points[:, 0] + c * points[:, 1] + chord * np.sin(half)
