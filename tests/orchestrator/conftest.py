@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from reconcile_bench import Bench
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
-from skytether.orchestrator import catalogue
+from skytether.orchestrator import catalogue, sites
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.records import Record
@@ -102,8 +103,10 @@ def migrated() -> bytes:
 @pytest.fixture(scope="session", autouse=True)
 def installed_services_are_read_once() -> Iterator[None]:
     """They stay what they are while the tests run, and hundreds of orchestrators want to know."""
-    read = cache(catalogue.read_builtin)
+    read, installed = cache(catalogue.read_builtin), cache(entry_points)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalogue, "entry_points", installed)
+        patch.setattr(sites, "entry_points", installed)
         patch.setattr(catalogue, "read_builtin", lambda points: read(tuple(points)))
         yield
 
@@ -179,9 +182,14 @@ class Server:
     def __init__(self) -> None:
         self.app: Any = None
         self.url = ""
+        self._routes: Any = None
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         await self.app(scope, receive, send)
+
+    def share_routes(self) -> None:
+        """They know no orchestrator, and to make them takes longer than most tests do."""
+        self._routes = self.app.router = self._routes or self.app.router
 
     def run(self) -> Iterator[Server]:
         config = uvicorn.Config(self, interface="asgi3", log_config=None, lifespan="off", timeout_graceful_shutdown=1)
@@ -202,6 +210,7 @@ def served_in(folder: Path, server: Server, **settings: Any) -> Iterator[Served]
     core.start()
     core.sites.delete("local")
     server.app = create_app(core)
+    server.share_routes()
     served = Served(core, server.url, fleet, (folder / "operator.token").read_text().strip())
     served.operator.put_service("toy", document(params={"properties": {"mass": {"type": "number", "minimum": 0}}}))
     yield served

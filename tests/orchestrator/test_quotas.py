@@ -142,8 +142,8 @@ def test_watchers_that_leave_make_room(served_with: Any) -> None:
     served.site()
     robot = served.robot()
     made = robot.create_instance(ASK)
-    for _ in range(6):
-        assert list(robot.watch(made.id, timeout=0.2))
+    for _ in range(3):
+        assert list(robot.watch(made.id, timeout=0.5))
     watching = [robot.watch(made.id), robot.watch(made.id)]
     for one in watching:
         next(one)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic_core import from_json, to_json
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
@@ -11,6 +12,9 @@ from sqlalchemy.exc import TimeoutError as NoConnectionError
 
 from .discovery import NAME
 from .errors import OutdatedError
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 GONE = (OperationalError, InterfaceError, NoConnectionError)
 """What is raised when the database does not answer (or, SQLite, its disk is full), or all connections wait for it."""
@@ -130,14 +134,11 @@ def migrate(engine: Engine, to: str = "head") -> str:
         OutdatedError: The database has one that it does not know.
     """
     from alembic import command  # Alembic is slow to import, and only needed here
-    from alembic.config import Config
-    from alembic.script import ScriptDirectory
+    from alembic.runtime.migration import MigrationContext
     from alembic.script.revision import ResolutionError
     from alembic.util import CommandError
 
-    config = Config()
-    config.set_main_option("script_location", "skytether.orchestrator:migrations")
-    config.set_main_option("path_separator", "os")
+    config, newest = _alembic(), _newest()
     with engine.execution_options(immediate=True).begin() as connection:
         if engine.dialect.name == "postgresql":
             # A large table takes its time; requests of others that run still are waited for, but not for ever.
@@ -145,6 +146,8 @@ def migrate(engine: Engine, to: str = "head") -> str:
             connection.detach()  # closed at the end, and not used for what has to be quick
             connection.execute(text(f"SET LOCAL statement_timeout = 0; SET LOCAL lock_timeout = {_LOCK_MS}"))
             connection.execute(text(f"SELECT pg_advisory_xact_lock({MIGRATING})"))
+        if to == "head" and MigrationContext.configure(connection).get_current_heads() == (newest,):
+            return newest
         config.attributes["connection"] = connection
         try:
             command.upgrade(config, to)
@@ -152,4 +155,21 @@ def migrate(engine: Engine, to: str = "head") -> str:
             if isinstance(error.__cause__, ResolutionError):  # the database's revision: ours are all known
                 raise OutdatedError from error
             raise
-    return str(ScriptDirectory.from_config(config).get_current_head())
+    return newest
+
+
+@cache
+def _newest() -> str:
+    """The newest schema that this code knows."""
+    from alembic.script import ScriptDirectory
+
+    return str(ScriptDirectory.from_config(_alembic()).get_current_head())
+
+
+def _alembic() -> Config:
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", "skytether.orchestrator:migrations")
+    config.set_main_option("path_separator", "os")
+    return config
