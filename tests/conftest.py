@@ -12,7 +12,8 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -47,35 +48,60 @@ TOGETHER = (
     "lab/test_bench_fleet.py",
     "lab/test_bench_start.py",
     "lab/test_embedded.py",
+    "lab/test_person.py",
     "lab/test_world.py",
     "orchestrator/test_backup.py",
     "orchestrator/test_docker.py",
+    "orchestrator/test_disk_full.py",
     "orchestrator/test_docker_orchestrated.py",
+    "orchestrator/test_faults.py",
     "orchestrator/test_faults_engine.py",
     "orchestrator/test_images.py",
     "orchestrator/test_migrations.py",
     "orchestrator/test_moves.py",
+    "orchestrator/test_openapi.py",
     "orchestrator/test_plan.py",
     "orchestrator/test_process.py",
+    "orchestrator/test_reconcile.py",
     "orchestrator/test_replicas.py",
+    "orchestrator/test_server.py",
     "orchestrator/test_tls_and_logs.py",
     "robot/safety/test_footprint.py",
+    "robot/safety/test_gate_loop.py",
     "robot/safety/test_rules.py",
     "robot/safety/test_sensing.py",
+    "robot/safety/test_stopping.py",
     "robot/test_accrual.py",
     "robot/test_arbiter.py",
+    "robot/test_cloud_ros2.py",
     "robot/test_ros2.py",
     "robot/test_supervisor.py",
     "ros/ros1/",
+    "ros/ros2/test_display.py",
     "ros/ros2/test_gate.py",
     "ros/ros2/test_node.py",
+    "ros/ros2/test_own_gate.py",
     "ros/ros2/test_parameters.py",
     "ros/ros2/test_port.py",
+    "ros/ros2/test_robot_run.py",
     "service/test_calls.py",
     "services/",
     "wire/",
 )
 """Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
+
+ALONE = (
+    "orchestrator/test_server.py::test_a_killed_orchestrator_comes_back",
+    "orchestrator/test_server.py::test_a_killed_service_is_seen_within_a_second",
+    "orchestrator/test_server.py::test_at_shutdown_what_was_asked",
+    "orchestrator/test_server.py::test_killed_in_the_middle_of_starting",
+    "orchestrator/test_server.py::test_watchers_do_not_hold_up_the_end",
+)
+"""Among those the ones that look at the clock."""
+
+QUICK_S = 0.5
+"""Of processor time; a quick test that takes more belongs among the slow ones, or is made cheaper."""
+_BEGAN = pytest.StashKey[float]()
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -85,7 +111,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.is_relative_to(here):
             name = f"{item.path.relative_to(here).as_posix()}::{item.name}"
-            if name.startswith(TOGETHER):
+            if name.startswith(TOGETHER) and not name.startswith(ALONE):
                 item.add_marker(pytest.mark.together)
 
 
@@ -95,8 +121,29 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.stash[_BEGAN] = time.process_time()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note what a quick test cost, with its fixtures; whoever else uses the machine adds little to that."""
+    report = yield
+    if report.when == "teardown" and item.get_closest_marker("slow") is None and _BEGAN in item.stash:
+        report.user_properties.append(("processor_s", time.process_time() - item.stash[_BEGAN]))
+    return report
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Why a test was run again; pytest keeps that to itself where it then passed."""
+    """The costliest quick tests, and why a test was run again: pytest keeps that to itself where it then passed."""
+    ended = (report for report in terminalreporter.stats.get("", ()) if report.when == "teardown")
+    costs = [(dict(report.user_properties).get("processor_s", 0.0), report.nodeid) for report in ended]
+    costly = sorted((cost for cost in costs if cost[0] > QUICK_S), reverse=True)
+    if costly:
+        terminalreporter.section(f"quick tests of more than {QUICK_S} s of processor time: {len(costly)}")
+    for seconds, name in costly[:10]:
+        terminalreporter.write_line(f"{seconds:.2f}s {name}")
     for report in terminalreporter.stats.get("rerun", ()):
         why = getattr(getattr(report.longrepr, "reprcrash", None), "message", report.longrepr)
         terminalreporter.write_line(f"run again: {report.nodeid}, for {' '.join(str(why).split())[:500]}")

@@ -64,6 +64,7 @@ def test_lets_go_at_the_end() -> None:
     assert push(p, 500, pose=Pose(0.31, 0, 0)) == pytest.approx((0, 0), abs=0.5)
 
 
+@pytest.mark.slow
 def test_steps_show_in_the_push_at_the_step_rate() -> None:
     stepping = dataclasses.replace(CALM, step_force=5.0, step_rate=1.7)
     p = person(stepping)
@@ -73,6 +74,7 @@ def test_steps_show_in_the_push_at_the_step_rate() -> None:
     assert peak == pytest.approx(1.7, abs=0.15)
 
 
+@pytest.mark.slow
 def test_unsteadiness_has_the_size_asked_for() -> None:
     shaky = dataclasses.replace(CALM, speed=0.0, tremor=2.0)
     p = person(shaky)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, nan
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.control.admittance import Velocity
@@ -44,6 +44,7 @@ def test_a_good_drive_has_no_violation():
     assert finding.standstill == (pytest.approx(0.24, abs=0.021), 0.3)
 
 
+@settings(max_examples=10)
 @given(st.lists(st.floats(-0.015, 0.0), min_size=200, max_size=200))
 def test_a_clock_that_is_read_a_little_before_sending_is_no_violation(early):
     record = drive((0.5, 1.0), (0.0, 1.0), (0.5, 2.0))

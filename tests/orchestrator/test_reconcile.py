@@ -205,7 +205,7 @@ def test_a_standby_that_cannot_be_started_waits_for_no_room(
     assert len(b.runtime.world) == 0
 
 
-@pytest.mark.parametrize("silent", [False, True])
+@pytest.mark.parametrize("silent", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_waits_tries_a_site_that_could_not_start_it_again(
     bench: Any, new_record: NewRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silent: bool
 ) -> None:

@@ -114,7 +114,9 @@ def only_long(*seeds):
 
 
 @short_and_long(1, 2)
-@pytest.mark.parametrize(("loss", "camera"), [("50ms-1%", 0.995), ("50ms-5%", 0.99)])
+@pytest.mark.parametrize(
+    ("loss", "camera"), [("50ms-1%", 0.995), pytest.param("50ms-5%", 0.99, marks=pytest.mark.slow)]
+)
 def test_random_loss(world, loss, camera, seed, seconds):
     measured = Measured(world, link_of(loss), seed=seed, seconds=seconds)
     assert measured.small >= 0.999

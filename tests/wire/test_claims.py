@@ -138,6 +138,7 @@ def test_large_messages_go_to_a_proven_address_only(link):
     assert len([m for _, m in link.messages[ROBOT] if m.topic == "image"]) >= 40
 
 
+@pytest.mark.slow
 def test_a_move_under_loss_takes_a_few_questions(make_world):
     for seed in range(8):
         bad = [LinkConditions(delay=0.02, loss=0.3, seed=2 * seed + i) for i in range(2)]

@@ -304,6 +304,7 @@ def relay(link, first):
         link.inject(ROBOT, bytes(batch.data), "service", batch.segment)
 
 
+@pytest.mark.slow
 def test_used_hellos_and_pending_handshakes_are_bounded(world, topics):
     door = Doorkeeper(bytes(32), {t.name: t for t in topics}, world.random.randbytes)
     from skytether.wire.handshake import NO_KEYS, Hello

@@ -132,6 +132,7 @@ def test_what_was_sent_before_repeated_cut_and_changed(live, seed):
         assert state(live, role) == before
 
 
+@pytest.mark.slow
 def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     config = Config(max_message=200_000, reassembly_limit=400_000)
     world = make_world(2)

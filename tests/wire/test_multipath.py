@@ -93,6 +93,7 @@ def test_a_broken_path_costs_the_others_its_detection(two, topic, role):
     assert events == [PathSwitched(1, "lost")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [ROBOT, SERVICE])
 def test_a_path_broken_one_way_only_is_found_out_by_who_sends(two, way):
     link = two()
@@ -103,6 +104,7 @@ def test_a_path_broken_one_way_only_is_found_out_by_who_sends(two, way):
     assert path_of(link, way, 1).active
 
 
+@pytest.mark.slow
 def test_a_large_message_under_way_ends_on_the_other_path(two):
     link = two(config=Config(rate_bps=5e6))
     fate = stream(link, "camera", 2.0, size=40_000, period=0.1)
@@ -181,6 +183,7 @@ def test_an_interface_that_vanishes_and_another_that_comes(two):
     assert {p.path for p in link.sessions[SERVICE].stats(link.now).paths} == {1, 2}  # the one left is forgotten
 
 
+@pytest.mark.slow
 def test_the_last_interface_goes_and_comes_back_as_another(two):
     link = two()
     link.close_path(0)
@@ -194,6 +197,7 @@ def test_the_last_interface_goes_and_comes_back_as_another(two):
     assert link.sessions[ROBOT].stats(link.now).handshakes == 1
 
 
+@pytest.mark.slow
 def test_an_address_that_changes_in_mid_stream_loses_nothing_of_a_redundant_topic(two):
     link = two()
     up, down = stream(link, "safe", 2.0), stream(link, "safe_out", 2.0, role=SERVICE)

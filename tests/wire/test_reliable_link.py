@@ -79,6 +79,7 @@ def test_everything_arrives_once_and_in_order_on_any_link(make_world, up, down, 
         assert link.sessions[role]._streams._busy == set()
 
 
+@pytest.mark.slow
 def test_a_latched_value_published_before_there_was_a_session_is_kept(world):
     link = make(world, connect=False, up=LinkConditions(cut=True), down=LinkConditions(cut=True))
     assert link.publish(SERVICE, "param", b"old")

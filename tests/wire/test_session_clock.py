@@ -58,6 +58,7 @@ def test_every_message_at_both_ends(make_world, offset, drift, up, down, jitter,
             assert stats.clock_error <= (up + down) / 2 + 10 * jitter + 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [-MAX_DRIFT, MAX_DRIFT])
 def test_minutes_of_drift_is_followed(world, drift):
     link = world.link(service_clock=(50.0, drift), up=LinkConditions(delay=0.03), down=LinkConditions(delay=0.01))

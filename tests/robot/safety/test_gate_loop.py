@@ -430,10 +430,11 @@ def test_a_stranger_cannot_tell_the_agent_its_state(bench):
     assert unpack_state(lie[:-1]) is None
 
 
+@pytest.mark.slow
 def test_a_display_that_hangs_costs_the_loop_nothing_and_is_named(bench, tmp_path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hangs:
         hangs.bind(str(tmp_path / "display.sock"))
-        for _ in range(100 * 12):
+        for _ in range(100 * 20):
             bench.link.send(Velocity(0.2, 0.0))
             assert bench.turn() is not None
         assert any("zones are not shown" in sentence for sentence in bench.ask(do="status")["troubles"])

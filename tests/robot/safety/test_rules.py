@@ -341,6 +341,7 @@ def test_each_trouble_is_named_once(caplog):
     assert any("odom" in sentence for sentence in said)
 
 
+@pytest.mark.slow
 def test_ten_times_the_rate_changes_nothing():
     ordinary, hasty = Bench(), Bench()
     for _ in range(200):

@@ -125,13 +125,6 @@ def drives(draw: st.DrawFn, *rates: float) -> tuple[Drive, float]:
 seeds = st.integers(0, 2**32)
 
 
-@settings(max_examples=3)
-@given(drives(10.0, 15.0, 30.0))
-def test_whatever_the_robot_and_whatever_it_wants_nothing_gets_into_the_stop_zone(drawn):
-    drive, seconds = drawn
-    assert deepest(drive, seconds) <= CURVES
-
-
 @pytest.mark.slow
 @settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
 @given(drives(10.0, 15.0, 30.0, 50.0, 100.0, 250.0, 500.0))

@@ -63,7 +63,7 @@ def slowest(told, since):
     return max(steps, default=0.0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])  # below are all that tell it to end
 def test_without_a_section_there_is_a_gate_that_stops_the_wheels_and_ends_with_the_agent(graph, walker, start, number):
     agent = start("run")
     drives(walker)
