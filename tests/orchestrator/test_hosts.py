@@ -36,7 +36,7 @@ PATHS = ("/healthz", "/readyz", "/metrics", "/docs", "/openapi.json", "/api/v1/s
 @pytest.mark.parametrize("path", PATHS)
 def test_a_page_that_was_given_our_address_reads_nothing(served: Any, path: str) -> None:
     headers = {"Authorization": f"Bearer {served.token}", "Host": "evil.example"}
-    answer = httpx.get(f"{served.url}{path}", headers=headers, trust_env=False)
+    answer = httpx.get(f"{served.url}{path}", headers=headers, trust_env=False, timeout=30)
     assert answer.status_code == 421
     assert "'hosts'" in answer.json()["detail"]
     assert "SKYTETHER_HOSTS" in answer.json()["detail"]
@@ -44,15 +44,19 @@ def test_a_page_that_was_given_our_address_reads_nothing(served: Any, path: str)
 
 @pytest.mark.parametrize("host", ALWAYS)
 def test_addresses_and_loopback_names_need_no_setting(served: Any, host: str) -> None:
-    assert httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False).status_code == 200
+    assert httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False, timeout=30).status_code == 200
 
 
 def test_names_that_were_set_are_good(served_with: Any) -> None:
     served = served_with(hosts=("Cloud.example.org", "*.robots.example"), advertise="http://orch-1:8600")
     for host in ("cloud.example.org:443", "a.robots.example", "orch-1:8600", socket.gethostname()):
-        assert httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False).status_code == 200, host
+        assert (
+            httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False, timeout=30).status_code == 200
+        ), host
     for host in ("robots.example", "evilrobots.example", "cloud.example.org.evil.example", "xcloud.example.org"):
-        assert httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False).status_code == 421, host
+        assert (
+            httpx.get(f"{served.url}/healthz", headers={"Host": host}, trust_env=False, timeout=30).status_code == 421
+        ), host
 
 
 @pytest.mark.parametrize(
@@ -81,7 +85,7 @@ def test_where_it_listens_is_its_name() -> None:
 
 
 def test_the_page_loads_nothing_from_elsewhere(served: Any) -> None:
-    with httpx.Client(base_url=served.url, trust_env=False) as http:
+    with httpx.Client(base_url=served.url, trust_env=False, timeout=30) as http:
         page = http.get("/docs")
         sources = re.findall(r'(?:src|href)="([^"]+)"', page.text)
         assert "docs/swagger-ui-bundle.js" in sources
