@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,6 +30,10 @@ _END_S = 10.0
 _AGAIN_S = 1.0
 """Between two starts of one that ended by itself."""
 _POLL_S = 0.05
+_STRANGE_S = 15.0
+"""A gate that was there when we came, and ends so soon after, was the one of an agent that has died."""
+_GONE_S = 1.0
+"""A gate that listens no more for so long has ended, or is started anew by whoever looks after it."""
 _ASK_S = 3.0
 
 NO_GATE = (
@@ -77,7 +81,7 @@ class OwnGate:
 
     def look(self) -> str:
         """Start it again if it has ended by itself. Returns a sentence about that; empty: it runs."""
-        if self._assumed:
+        if self._assumed and listens(self._folder):
             self._let_go(start=True)
             self._assumed = False  # that was for this start; from now on a person is asked
         status = self._process.poll()
@@ -110,6 +114,58 @@ class OwnGate:
                 ask(self._folder, {"do": "start"}, _ASK_S)
 
 
+class FoundGate:
+    """A gate that ran already. It may be that of an agent that was killed a moment ago, and brakes before it ends.
+
+    Args:
+        config: The robot.yaml.
+        safety: Its section.
+        assumed: See `OwnGate`.
+        make: Starts another one.
+        there: Whether a gate listens in the folder.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        config: Path,
+        safety: SafetyConfig,
+        *,
+        assumed: bool,
+        make: Callable[..., OwnGate] = OwnGate,
+        there: Callable[[Path], bool] = listens,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._config = config
+        self._safety = safety
+        self._assumed = assumed
+        self._make = make
+        self._there = there
+        self._clock = clock
+        self._end = clock() + _STRANGE_S
+        self._gone_at: float | None = None
+        self._own: OwnGate | None = None
+
+    def look(self) -> str:
+        """Start one if it has ended. Returns a sentence about that; empty: it runs."""
+        if self._own is not None:
+            return self._own.look()
+        now = self._clock()
+        if self._there(self._safety.place()):
+            self._gone_at = None
+            return ""
+        self._gone_at = now if self._gone_at is None else self._gone_at
+        if self._gone_at > self._end or now - self._gone_at < _GONE_S:
+            return ""
+        self._own = self._make(self._config, self._safety, assumed=self._assumed)
+        return "the gate that ran here has ended: it was that of another agent; one of our own is started"
+
+    def close(self) -> None:
+        """Have the one that was started end."""
+        if self._own is not None:
+            self._own.close()
+
+
 def other_wheels(config: Path, folder: Path) -> str:
     """Whether the gate that runs in a folder is another robot's: a sentence; empty: it is this one's, or hangs.
 
@@ -130,8 +186,8 @@ def other_wheels(config: Path, folder: Path) -> str:
 
 
 @contextmanager
-def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterator[OwnGate | None]:
-    """See that there is a gate for as long as the context lasts; None: it is not ours, or there is to be none.
+def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterator[OwnGate | FoundGate | None]:
+    """See that there is a gate for as long as the context lasts; None: there is to be none.
 
     Args:
         config: The robot.yaml.
@@ -150,7 +206,11 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         if strange:
             fail(strange)
         console.print(f"gate: uses the one that runs in {safety.place()}", markup=False, soft_wrap=True)
-        yield None
+        found = FoundGate(config, safety, assumed=assumed)
+        try:
+            yield found
+        finally:
+            found.close()
         return
     if assumed:
         console.print(f"warning: {ASSUMED}", style="yellow", markup=False, soft_wrap=True)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skytether.ros.ros1.node import Node
 
     from .robot_config import RobotConfig, Ros1Config, Ros2Config
-    from .robot_gate import OwnGate
+    from .robot_gate import FoundGate, OwnGate
 
 _STATUS_S = 0.5
 """Between looks at the agent, to say what changed."""
@@ -157,7 +157,7 @@ def _node(settings: RobotConfig, ros1: Ros1Config, ended: threading.Event) -> It
 
 
 def _watch(
-    status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None, gate: OwnGate | None
+    status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None, gate: OwnGate | FoundGate | None
 ) -> None:
     """Say what changes, until the end."""
     gc.freeze()  # all that is loaded by now stays: looking through it for garbage takes ticks of the control loop

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from skytether.lab.safety import cloud, deaths, hardware, ros1, starve, stops, suspend
+from skytether.lab.safety import cloud, deaths, hardware, ros1, starve, stops, storm, suspend
 from skytether.lab.safety.attacks import Attack, Attacks, MakeRobot
 from skytether.lab.safety.checker import Finding, tightest
 from skytether.lab.safety.cores import busy_cores
@@ -85,6 +85,7 @@ def attacks(with_ros1: bool = False) -> list[Attack]:
     cloud.enter(known)
     starve.enter(known)
     suspend.enter(known)
+    storm.enter(known)
     if with_ros1:
         ros1.enter(known)
     return known.all

@@ -9,7 +9,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-from . import deaths, hardware, stops
+from . import deaths, hardware, stops, storm
 from .attacks import Attacks
 from .robot import PlayedRobot
 from .ros1_hardware import Ros1Hardware
@@ -39,6 +39,8 @@ def enter(attacks: Attacks) -> None:
     add("stop-gate-killed", "a stop is acknowledged, and the gate killed", stops.stop_and_kill("gate"), 5)
     add("wheels-gone", "the wheels' node is gone for 0.5 s", hardware.wheels_gone(0.5), 3)
     add("laser-silent", "the laser falls silent", hardware.blind("nothing any more", lambda _: lambda: None), 4)
+    for seed in storm.SEEDS:
+        add(f"storm-{seed}", storm.WHAT.format(seed), storm.storm(seed, _ROLES), 6)
     add("master-killed", "the master is killed, then the agent; the master starts again", _master, 6)
 
 

@@ -102,6 +102,10 @@ class Stage:
         yield
         self._demands.append(Demand(since, within_s, now(), why, speed))
 
+    def stood(self, since: float, within_s: float, why: str) -> None:
+        """The robot had to come to a standstill after a moment [s], and to stay so until now."""
+        self._demands.append(Demand(since, within_s, now(), why))
+
     def stop(self, reason: str = "an attack") -> bool:
         """Emergency stop; whether it was acknowledged."""
         try:
