@@ -10,8 +10,11 @@ import yaml
 from gate_robot import release
 from ros1_graph import wait_for
 
-from skytether.messages import Bool, Joy, LaserScan, decode, encode, type_hash
+from skytether.guard.velocity import Velocity
+from skytether.messages import Bool, Joy, LaserScan, Twist, decode, encode, type_hash
 from skytether.robot.safety.client import GateError, ask
+from skytether.robot.safety.config import Ros1Way
+from skytether.robot.safety.ros1 import Ros1Wheels
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
@@ -109,6 +112,21 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     time.sleep(0.5)
     assert not levels
     assert "Traceback" not in (tmp_path / "gate.log").read_text()
+
+
+def test_a_velocity_that_waits_in_a_writer_that_stands_still_is_never_told(graph, walker):
+    """It stands between two threads: the velocity is handed over, and not sent yet."""
+    wheels = Ros1Wheels(Ros1Way(master=graph.uri, cmd_vel="/told"), "guard", 0.1)
+    told = []
+    listener = Listener(lambda data, _: told.append(decode(Twist, data, "ros1").linear.x))
+    walker.node.subscribe("/told", Twist.TYPE, type_hash(Twist, "ros1"), listener)
+    wait_for(wheels.listeners, "the wheels to listen")
+    wheels._node.soon(lambda: time.sleep(0.5))
+    wheels.write(Velocity(0.5, 0.0))
+    time.sleep(0.6)
+    wait_for(lambda: wheels.write(Velocity(0.1, 0.0)) or told, "a velocity")
+    assert set(told) == {0.1}
+    wheels.close()
 
 
 def test_the_check_says_whether_the_gate_is_there(graph, gated, walker):

@@ -99,6 +99,33 @@ def test_messages_are_held_for_a_first_subscriber_and_a_latched_one_for_all():
     run(latched, latched=True)
 
 
+def test_what_is_too_old_by_the_time_that_it_is_sent_is_not():
+    """The process stood still between `publish` and the thread of the node, or before a slow subscriber had room."""
+    now = 100.0
+
+    async def work(publication, connect):
+        nonlocal now
+        reader, writer, _ = await connect()
+        while not publication.subscribers:
+            await asyncio.sleep(0.001)
+        publication.publish(b"old", until=100.1)
+        now = 102.0
+        publication.publish(b"of any age")
+        publication.publish(b"new", until=102.1)
+        assert [await read_frame(reader) for _ in range(2)] == [b"of any age", b"new"]
+        publication.publish(bytes(16_000_000))  # now the subscriber is slow
+        await asyncio.sleep(0.01)
+        publication.publish(b"waits", until=102.1)
+        await asyncio.sleep(0.01)
+        now = 103.0
+        publication.publish(b"last", until=103.1)
+        assert len(await read_frame(reader)) == 16_000_000
+        assert await read_frame(reader) == b"last"
+        writer.close()
+
+    run(work, clock=lambda: now)
+
+
 @pytest.mark.parametrize(
     "header", [{"md5sum": "b" * 32, "type": "std_msgs/String"}, {"md5sum": "*", "type": "std_msgs/Bool"}]
 )

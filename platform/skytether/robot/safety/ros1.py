@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from skytether.control.admittance import Velocity
+from skytether.guard.clock import now as boottime
 from skytether.messages import Bool, MarkerArray, Message, Twist, Vector3, encode, hash_of
 from skytether.robot.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
@@ -26,13 +27,16 @@ class Ros1Wheels:
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
+        fresh_s: Nobody gets a velocity or a level that is older [s]: it is the node's own thread that sends them, and
+            this process may stand still meanwhile.
         enable_topic: Of the enable signal, std_msgs/Bool; empty: there is none.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros1Way, role: str, enable_topic: str = "") -> None:
+    def __init__(self, way: Ros1Way, role: str, fresh_s: float, enable_topic: str = "") -> None:
+        self._fresh_s = fresh_s
         self._node = _start(way, role)
         topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
@@ -48,12 +52,12 @@ class Ros1Wheels:
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
         twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
-        self._publication.publish(encode(twist, "ros1"))
+        self._publication.publish(encode(twist, "ros1"), boottime() + self._fresh_s)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""
         if self._enable is not None:
-            self._enable.publish(encode(Bool(data=level), "ros1"))
+            self._enable.publish(encode(Bool(data=level), "ros1"), boottime() + self._fresh_s)
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""

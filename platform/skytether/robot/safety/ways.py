@@ -52,7 +52,7 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
     if config.ros1 is not None:
         from .ros1 import Ros1Wheels
 
-        return Ros1Wheels(config.ros1, role, enable or "")
+        return Ros1Wheels(config.ros1, role, config.guard_s, enable or "")
     if config.ros2 is not None:
         from .ros2 import Ros2Wheels
 

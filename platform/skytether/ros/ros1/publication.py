@@ -8,7 +8,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from math import inf
 
+from skytether.guard.clock import now as boottime
 from skytether.ros.names import ros1_type
 
 from .tcpros import ANY, pack_frame, pack_header, sums_differ
@@ -26,27 +28,34 @@ _HANDOVER = 1000
 _MAX_SUBSCRIBERS = 256
 
 
+_Frame = tuple[bytes, float]
+"""What goes to subscribers, and when it is too old for that [s, as `boottime`]."""
+
+
 class _Subscriber:
     """One connection."""
 
-    def __init__(self, caller: str, writer: asyncio.StreamWriter, queue: int) -> None:
+    def __init__(
+        self, caller: str, writer: asyncio.StreamWriter, queue: int, clock: Callable[[], float] = boottime
+    ) -> None:
         self.caller = caller
         self.writer = writer
         self.dropped = 0
+        self._clock = clock
         self._limit = queue
-        self._queue: deque[bytes] = deque()
+        self._queue: deque[_Frame] = deque()
         self._bytes = 0
         self._draining: asyncio.Task[None] | None = None
         writer.transport.set_write_buffer_limits(_WRITTEN_BYTES)
 
-    def send(self, frame: bytes) -> None:
+    def send(self, frame: bytes, until: float = inf) -> None:
         if self._draining is None and self.writer.transport.get_write_buffer_size() < _WRITTEN_BYTES:
-            self.writer.write(frame)
+            self._write(frame, until)
             return
-        self._queue.append(frame)
+        self._queue.append((frame, until))
         self._bytes += len(frame)
         while len(self._queue) > self._limit or (self._bytes > QUEUE_BYTES and len(self._queue) > 1):
-            self._bytes -= len(self._queue.popleft())
+            self._bytes -= len(self._queue.popleft()[0])
             self.dropped += 1
         if self._draining is None:
             self._draining = asyncio.ensure_future(self._drain())
@@ -56,13 +65,20 @@ class _Subscriber:
             while self._queue:
                 await self.writer.drain()
                 if self._queue:
-                    frame = self._queue.popleft()
+                    frame, until = self._queue.popleft()
                     self._bytes -= len(frame)
-                    self.writer.write(frame)
+                    self._write(frame, until)
         except OSError:
             self._queue.clear()  # the connection's reader notices its end
         finally:
             self._draining = None
+
+    def _write(self, frame: bytes, until: float) -> None:
+        """Right before it goes, for this process may have stood still since it was wanted."""
+        if self._clock() <= until:
+            self.writer.write(frame)
+        else:
+            self.dropped += 1
 
     def close(self) -> None:
         if self._draining is not None:
@@ -91,6 +107,7 @@ class Publication:
         latched: bool,
         queue: int,
         hold_s: float = 0.0,
+        clock: Callable[[], float] = boottime,
     ) -> None:
         self.topic = topic
         self.type = ros1_type(kind)
@@ -113,7 +130,8 @@ class Publication:
         self._held: deque[tuple[float, bytes]] = deque(maxlen=queue)
         self._newest: bytes | None = None
         self._lock = threading.Lock()
-        self._handover: deque[bytes] = deque(maxlen=_HANDOVER)
+        self._clock = clock
+        self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self._refused: set[tuple[str, str]] = set()
 
@@ -122,12 +140,18 @@ class Publication:
         """Names of the nodes that listen now."""
         return [subscriber.caller for subscriber in list(self._subscribers)]
 
-    def publish(self, payload: bytes | memoryview) -> None:
-        """Send a serialised message to everybody who listens; never blocks."""
+    def publish(self, payload: bytes | memoryview, until: float = inf) -> None:
+        """Send a serialised message to everybody who listens; never blocks.
+
+        Args:
+            payload: The message.
+            until: Not sent after that [s, `skytether.guard.clock.now`]: another thread sends it, which may stand still
+                meanwhile.
+        """
         frame = pack_frame(payload)
         with self._lock:
             first = not self._handover
-            self._handover.append(frame)
+            self._handover.append((frame, until))
         if first:
             self._soon(self._flush)
 
@@ -137,13 +161,13 @@ class Publication:
         if not frames:
             return
         if self._latched:
-            self._newest = frames[-1]
+            self._newest = frames[-1][0]
         for subscriber in self._subscribers:
-            for frame in frames:
-                subscriber.send(frame)
+            for frame, until in frames:
+                subscriber.send(frame, until)
         if self._hold_s and not self._subscribers:
-            until = time.monotonic() + self._hold_s
-            self._held.extend((until, frame) for frame in frames)
+            held_until = time.monotonic() + self._hold_s
+            self._held.extend((held_until, frame) for frame, _ in frames)
 
     async def serve(self, header: dict[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """In the node's thread: a subscriber has connected. Returns when it is gone."""
@@ -154,7 +178,7 @@ class Publication:
             await writer.drain()
             return
         writer.write(self._header)
-        subscriber = _Subscriber(caller, writer, self._queue)
+        subscriber = _Subscriber(caller, writer, self._queue, self._clock)
         if self._latched and self._newest is not None:
             subscriber.send(self._newest)
         while self._held:
