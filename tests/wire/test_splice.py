@@ -130,6 +130,20 @@ def test_parts_of_several_packets_make_none(rekeyed, seed):
     assert state(rekeyed, role) == before
 
 
+def test_batches_of_shards_again_whole_reversed_and_in_part(world):
+    link = world.link(record=True, up=DELAY, down=DELAY)
+    link.publish(ROBOT, "camera", bytes(20_000))
+    link.run(0.5)
+    seen = shards_of([p for _, p in link.sent[ROBOT]])
+    before, counts = state(link, SERVICE), refused(link, SERVICE)
+    size = len(seen[0])
+    for batch in (seen, seen[::-1], seen[3:9], seen[:4] * 3, sorted(seen)):
+        link.inject(SERVICE, b"".join(batch), "elsewhere", segment=size)
+        assert refused(link, SERVICE) - counts == {"repeated": len(batch)}
+        counts = refused(link, SERVICE)
+    assert state(link, SERVICE) == before
+
+
 def test_handshakes_in_any_order_later_end_nothing_and_make_no_keys(world, monkeypatch):
     """All packets of six handshakes again, the last first, shuffled, from elsewhere and from the peer's address."""
     link = world.link(record=True, robot={"config": Config(rekey_after=0.5)}, up=DELAY, down=DELAY)

@@ -50,6 +50,15 @@ def test_zeros_at_the_end_count():
     assert not tags.check_one(short.tobytes() + bytes(4))
 
 
+def test_packets_larger_than_any_datagram_are_checked_too():
+    tags = Tags(SECRET)
+    rows = np.zeros((2, 200_000), np.uint8)
+    assert not tags.check(rows).any()
+    Tags(SECRET).put(rows)
+    assert tags.check(rows).all()
+    assert rows[1, 32:40].tobytes() == by_definition(rows[1].tobytes())
+
+
 def test_packets_of_many_sizes_take_little_memory():
     tags = Tags(SECRET)
     for size in range(44, 8000, 4):

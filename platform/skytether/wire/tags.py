@@ -115,7 +115,7 @@ class Tags:
             sums: Of these packets, if they are at hand.
         """
         words = rows.view(_WORD)
-        step = len(self._scratch) // words.shape[1]
+        step = max(1, len(self._scratch) // words.shape[1])
         for start in range(0, len(words), step):
             part = words[start : start + step]
             known = None if sums is None else sums[start : start + step]
@@ -125,7 +125,7 @@ class Tags:
         """Which of these packets have the right tag. Takes the same time whichever bytes are wrong."""
         words = rows.view(_WORD)
         given = words[:, TAG_WORDS].view(_TAG)[:, 0]
-        step = len(self._scratch) // words.shape[1]
+        step = max(1, len(self._scratch) // words.shape[1])
         if len(words) <= step:
             right: Bools = self._tags(words) == given
             return right
