@@ -75,7 +75,7 @@ class Bench:
 
     def neutral(self) -> None:
         """Agent and joystick begin from a standstill."""
-        for now in (self.now - 0.5, self.now - 0.2):
+        for now in (self.now - 0.4, self.now - 0.3, self.now - 0.2):
             self.sequence += 1
             self.gate.command(Command(Hand.AGENT, 0.0, 0.0, 1, self.sequence, now, 0.0, now), now)
             self.gate.sense("joy", joy(0.0, 0.0, held=False), now)

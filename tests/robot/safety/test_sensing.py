@@ -46,7 +46,7 @@ class Drive:
         self.gate = Gate(what or rules())
         self.now = 100.0
         self.sequence = 0
-        for now in (99.5, 99.8):  # it begins from a standstill
+        for now in (99.6, 99.7, 99.8):  # it begins from a standstill
             self.command((0.0, 0.0), now)
 
     def command(self, wanted: tuple[float, float], now: float) -> None:
