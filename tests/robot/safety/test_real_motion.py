@@ -122,8 +122,9 @@ def test_a_message_of_another_type_is_named_and_is_silence():
 def test_a_new_driver_begins_at_what_the_wheels_do():
     """Held back by a threshold at 0.15 m/s, told 0.4: the one who takes over rises from 0.15, and nothing leaps."""
     robot = Robot(replace(RULES, odometry=replace(RULES.odometry, from_measured=True)), Wheels(noise=0.0))
-    robot.gate.sense("nav_vel", Twist(), robot.now)
-    robot.drive(0.0, 1.0)
+    for _ in range(10):
+        robot.gate.sense("nav_vel", Twist(), robot.now)
+        robot.drive(0.0, 0.1)
     robot.wheels.fault = lambda v: Velocity(min(v.linear, 0.15), v.angular)
     robot.drive(0.4, 2.0)
     told = []
