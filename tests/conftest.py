@@ -32,6 +32,9 @@ settings.register_profile(
 )
 settings.load_profile("skytether")
 
+# A run under nohup ignores it, and so would every program that a test starts.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
 
 TOGETHER = (
     "bridge/test_mtu.py",

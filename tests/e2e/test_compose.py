@@ -23,7 +23,7 @@ from docker_site import DockerSite, Images
 
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
-from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, SiteCreate, TopicReport
+from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, RobotCreate, SiteCreate, TopicReport
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.compose]
 
@@ -221,6 +221,7 @@ def test_an_instance_runs_and_prometheus_knows_all_that_the_dashboard_asks(
         topics = [{"name": n, "type": "a/msg/B", "direction": d} for n, d in (("force", "in"), ("cmd_vel", "out"))]
         manifest = Manifest.model_validate({**document, "spec": {"image": images.toy, "topics": topics}})
         client.put_service("virtual-trail", manifest)
+        client.create_robot(RobotCreate(name="walker"))  # of a robot that nobody registered no gate is kept
         made = client.create_instance(InstanceCreate(robot="walker", service="virtual-trail", lease_s=600))
         assert client.wait_running(made.id, timeout=PATIENCE).placement.site == "edge"
         until(lambda: len(stack.query("up == 1")) == 2)

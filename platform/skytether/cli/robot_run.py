@@ -232,6 +232,7 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
 def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
     """What the graph needs of the configuration."""
     from skytether.robot.ros1 import Ros1RobotConfig
+    from skytether.robot.supervisor import Limits
 
     return Ros1RobotConfig(
         robot=settings.robot,
@@ -240,6 +241,7 @@ def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
         remap=ros1.remap,
         cmd_vel=ros1.cmd_vel if settings.safety is None else None,
         idle_s=ros1.idle_s,
+        fresh_s=Limits(**settings.limits).watchdog_s,
         readings=ros1.readings,
         topics=ros1.topics,
         params=ros1.params,

@@ -9,6 +9,7 @@ from functools import partial
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
+from skytether.guard.clock import now as boottime
 from skytether.messages import Encoding, Message, Twist, hash_of, type_of
 from skytether.ros import notes, permissions
 from skytether.ros.names import Names, bridge_type, namespace_of, resolve
@@ -20,6 +21,7 @@ from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import Role, Topic
 
 from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
+from .supervisor import Limits
 from .table import Offer, robot_table
 from .wheels_watch import NOBODY, Others, WheelsWatch
 
@@ -37,6 +39,8 @@ class Ros1RobotConfig:
         remap: Names in the graph, by topic, call, action or reading.
         cmd_vel: What the wheels listen to; None: others have the wheels.
         idle_s: See `skytether.robot.graph_base.IDLE_S`.
+        fresh_s: The wheels get no velocity that is older [s]: the node's own thread sends it, and this process may
+            stand still meanwhile.
         readings: Types of what the robot's own control reads, by name.
         topics: Sent to a service that takes any.
         params: Handed to the service's graph.
@@ -53,6 +57,7 @@ class Ros1RobotConfig:
     remap: Mapping[str, str] = field(default_factory=dict)
     cmd_vel: str | None = "cmd_vel"
     idle_s: float | None = IDLE_S
+    fresh_s: float = Limits().watchdog_s
     readings: Mapping[str, str] = field(default_factory=dict)
     topics: Collection[str] = ()
     params: Collection[str] = ()
@@ -102,7 +107,11 @@ class Ros1Robot:
         send: Callable[[bytes], object] = nowhere
         if config.cmd_vel is not None:
             topic = resolve(config.cmd_vel, config.home)
-            send = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1).publish
+            wheels = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+
+            def send(payload: bytes) -> None:
+                wheels.publish(payload, boottime() + config.fresh_s)
+
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
         self.base = GraphBase(readings, "ros1", send, idle_s=config.idle_s)
         own = config.names(())
