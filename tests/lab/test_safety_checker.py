@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, nan
 
 import pytest
@@ -127,6 +128,14 @@ def test_a_robot_that_moves_again_by_itself():
     assert kinds(pulse, Demand(1.0, 0.4, 3.0, "stopped")) == ["motion"]
     assert kinds(pulse, Demand(1.5, 0.0, 3.0, "stopped")) == ["motion"]
     assert kinds(pulse, Demand(1.0, 0.4, 2.0, "stopped")) == []
+
+
+def test_what_may_have_begun_after_the_demand_is_no_motion():
+    """A frozen one goes on right after it; what it says first may have waited for some milliseconds, or not."""
+    record = [replace(told, earliest=told.at - 0.007) for told in drive((0.0, 2.0), (0.5, 1.0))]
+    began = next(told for told in record if told.velocity.linear)
+    assert kinds(record, Demand(1.0, 0.4, began.at - 0.001, "frozen")) == []
+    assert kinds(record, Demand(1.0, 0.4, began.at + 0.001, "frozen")) == ["motion"]
 
 
 def test_turning_on_the_spot_is_no_standstill():

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
+from typing import NamedTuple
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.robot.supervisor import Limits
@@ -243,28 +244,40 @@ def _needed(before: float, after: float, acceleration: float, braking: float) ->
     return before / braking - after / acceleration
 
 
-def _motions(record: Sequence[Told], wheels: Wheels) -> list[tuple[float, float, Velocity]]:
-    """When the wheels turned: from, until, how fast at first. Neighbours that touch are one."""
-    found: list[tuple[float, float, Velocity]] = []
+class _Motion(NamedTuple):
+    """When the wheels turned."""
+
+    start: float
+    """At the earliest [s]."""
+    end: float
+    velocity: Velocity
+    """At first."""
+    surely: float
+    """When they turned for sure [s]."""
+
+
+def _motions(record: Sequence[Told], wheels: Wheels) -> list[_Motion]:
+    """Neighbours that touch are one."""
+    found: list[_Motion] = []
     for i, told in enumerate(record):
         if told.velocity == STANDSTILL:
             continue
         end = told.since + wheels.silence_s
         if i + 1 < len(record):
             end = min(end, record[i + 1].since)
-        if found and told.since <= found[-1][1]:
-            found[-1] = (found[-1][0], end, found[-1][2])
+        if found and told.since <= found[-1].end:
+            found[-1] = found[-1]._replace(end=end)
         else:
-            found.append((told.since, end, told.velocity))
+            found.append(_Motion(told.since, end, told.velocity, told.at))
     return found
 
 
-def _stands(motions: Sequence[tuple[float, float, Velocity]], demand: Demand) -> tuple[list[Violation], float]:
+def _stands(motions: Sequence[_Motion], demand: Demand) -> tuple[list[Violation], float]:
     """Whether the robot stands in time and stays so; and how long it took [s]."""
     by, took = demand.since + demand.within_s, 0.0
     found = []
-    for start, end, velocity in motions:
-        if end <= demand.since or start >= demand.until:
+    for start, end, velocity, surely in motions:
+        if end <= demand.since or surely >= demand.until:  # what may have begun after it is held against nobody
             continue
         end = min(end, demand.until)
         if start < by:
