@@ -63,6 +63,15 @@ def test_what_comes_with_a_renewal_is_the_same(served: Any) -> None:
     assert 'skytether_gate_stopped{robot="walker"} 0.0' in text
 
 
+def test_of_a_robot_that_nobody_registered_there_is_no_state_at_any_time(gates: Gates) -> None:
+    """An operator's token renews for any name. What was neither kept nor hidden came and went in the metrics."""
+    gates.hear("nobody", STOPPED)
+    gates.hear("walker", DRIVES)
+    assert gates.fresh() == {"walker": DRIVES}
+    gates.write()
+    assert gates.fresh() == {"walker": DRIVES}
+
+
 def test_only_the_robot_itself_says_how_its_gate_is(served: Any) -> None:
     served.operator.create_robot(RobotCreate(name="walker"))
     stranger = served.client(served.operator.create_robot(RobotCreate(name="stranger")).token)

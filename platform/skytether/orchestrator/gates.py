@@ -67,7 +67,9 @@ class Gates:
         """By robot, when it said something last, and what, while that is fresh."""
         rows = self._store.gates()
         with self._taking:
-            rows |= self._heard
+            heard = dict(self._heard)
+        # Of a robot that nobody registered nothing is kept, so nothing is shown until then either.
+        rows |= {robot: row for robot, row in heard.items() if robot in rows or self._store.robot(robot) is not None}
         now = self._clock()
         # Either way: a clock that was set back must not keep what was said for as long as that.
         return {
