@@ -8,7 +8,7 @@ import pytest
 
 from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
-from skytether.control.admittance import Velocity
+from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
 from skytether.robot.arbiter import Needs, Reason
 from skytether.robot.command import Source
@@ -18,6 +18,7 @@ from skytether.robot.link import Quality
 from skytether.robot.service_manager import Terms, terms
 from skytether.robot.session import LiveSession
 from skytether.robot.supervisor import Limits
+from skytether.robot.told import Told
 from skytether.wire.events import Connected, Disconnected, MessageReceived
 
 TICK = 0.01
@@ -159,6 +160,71 @@ def test_a_standstill_is_wanted_by_who_drives_or_by_nobody_while_no_service_has_
     rig.driver.let_go()
     rig.run(0.1)
     assert base.why[-1], "it was let go"
+
+
+class Gate:
+    """What the gate tells an agent, by hand."""
+
+    def __init__(self, base):
+        self.hand = "agent"
+        self._base = base
+        base.told = self._told
+
+    def _told(self, now):
+        moves = self._base.written and self.hand != "nobody"
+        return Told(Velocity(*self._base.written[-1]) if moves else STANDSTILL, 0.0, "", self.hand)
+
+
+@pytest.fixture
+def reset_on_its_own(base, make_cloud, bridge):
+    """A robot that a service drove, was stopped and reset, and whose fallback wanted a standstill meanwhile."""
+    gate, base.push = Gate(base), 0.0
+    rig = Rig(base, make_cloud)
+    rig.connect(bridge)
+    assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
+    gate.hand = "nobody"
+    rig.run(0.5, linear=0.2, angular=0.0)
+    assert rig.run(5.0).source is Source.FALLBACK
+    assert base.why[-1]
+    gate.hand = "agent"
+    rig.gate = gate
+    return rig
+
+
+def test_after_a_reset_the_fallback_s_standstill_is_not_the_service_s(reset_on_its_own, caplog):
+    """It wanted to move all the time: the link's return alone must not set the robot in motion."""
+    rig = reset_on_its_own
+    begin = len(rig.base.written)
+    assert rig.run(3.0, linear=0.2, angular=0.0).source is Source.FALLBACK
+    assert max(linear for linear, _ in rig.base.written[begin:]) < 1e-6
+    assert [r.message for r in caplog.records if "since before the reset" in r.message] != []
+    rig.run(0.25, linear=0.0, angular=0.0)
+    assert rig.run(0.1, linear=0.2, angular=0.0).source is Source.CLOUD
+
+
+def test_after_a_reset_the_fallback_drives_while_the_service_owes_a_standstill(reset_on_its_own):
+    rig = reset_on_its_own
+    rig.base.push = 20.0
+    assert rig.run(2.0, linear=0.2, angular=0.0).source is Source.FALLBACK
+    assert rig.base.velocity[0] > 0.1
+
+
+def test_a_service_that_a_person_starts_after_a_reset_goes_on(reset_on_its_own):
+    rig = reset_on_its_own
+    rig.gate.hand = "nobody"
+    assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
+    rig.gate.hand = "agent"
+    rig.run(0.1, linear=0.2, angular=0.0)
+    assert rig.run(1.0).source is Source.FALLBACK
+    assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
+
+
+def test_a_service_that_is_asked_for_after_a_reset_owes_nothing(reset_on_its_own, bridge):
+    rig = reset_on_its_own
+    rig.driver.let_go()
+    rig.run(0.1)
+    rig.connect(bridge)
+    assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
 
 
 def test_a_standstill_of_a_fallback_without_readings_is_not_wanted(base, make_cloud, monkeypatch):

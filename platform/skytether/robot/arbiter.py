@@ -5,7 +5,7 @@
 Two kinds of trouble. Without a valid command or a session the robot is on its own at once. A round trip, a loss, a
 lateness or a clock that is worse than the service's manifest allows must last before it counts. The way back is the
 same for all: the link must have been good without a break for ``good_s``, so that the cloud never takes over more often
-than that.
+than that. After a reset the cloud does not take over, however good the link is, before it wanted a standstill.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class Link:
         loss: Share of messages lost over a recent window.
         late: Share of messages that missed their lifespan over a recent window.
         clock_error: Bound of the clock offset's error [s].
+        owes: The service must have wanted a standstill before it takes over (`neutral`).
     """
 
     connected: bool = False
@@ -98,6 +99,7 @@ class Link:
     loss: float = nan
     late: float = nan
     clock_error: float = inf
+    owes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,7 @@ def choose(needs: Needs, choice: Choice, link: Link, now: float) -> Choice:
         good_since = _begin(choice.good_since, now)
         if choice.source is Source.CLOUD:
             return replace(choice, good_since=good_since, bad_since=None)
-        if now - good_since >= needs.good_s:
+        if now - good_since >= needs.good_s and not link.owes:
             return Choice(Source.CLOUD, Reason.RECOVERED, now, good_since=good_since)
         return replace(choice, source=needs.local, good_since=good_since, bad_since=None)
     bad_since = _begin(choice.bad_since, now)

@@ -16,12 +16,13 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import DecodeError, Encoding, Message, Twist, Vector3, decode
 from skytether.wire.events import MessageReceived
 
-from . import arbiter, service_manager, supervisor
+from . import arbiter, neutral, service_manager, supervisor
 from .accrual import Accrual
 from .arbiter import Choice, Link, Needs
 from .command import UNUSED_AXES, Command, Source, unused_axes
 from .fallback import Fallback, Reading, Watching
 from .link import Quality
+from .neutral import Neutral
 from .notices import Notices
 from .service_manager import Terms
 from .session import LiveSession
@@ -42,6 +43,10 @@ _NAMED = {
     Objection.ANGULAR_LIMIT: "turning faster than limits.angular_max allows; they are cut down",
 }
 """Named in the log, once while it lasts. A gap is told by the hand-over; limits of acceleration are no trouble."""
+_OWES = (
+    "the link is good, but the service wants to move since before the reset, and nothing moves by itself: it takes over"
+    " once it wanted a standstill; or end its work and begin it again, or stop the robot, reset and start it"
+)
 _LOOKED_TICKS = 2.0
 """Periods of the loop that one tick counts for at most, when the cloud's silence is measured."""
 _TICK_S = 0.5
@@ -162,6 +167,8 @@ class Driver:
         self._told: Told | None = None
         self._spoke = False
         """A service has sent commands, in a session that there is or one before it without a break."""
+        self._owed = Neutral()
+        """Whether it must have wanted a standstill before it takes over from the fallback."""
         self._watching = fallback if isinstance(fallback, Watching) else None
         self._own_limits = self._limits = limits
         """As configured, and with what was learned of the commands' gaps."""
@@ -298,8 +305,15 @@ class Driver:
         if self._tells_back is None:
             return
         self._told = self._tells_back.told(now)
-        if self._told is not None:
-            self._supervised = rebase(self._limits, self._supervised, self._told)
+        if self._told is None:
+            return
+        self._supervised = rebase(self._limits, self._supervised, self._told)
+        # The gate takes the agent for one. The fallback's standstill lets the fallback drive; a service that wanted to
+        # drive all the time must have wanted one itself.
+        if self._told.nobody and self._spoke and not self._owed.why:
+            self._owed = neutral.require("nobody was allowed to drive")
+        elif self._told.agent and self._choice.source is Source.CLOUD:
+            self._owed = Neutral()
 
     def _change_over(self) -> list[LiveSession]:
         """Make before break: while the cloud drives, another session takes over with its first command.
@@ -324,6 +338,8 @@ class Driver:
         for session in self._change_over():
             for epoch, message in session.take():
                 self._take(epoch, message, session.encoding, now)
+        if self.session is None:  # the next service is somebody's new decision
+            self._spoke, self._owed = False, Neutral()
 
     def _take(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:
         try:
@@ -337,6 +353,8 @@ class Driver:
         objection = self._admit(command, now)
         if objection is None:
             self._spoke = True
+            wanted = Velocity(command.linear, command.angular)
+            self._owed = neutral.want(self._owed, wanted, now, self._arrivals.limit_s)
             before = self._command_before
             lost = command.sequence - before[1] - 1 if before[0] == command.epoch else 0
             self._command_before = command.epoch, command.sequence
@@ -359,6 +377,7 @@ class Driver:
             loss=self.quality.loss,
             late=self.quality.late,
             clock_error=held.sent_at_error if held else nan,
+            owes=bool(self._owed.why) and not (self._told is not None and self._told.nobody),
         )
         timeout = self._arrivals.limit_s
         if timeout != self._needs.command_timeout_s:
@@ -372,6 +391,9 @@ class Driver:
             self._transitions.append(Transition(now, self._choice.source, self._choice.reason))
             _log.warning("control: %s -> %s (%s): %s", before.source, self._choice.source, self._choice.reason, why)
             self._why = why
+        since = self._choice.good_since
+        if link.owes and self._choice.source is not Source.CLOUD and since and now - since > self._needs.good_s:
+            self._notices.say("owes", f"control: {_OWES}", now)
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
@@ -430,7 +452,6 @@ class Driver:
         if now < self._believed_from:
             return False
         if source is Source.STOP:  # a service that has spoken, and is not heard now, may want to drive all the time
-            self._spoke = self._spoke and self.session is not None
             return not self._spoke
         return supervisor.wants_standstill(self._limits, self._supervised, source, self._max_age(source), now)
 

@@ -30,6 +30,16 @@ class Told:
     stopped: str = ""
     hand: str = ""
 
+    @property
+    def nobody(self) -> bool:
+        """Nobody may drive: the robot is stopped, or who wants to drive must want a standstill first."""
+        return self.hand == "nobody"
+
+    @property
+    def agent(self) -> bool:
+        """The agent drives, or may."""
+        return self.hand == "agent"
+
 
 @runtime_checkable
 class TellsBack(Protocol):

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, Time, Twist, TwistStamped, Vector3
+from skytether.robot import neutral
 from skytether.robot.command import Command
-from skytether.robot.safety import joystick, neutral
+from skytether.robot.neutral import NEUTRAL_S
+from skytether.robot.safety import joystick
 from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.joystick import RELEASED_S, Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams
-from skytether.robot.safety.neutral import NEUTRAL_S
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sources import Hand, LockParams, OnSilence, SourceParams, SourceRules
 from skytether.robot.supervisor import Limits

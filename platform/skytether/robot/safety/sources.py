@@ -14,13 +14,14 @@ from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
+from skytether.robot import neutral
 from skytether.robot.command import Command, unused_axes
+from skytether.robot.neutral import Neutral
 from skytether.robot.supervisor import Limits, with_gap
 
-from . import joystick, latch, neutral
+from . import joystick, latch
 from .joystick import Grip, Joystick, JoystickParams
 from .latch import ButtonParams, Latch
-from .neutral import Neutral
 
 _STARTED = "the gate was started"
 _RESET = "the reset"
