@@ -13,7 +13,10 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from skytether.guard import descriptors
+from skytether.guard.child import Child
+from skytether.guard.log import Log
 from skytether.guard.mailbox import bind
+from skytether.guard.onlooker import Onlooker
 from skytether.guard.requests import Requests
 from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Bool, LaserScan, encode
@@ -148,6 +151,30 @@ def test_an_agent_takes_none_with_what_the_gate_answers(kernel, lingering, tmp_p
         assert link.state().stopped == "somebody fell"
     link.close()
     gate.close()
+
+
+def test_a_child_that_sends_descriptors_holds_the_guard_up_for_no_time(kernel, lingering, monkeypatch):
+    """The process that only shows something, say, which has gone mad."""
+    pairs, make = [], socket.socketpair
+
+    def remembered(*arguments):
+        pairs.append(make(*arguments))
+        return pairs[-1]
+
+    monkeypatch.setattr("skytether.guard.child.socket.socketpair", remembered)
+    monkeypatch.setattr(Child, "_start", lambda *_: None)
+    display = Onlooker("display", ("display",), 0, Log("guard", os.open(os.devnull, os.O_WRONLY)))
+    display.turn(1.0)
+    ((own, theirs),) = pairs
+    assert send(theirs, b".", lingering()) is (kernel == "held")
+    with suppress(BlockingIOError):
+        theirs.send(b".")
+    with quickly():
+        display.turn(2.0)
+    theirs.close()
+    display.turn(3.0)
+    assert "ended" in display.trouble
+    own.close()
 
 
 def test_where_there_is_no_room_for_descriptors_the_socket_is_silent(monkeypatch, tmp_path):

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 
+from .descriptors import refuse
+
 _HANGS_S = 3.0
 """One that says nothing for this long is ended and started anew."""
 _STARTS_S = 15.0
@@ -47,6 +49,7 @@ class Child:
         except OSError as error:
             raise StartError(error.strerror) from error
         self.socket.setblocking(False)
+        refuse(self.socket)
         self.gone = False
         """It has closed its end."""
         self._started_at = now

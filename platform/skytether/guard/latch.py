@@ -7,12 +7,15 @@ that was started is therefore stopped until a person resets it.
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
+from .folder import trusted
 from .protocol import REASON_BYTES, cut
 
 SIZE = 512
@@ -68,6 +71,23 @@ def decode(data: bytes | None, boot: str) -> str:
     return "" if boot and then == boot else FIRST_ACT
 
 
+def _open(path: str, flags: int) -> int:
+    """A file that nobody else can have put there: in a folder with the sticky bit a group may make files.
+
+    Raises:
+        OSError: It cannot be opened, is no file, or is another user's.
+    """
+    file = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW, 0o600)  # a pipe must not hold it up
+    try:
+        about = os.fstat(file)
+        if not stat.S_ISREG(about.st_mode) or about.st_uid not in trusted(os.path.dirname(path) or "."):
+            raise OSError(errno.EPERM, "it is no file of this user")
+    except OSError:
+        os.close(file)
+        raise
+    return file
+
+
 class Kept(NamedTuple):
     """How far the keeping is."""
 
@@ -97,7 +117,7 @@ class Keeper:
     def before(self) -> str:
         """Why the robot is to stand from the start; empty: it is not."""
         try:
-            file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe must not hold it up
+            file = _open(self._path, os.O_RDONLY)
             try:
                 return decode(os.read(file, 2 * SIZE), self._boot)
             finally:
@@ -129,7 +149,7 @@ class Keeper:
 
     def _write(self, reason: str) -> str:
         try:
-            file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
+            file = _open(self._path, os.O_WRONLY | os.O_CREAT)
             try:
                 written = os.pwrite(file, encode(reason, self._boot), 0)
                 os.fsync(file)

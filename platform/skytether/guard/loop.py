@@ -17,6 +17,7 @@ from .board import Board, Role
 from .child import Child, StartError
 from .claim import Claim, ClaimError
 from .clock import now as boottime
+from .descriptors import receive
 from .enable import Enable, Power, WriterLine, open_line
 from .latch import Keeper, Latch, boot_id, clean
 from .log import Log
@@ -45,6 +46,8 @@ _LEAVES_S = 2.0
 """For the writer to leave its graph, and for the disk."""
 _MOST_PACKETS = 64
 """Taken from the gate in one turn; one that says more has gone mad, and the rest waits."""
+_LAST_PACKETS = 1024
+"""Of a gate that has ended: more than the kernel keeps."""
 _LAST_STOPS = 5
 """Said at the end."""
 _AT_MOST = 4
@@ -189,16 +192,18 @@ class Guard:
         self._look_after(self._clock())
         self._systemd.tell("READY=1\nWATCHDOG=1" if self._ready else "WATCHDOG=1")
 
-    def _hear(self) -> bool:
+    def _hear(self, most: int = _MOST_PACKETS) -> bool:
         """Take in what the gate says. True if it said anything."""
         gate, newest = self._gate, None
-        for _ in range(_MOST_PACKETS):
+        for _ in range(most):
             if gate is None or gate.gone:
                 break
             try:
-                data = gate.socket.recv(LARGEST)
+                data = receive(gate.socket, LARGEST)[0]
             except BlockingIOError:
                 break
+            except ConnectionResetError:  # it ended with answers unread; its last words still wait behind that
+                continue
             except OSError:
                 data = b""
             if not data:
@@ -304,10 +309,12 @@ class Guard:
         self._log.line("ERROR", f"the {name} {why}; the wheels stand and it is started anew")
         self._event(name, "death", why)
         self._restarts[name] = self._restarts.get(name, 0) + 1
+        if name == "gate":
+            self._hear(_LAST_PACKETS)  # its last word may be a stop
+            self._watch.forget()
         child.end()
         self._dead.append(child)
         if name == "gate":
-            self._watch.forget()
             self._deaths.append(now)
             if len(self._deaths) == _DEATHS and now - self._deaths[0] <= _DEATHS_S:
                 self._stop("guard", f"the gate ended {_DEATHS} times within a minute, at last: {why}")

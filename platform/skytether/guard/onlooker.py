@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .child import Child, StartError
+from .descriptors import receive
 from .log import Log
 
 _LOOK_S = 0.5
@@ -72,7 +73,7 @@ class Onlooker:
     def _hear(self, child: Child, now: float) -> None:
         for _ in range(_PACKETS):
             try:
-                data = child.socket.recv(1)
+                data = receive(child.socket, 1)[0]
             except BlockingIOError:
                 return
             except OSError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 
+from .descriptors import receive
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
 from .velocity import Velocity
 
@@ -79,7 +80,7 @@ class WriterWheels:
         """Take in that the writer is alive."""
         while self.link is not None:
             try:
-                data = self.link.recv(LARGEST)
+                data = receive(self.link, LARGEST)[0]
             except OSError:  # nothing waits
                 break
             if not data:

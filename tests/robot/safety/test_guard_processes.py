@@ -119,7 +119,8 @@ def test_in_every_order_of_deaths_the_wheels_are_told_to_stop(robot, first, how,
     robot.signal(first, SIGNALS[how])
     stands(robot)
     with stage.stands(0.0, f"the {first} {how}, then the {second} {then}"):
-        os.kill(partner, SIGNALS[then])
+        with suppress(ProcessLookupError):  # a gate without its guard ends by itself
+            os.kill(partner, SIGNALS[then])
         time.sleep(0.5)
     for left in robot.processes():  # who was frozen goes on from standstill
         left.resume()
