@@ -51,12 +51,12 @@ def token(url: str, folder: Path = SECRETS, operator: Path = OPERATOR) -> None:
     path = folder / "prometheus" / "token"
     if path.exists():
         try:
-            with Client(url, path.read_text()) as client:
+            with Client(url, path.read_text(), insecure_http=True) as client:  # within the stack's own network
                 client.metrics()
                 return
         except ApiError as error:
             print(f"the token in {path} is made anew: {error}")
-    with Client(url, operator.read_text().strip()) as client:
+    with Client(url, operator.read_text().strip(), insecure_http=True) as client:
         for old in client.tokens():
             if old.robot is None and old.name == "prometheus":
                 client.delete_token(old.id)

@@ -156,7 +156,7 @@ CALLS: list[Callable[[Client], Any]] = [
 
 
 @pytest.mark.parametrize("call", CALLS)
-@pytest.mark.parametrize("url", ["http://127.0.0.1:1", "http://no-such-host.invalid"])
+@pytest.mark.parametrize("url", ["http://127.0.0.1:1", "https://no-such-host.invalid"])
 def test_nobody_there_is_one_sentence_that_says_what_to_do(call: Callable[[Client], Any], url: str) -> None:
     with Client(url) as client, pytest.raises(Unreachable) as caught:
         call(client)

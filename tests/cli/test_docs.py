@@ -23,7 +23,7 @@ from skytether.cli.robot_config import RobotConfig
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 FILES = [*sorted((ROOT / "docs").rglob("*.service")), *sorted((ROOT / "ros1").rglob("*.service"))]
-ROBOT = {"robot": "walker", "orchestrator": "http://cloud:8600", "token_file": "t", "service": "s", "ros1": {}}
+ROBOT = {"robot": "walker", "orchestrator": "https://cloud:8600", "token_file": "t", "service": "s", "ros1": {}}
 TOPIC = {"name": "a", "type": "m/msg/M", "direction": "in"}
 END = {"role": "robot", "id": "ff" * 8, "key_file": "key", "peer": {"host": "h", "port": 1}, "topics": [TOPIC]}
 

@@ -94,6 +94,17 @@ def test_a_mistake_is_named_by_its_key(read, text, says):
     assert says in str(told.value)
 
 
+def test_plain_http_to_another_machine_needs_a_word(read, tmp_path):
+    for address in ("http://192.0.2.7:8600", '"https://a:1, http://cloud:8600"'):
+        path = tmp_path / "robot.yaml"
+        path.write_text(LEAST.replace("http://127.0.0.1:8080", address) + "ros1: {}")
+        with pytest.raises(ConfigError, match=r"the token could be read on the way: .*add insecure_http: true"):
+            load_config(path)
+        path.write_text(path.read_text() + "\ninsecure_http: true")
+        assert load_config(path).insecure_http
+    assert read("ros1: {}\nca_file: ca.pem").ca_file == tmp_path / "ca.pem"
+
+
 def test_a_token_is_read_from_a_file_that_nobody_else_may_read(read, tmp_path):
     settings = read()
     path = tmp_path / "walker.token"

@@ -39,7 +39,7 @@ def test_a_container_may_nothing_that_it_does_not_need(name: str) -> None:
     assert image is not None
     assert re.fullmatch(r"1|v?\d+\.\d+[.\w-]*", image[2])
     for port in service.get("ports", ()):
-        assert re.match(r"127\.0\.0\.1:|\$\{SKYTETHER_ADDRESS:-127\.0\.0\.1}:", port)
+        assert re.match(r"127\.0\.0\.1:|\$\{SKYTETHER_INSECURE_HTTP_ADDRESS:-127\.0\.0\.1}:", port)
 
 
 def test_no_password_is_written_down_and_each_is_seen_only_by_those_who_need_it() -> None:

@@ -97,6 +97,24 @@ def test_a_clock_that_is_wrong_is_no_wrong_certificate(
         client.sites()
 
 
+def test_without_a_certificate_nothing_listens_beyond_loopback_unasked(
+    program: Callable[..., Program], tmp_path: Path
+) -> None:
+    status, text = program(host="0.0.0.0").fails()
+    assert status == 2
+    assert "could be read on the way to 0.0.0.0: give a certificate" in text
+    assert "--insecure-http" in text
+    told = program(host="0.0.0.0", insecure_http=True)
+    with told.start() as client:
+        assert client.sites()
+    cert, key = certificate(tmp_path)
+    secret = program(host="0.0.0.0", tls={"certificate": str(cert), "key": str(key)})
+    secret.start().close()
+    url = (secret.folder / "address").read_text().strip().replace("0.0.0.0", "127.0.0.1")
+    with Client(url, (secret.folder / "operator.token").read_text().strip(), ca_file=cert) as client:
+        assert client.sites()
+
+
 def test_a_certificate_that_cannot_be_used_is_one_sentence(program: Callable[..., Program], tmp_path: Path) -> None:
     cert, key = certificate(tmp_path)
     key.write_text("rubbish")

@@ -19,6 +19,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from .bounded import WHOLE, BoundedTransport, EndlessError
 from .manifest import Manifest
+from .plain_http import is_readable_on_the_way
 from .printable import printable
 from .rest import (
     CHANGE,
@@ -109,6 +110,7 @@ class Client:
         *,
         timeout: float = 10.0,
         ca_file: Path | str | None = None,
+        insecure_http: bool = False,
         largest: int = _LARGEST,
     ) -> None:
         """One orchestrator, or several.
@@ -118,16 +120,25 @@ class Client:
             token: An operator's or a robot's.
             timeout: Seconds for each step of a request: connect, send, receive; all of it takes four of them at most.
             ca_file: PEM file of the authority that the orchestrator's certificate is by; None: the system's.
+            insecure_http: Use plain http beyond this machine too, where others can read token and keys on the way.
             largest: Bytes of an answer that is not followed as it comes.
 
         Raises:
             ApiError: The token holds characters that no token has, or the file holds no certificate.
+            Unreachable: An address is plain http beyond this machine.
         """
         self._urls = addresses(base_url)
         self._at = 0
         """Which of them answered last."""
         if token and not (token.isascii() and token.isprintable()):
             raise ApiError(Problem(title="No valid token", status=401, detail="what was given as token is none"))
+        readable = [url for url in self._urls if is_readable_on_the_way(url)]
+        if readable and not insecure_http:
+            raise Unreachable(
+                f"{readable[0]} would be asked without TLS, and the token could be read on the way: write https:// "
+                "(the orchestrator's tls.certificate, or a proxy before it); inside a network that is all yours, such "
+                "as a VPN, allow it with SKYTETHER_INSECURE_HTTP=true, or insecure_http: true in robot.yaml"
+            )
         self._whole = {WHOLE: _STEPS * timeout}
         # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
         verify = None if all(url.startswith("http://") for url in self._urls) else _trust(ca_file)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
@@ -45,12 +45,27 @@ def connected(url: str | None, token_file: Path | None) -> Iterator[Client]:
     from skytether.api.client import ApiError, Client, NotRunning, Unreachable
 
     try:
-        with Client(url or local_url(), _token(token_file), ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
+        with Client(url or local_url(), _token(token_file), **transport(url)) as client:
             yield client
     except (ApiError, NotRunning, Unreachable) as error:
         fail(str(error))
     except KeyboardInterrupt:
         fail("interrupted", 130)
+
+
+class Transport(TypedDict):
+    """How a client sends its requests."""
+
+    ca_file: str | None
+    insecure_http: bool
+
+
+def transport(url: str | None) -> Transport:
+    """What the environment says of it; None: to the orchestrator of this machine, which nothing leaves."""
+    from skytether.api.plain_http import VARIABLE, is_allowed
+
+    allowed = url is None or is_allowed(os.environ.get(VARIABLE))
+    return {"ca_file": os.environ.get("SKYTETHER_CA_FILE"), "insecure_http": allowed}
 
 
 def local_url() -> str:

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from .connection import Json
+from .connection import Json, transport
 from .output import console, fail, print_json
 
 if TYPE_CHECKING:
@@ -71,8 +71,8 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     from .robot_config import load_config, load_token
 
     settings = load_config(config) if config is not None else None
-    if settings is not None and config is not None and settings.ca_file is not None:
-        ca_file = ca_file or config.parent / settings.ca_file
+    if settings is not None:
+        ca_file = ca_file or settings.ca_file
     address = url or (settings.orchestrator if settings else None)
     yield examine.extras(["ros2"] if settings and settings.ros2 else [])
     if settings is not None:
@@ -88,7 +88,9 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
                 yield _trouble("token", str(error), "mend the file; it is made by: skytether robot add NAME > FILE")
                 given = None
         if given:
-            yield examine.token(address, ca_file, given, settings.service if settings else None)
+            allowed = settings.insecure_http if settings and not url else transport(address)["insecure_http"]
+            service = settings.service if settings else None
+            yield examine.token(address, ca_file, given, service, insecure_http=allowed)
     each = addresses(address) if address is not None else []
     echoes = [_address(echo)] if echo else [where for where in map(_of, each) if where is not None]
     echoes += settings.task.addresses.values() if settings and not echo else ()

@@ -25,12 +25,12 @@ def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
         try:
             from skytether.api.client import Client
 
-            from .connection import local_token, local_url
+            from .connection import local_token, local_url, transport
 
-            url = given.get("url") or os.environ.get("SKYTETHER_URL") or local_url()
+            url = given.get("url") or os.environ.get("SKYTETHER_URL")
             file = given.get("token_file") or os.environ.get("SKYTETHER_TOKEN_FILE")
             token = local_token(Path(file) if file else None)
-            with Client(url, token, timeout=_PATIENCE_S, ca_file=os.environ.get("SKYTETHER_CA_FILE")) as client:
+            with Client(url or local_url(), token, timeout=_PATIENCE_S, **transport(url)) as client:
                 return [row for row in ask(client) if row[0].startswith(incomplete)]
         except (Exception, SystemExit):  # a key that was pressed must not be answered with a complaint
             return []

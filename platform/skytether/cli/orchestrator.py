@@ -45,6 +45,10 @@ def run(
         bool | None,
         typer.Option("--stop-instances", help="End all instances at shutdown; otherwise they run on."),
     ] = None,
+    insecure_http: Annotated[
+        bool | None,
+        typer.Option("--insecure-http", help="Plain HTTP beyond loopback: tokens can be read on the way."),
+    ] = None,
     open_metrics: Annotated[
         bool | None, typer.Option("--open-metrics", help="Let /metrics be read without a token.")
     ] = None,
@@ -70,6 +74,7 @@ def run(
         "secrets_dir": secrets_dir,
         "catalogue_dir": catalog,
         "stop_instances": stop_instances,
+        "insecure_http": insecure_http,
         "open_metrics": open_metrics,
     }
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -95,7 +96,12 @@ def show(findings: Sequence[Finding]) -> bool:
 def look_at_orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
     """Whether it has the service, and what that takes and gives."""
     try:
-        with Client(settings.orchestrator, token) as client:
+        with Client(
+            settings.orchestrator,
+            token,
+            ca_file=settings.ca_file or os.environ.get("SKYTETHER_CA_FILE"),
+            insecure_http=settings.insecure_http,
+        ) as client:
             manifest = client.get_service(settings.service)
     except (ApiError, Unreachable) as error:
         return None, [Finding("orchestrator", settings.orchestrator, "", str(error), good=False)]

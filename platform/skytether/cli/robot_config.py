@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from skytether.api.manifest import Name, Strict
 from skytether.api.plain import oddity
+from skytether.api.plain_http import is_readable_on_the_way
 from skytether.messages import type_of
 from skytether.robot.arbiter import Needs
 from skytether.robot.graph_base import protected_names as graph_names
@@ -208,7 +209,9 @@ class RobotConfig(Strict):
 
     robot: Name
     """As it is registered: ``skytether robot add NAME``."""
-    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="http://HOST:PORT; several with commas")]
+    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="https://HOST:PORT; several with commas")]
+    insecure_http: bool = False
+    """``http://`` beyond this machine too: whoever is on the way reads token and keys of sessions."""
     token_file: Path
     """Holds the token that the registration printed; relative to this file's folder."""
     service: Name
@@ -229,7 +232,7 @@ class RobotConfig(Strict):
     paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
     """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
     ca_file: Path | None = None
-    """PEM file of the certificate's authority, relative to this file's folder; null: the system's."""
+    """PEM file of the certificate's authority; in the file, relative to its folder; null: the system's."""
     task: TaskConfig = TaskConfig()
     status_port: Annotated[int, Field(ge=0, le=65_535)] | None = DEFAULT_PORT
     """Of ``/status`` and ``/metrics`` on loopback; 0: any free one; null: there are none."""
@@ -288,6 +291,16 @@ class RobotConfig(Strict):
     def notes(self) -> tuple[str, ...]:
         """A sentence for each of the limits that is beyond its bounds."""
         return check_plausible({"limits": self.limits}, self.beyond, "beyond")
+
+    @model_validator(mode="after")
+    def _token_stays_secret(self) -> RobotConfig:
+        readable = [url for url in self.orchestrator.split(",") if is_readable_on_the_way(url)]
+        if readable and not self.insecure_http:
+            raise ValueError(
+                f"orchestrator: {readable[0].strip()} is plain http, and the token could be read on the way: write "
+                "https://; inside a network that is all yours, such as a VPN, add insecure_http: true"
+            )
+        return self
 
     @model_validator(mode="after")
     def _has_a_graph(self) -> RobotConfig:
@@ -376,7 +389,10 @@ def load_config(path: Path) -> RobotConfig:
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key is wrong.
     """
-    return read_config(path, RobotConfig)
+    settings = read_config(path, RobotConfig)
+    if settings.ca_file is None:
+        return settings
+    return settings.model_copy(update={"ca_file": path.parent / settings.ca_file})
 
 
 def load_token(settings: RobotConfig, folder: Path) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import gc
-import ipaddress
 import logging
 import math
 import os
@@ -23,6 +22,7 @@ import uvicorn
 from alembic.util import CommandError
 from sqlalchemy.exc import DatabaseError, SQLAlchemyError
 
+from skytether.api.plain_http import is_loopback
 from skytether.bridge.echo import EchoServer
 
 from . import logs
@@ -74,6 +74,7 @@ def run(settings: Settings) -> None:
         raise StartError(f"cannot write the audit to {where}: {error.strerror}", usage=True) from error
     _allow_connections()
     with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
+        _check_secrecy(settings, listener)
         try:
             core = Orchestrator(settings)
         except SecretFileError as error:
@@ -81,6 +82,18 @@ def run(settings: Settings) -> None:
         except AddressError as error:
             raise StartError(str(error), usage=True) from error
         _serve(core, listener)
+
+
+def _check_secrecy(settings: Settings, listener: socket.socket) -> None:
+    host = listener.getsockname()[0]
+    if settings.tls.certificate or settings.insecure_http or is_loopback(host):
+        return
+    raise StartError(
+        f"without TLS, tokens and keys of sessions could be read on the way to {host}: give a certificate "
+        "(tls.certificate, tls.key), or listen on 127.0.0.1 behind a proxy that has one; inside a network that is all "
+        "yours (a VPN, a bridge of containers) allow it with --insecure-http",
+        usage=True,
+    )
 
 
 def _allow_connections() -> None:
@@ -190,9 +203,6 @@ class _Server(uvicorn.Server):
         draft = self._address.with_name("address.new")
         draft.write_text(f"{self._url}\n")
         draft.replace(self._address)
-        settings = self._core.settings
-        if not (settings.tls.certificate or settings.proxies or _loopback(settings.host)):
-            log.warning("listening on %s without TLS: tokens can be read on the way", settings.host)
         log.info("listening on %s, state in %s", self._url, self._core.settings.state_dir)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -200,13 +210,6 @@ class _Server(uvicorn.Server):
         self._core.broker.close()
         await super().shutdown(sockets)
         self._core.strain.rest()
-
-
-def _loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 @contextmanager

@@ -240,6 +240,10 @@ class Settings(Group):
     (DNS rebinding)."""
     proxies: tuple[str, ...] = ()
     """Addresses or networks of proxies in front, whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed."""
+    insecure_http: bool = False
+    """True: plain HTTP beyond loopback too, where whoever is on the way reads tokens and keys of sessions: for a VPN, a
+    bridge network of containers, or the way from a proxy with a certificate, if all of it is yours. Otherwise it does
+    not start so."""
     tls: Tls = Tls()
     """HTTPS without a proxy in front."""
     logs: Logs = Logs()

@@ -92,6 +92,7 @@ class AgentConfig:
         bind: Local address of the robot's end of the bridge; port 0: any.
         paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
         ca_file: PEM file of the authority of the orchestrator's certificate; none: the system's.
+        insecure_http: Whether plain http may leave this machine.
         task: How it is decided whether to ask, and for which site; None: the service is asked for always, at whatever
             site the orchestrator chooses by ``measurements``.
         fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
@@ -119,6 +120,7 @@ class AgentConfig:
     bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
     paths: Wanted = ()
     ca_file: str | None = None
+    insecure_http: bool = False
     task: TaskConfig | None = None
     fresh_token: Callable[[], str] | None = None
     status_port: int | None = None
@@ -191,6 +193,7 @@ class Agent:
                 config.token,
                 timeout=config.request_timeout_s,
                 ca_file=config.ca_file,
+                insecure_http=config.insecure_http,
                 largest=_LARGEST_ANSWER,
             )
         )

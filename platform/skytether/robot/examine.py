@@ -7,11 +7,11 @@ import ssl
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import httpx
 
 from skytether.api.client import ApiError, Client, Unreachable
+from skytether.api.plain_http import is_readable_on_the_way
 from skytether.bridge.echo import SMALLEST, EchoClient
 
 from . import fallback
@@ -58,16 +58,16 @@ def orchestrator(url: str, ca_file: Path | None) -> Iterator[Finding]:
     yield Finding("orchestrator", "ok", f"answers at {url}")
     if url.startswith("https://"):
         yield judge_certificate(url, "")
-    elif urlsplit(url).hostname not in ("localhost", "127.0.0.1", "::1"):
+    elif is_readable_on_the_way(url):
         todo = "give the orchestrator a certificate (tls.certificate), or use it inside a VPN only"
         yield Finding("certificate", "trouble", "there is none: tokens can be read on the way", todo)
     yield judge_clock(answer.headers.get("date"), before, time.time())
 
 
-def token(url: str, ca_file: Path | None, given: str, service: str | None) -> Finding:
+def token(url: str, ca_file: Path | None, given: str, service: str | None, *, insecure_http: bool) -> Finding:
     """Whether the token is good, and for the service."""
     try:
-        with Client(url, given, timeout=_TIMEOUT_S, ca_file=ca_file) as client:
+        with Client(url, given, timeout=_TIMEOUT_S, ca_file=ca_file, insecure_http=insecure_http) as client:
             if service is None:
                 client.services()
                 return Finding("token", "ok", "is accepted")
