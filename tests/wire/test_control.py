@@ -51,8 +51,11 @@ def test_sums_wrap_and_feedback_that_makes_no_sense_is_refused():
     ping = Ping(0, 0, True, 0, 1, 0, NOTHING)
     wrapped = pull_control(push_ping(ping._replace(feedback=NOTHING._replace(settled=2**32 + 5))))
     assert wrapped.feedback.settled == 5
-    for wrong in (math.nan, -1.0):
-        assert pull_control(push_ping(ping._replace(feedback=NOTHING._replace(rate=wrong)))) is None
+    for field in ("queue", "rate", "time", "time_squared"):
+        for wrong in (math.nan, -1.0, math.inf):
+            assert pull_control(push_ping(ping._replace(feedback=NOTHING._replace(**{field: wrong})))) is None
+    for wrong in (math.nan, -math.inf):
+        assert pull_control(push_ping(ping._replace(feedback=NOTHING._replace(capacity=wrong)))) is None
 
 
 def test_goodbye_travels():

@@ -45,6 +45,16 @@ def test_any_time_stamp_is_echoed(world, role, stamp):
     assert all(end.stats(link.now).connected for end in link.sessions.values())
 
 
+@pytest.mark.parametrize("role", Role)
+def test_losses_that_last_for_ever_are_not_reckoned_with(world, role):
+    link = world.link()
+    for turn in (1, 2):
+        bursts = NOTHING._replace(settled=1000 * turn, lost=300 * turn, runs=3 * turn, time=1.0 * turn)
+        say(link, role, ping(feedback=bursts._replace(time_squared=math.inf)))
+        link.run(0.02)
+    assert link.sessions[SERVICE if role is ROBOT else ROBOT].stats(link.now).rejected["control"] == 2
+
+
 def test_a_robot_with_many_paths(world):
     """Each opens when it is first heard; beyond the most that there may be, one makes room."""
     link = world.link()

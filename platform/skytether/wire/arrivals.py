@@ -1,7 +1,7 @@
 """What the packets that arrive tell of a path: losses with their bursts, and delays with the queue behind them.
 
-Packet numbers and times of sending are collected as packets come and evaluated from time to time, as arrays.
-They are not authenticated: what lies far from the rest is ignored.
+Packet numbers and times of sending of authentic packets are collected as they come and evaluated from time to time, as
+arrays. The peer may be hostile or begin anew: what lies far from the rest is ignored.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Ping(NamedTuple):
     """Keepalive, clock exchange, path probe, feedback. The time of sending is the message's own time of publishing."""
 
     path: int
-    """What it is sent by: authentic, as the header's is not."""
+    """What it is sent by."""
     cost: int
     """The sender's preference among paths; only the robot's end counts."""
     ask: bool
@@ -195,7 +195,8 @@ def pull_control(data: bytes) -> Control | None:
         if kind == PING:
             _, path, cost, ask, size, echo, hold, *fields = _PING.unpack_from(data)
             feedback = Feedback(*fields)
-            if any(math.isnan(value) or value < 0 for value in feedback):
+            known = feedback if feedback.capacity != math.inf else feedback[1:]
+            if min(feedback) < 0 or not all(map(math.isfinite, known)):
                 return None
             return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, hold, feedback)
         if kind == REPORT:

@@ -1,10 +1,8 @@
 """Shards back into sealed messages, within a bound of memory, whatever arrives.
 
-Nothing here is authenticated: anybody who knows the session id can make up shards. So a message is kept by all
-that its shards say of it (a forged shard with another topic, length or size makes an entry of its own), memory is
-counted by what arrived (a shard that claims 16 MiB reserves nothing), and when memory runs out, the topic that
-uses the most of it loses its oldest entry. A flood then has to fill the whole memory faster than a real
-message takes to arrive, and hits the topic that it claims first.
+Shards are the peer's, but the peer may be hostile. So a message is kept by all that its shards say of it (a shard with
+another topic, length or size makes an entry of its own), memory is counted by what arrived (a shard that claims 16 MiB
+reserves nothing), and when memory runs out, the topic that uses the most of it loses its oldest entry.
 """
 
 from __future__ import annotations
