@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from .lab_failover import alarms, failover
+from .lab_hostile import hostile
 from .lab_safety import safety
 from .output import console, fail, print_json, silenced
 
@@ -15,6 +16,7 @@ app = typer.Typer(help="Experiments and benchmarks on this machine.", no_args_is
 bench = typer.Typer(help="Measure the real program, and print what was measured.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 bench.command("safety")(safety)
+bench.command("hostile")(hostile)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 

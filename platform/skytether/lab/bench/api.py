@@ -107,7 +107,7 @@ def bench_api(
         operator.delete_site("local")
         tokens = [operator.create_robot(RobotCreate(name=f"robot-{i}")).token for i in range(instances)]
         began = time.monotonic()
-        held = _start(operator, tokens, on_progress)
+        held = start(operator, tokens, on_progress)
         start_s = time.monotonic() - began
         cpu_idle = _busy(orchestrator.pid, lambda: time.sleep(_SETTLE_S))[0]
         on_progress("the client by itself")
@@ -118,7 +118,7 @@ def bench_api(
         cpu, answers = _busy(orchestrator.pid, lambda: ask_openly(orchestrator.url, mix.next, rate_hz, seconds, rng))
         passes = passes_in(orchestrator.log[written:])
         time.sleep(_SETTLE_S)
-        lost = _lost(operator, [one.instance for one in held])
+        missing = lost(operator, [one.instance for one in held])
         memory = _peak_mb(orchestrator.pid)
     site, placer = passes.get("site-fleet"), passes.get("placer")
     if not site or not placer:
@@ -141,15 +141,22 @@ def bench_api(
         cpu_idle=round(cpu_idle, 3),
         cpu=round(cpu, 3),
         memory_mb=round(memory, 1),
-        lost=lost,
+        lost=missing,
         start_s=round(start_s, 1),
     )
 
 
-def _start(operator: Client, tokens: list[str], on_progress: Callable[[str], None]) -> list[Held]:
+def start(
+    operator: Client, tokens: list[str], on_progress: Callable[[str], None], lease_s: float = _LEASE_S
+) -> list[Held]:
+    """An instance for each robot, named by its number.
+
+    Raises:
+        BenchError: Not all of them ran in time.
+    """
     held = []
     for i, token in enumerate(tokens):
-        asked = InstanceCreate(robot=f"robot-{i}", service=SERVICE, lease_s=_LEASE_S)
+        asked = InstanceCreate(robot=f"robot-{i}", service=SERVICE, lease_s=lease_s)
         held.append(Held(f"robot-{i}", token, operator.create_instance(asked).id))
     deadline = time.monotonic() + _START_LIMIT_S
     while (up := sum(i.state is State.RUNNING for i in operator.instances())) < len(held):
@@ -179,7 +186,7 @@ def _peak_mb(pid: int) -> float:
     return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-def _lost(operator: Client, held: list[str]) -> int:
+def lost(operator: Client, held: list[str]) -> int:
     """Instances that are not running, as the orchestrator says, in exactly one process, as the kernel says."""
     running = {one.id for one in operator.instances() if one.state is State.RUNNING}
     processes = Counter(instance_of(process) for process in psutil.process_iter())

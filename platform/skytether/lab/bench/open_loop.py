@@ -62,7 +62,7 @@ def ask_openly(
 
     def one(request: Request, due: float) -> None:
         connection = idle.get()
-        status, body = _ask(connection, request)
+        status, body = ask(connection, request)
         answered = Answered(request.kind, time.monotonic() - due, status)
         idle.put(connection)
         if answered.good:
@@ -86,7 +86,8 @@ def ask_openly(
     return done
 
 
-def _ask(connection: http.client.HTTPConnection, request: Request) -> tuple[int, bytes]:
+def ask(connection: http.client.HTTPConnection, request: Request) -> tuple[int, bytes]:
+    """The answer's status and body; 0 without one."""
     try:
         connection.request(request.method, request.path, request.body, dict(request.headers))
         response = connection.getresponse()

@@ -6,6 +6,7 @@ import json
 import queue
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -65,7 +66,6 @@ class Mix:
         self._made: queue.SimpleQueue[tuple[dict[str, str], str]] = queue.SimpleQueue()
         """Instances to let go."""
         self._count = 0
-        self._report = report()
 
     def next(self) -> Request:
         """The next request."""
@@ -88,10 +88,15 @@ class Mix:
         if kind == "delete" and not self._made.empty():
             token, instance = self._made.get()
             return Request(kind, "DELETE", f"/api/v1/instances/{instance}", token)
-        return Request("renew", "POST", f"{path}/renew", own | _JSON, self._report)
+        return renewal(who)
 
     def _keep(self, token: dict[str, str], answer: bytes) -> None:
         self._made.put((token, json.loads(answer)["id"]))
+
+
+def renewal(who: Held) -> Request:
+    """A robot that drives reports, and keeps its lease."""
+    return Request("renew", "POST", f"/api/v1/instances/{who.instance}/renew", _bearer(who.token) | _JSON, report())
 
 
 def healthz() -> Request:
@@ -99,6 +104,7 @@ def healthz() -> Request:
     return Request("healthz", "GET", "/healthz")
 
 
+@cache
 def report() -> bytes:
     """A renewal as the agent of a robot that drives sends it."""
     topics = tuple(
