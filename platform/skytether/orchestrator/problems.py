@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
@@ -60,10 +61,23 @@ _HTTP = {
 def install(app: FastAPI) -> None:
     """Make an app answer every error with a problem document."""
 
+    @cache
+    def definitions() -> Any:
+        return _plain_refs(app.openapi().get("components", {}).get("schemas", {}))
+
+    @cache
+    def body_schema(route: object, method: str) -> dict[str, Any]:
+        """JSON schema of the body that a request should have had, from the API's own description."""
+        operation = app.openapi()["paths"].get(getattr(route, "path", ""), {}).get(method.lower(), {})
+        content = operation.get("requestBody", {}).get("content", {}).get("application/json", {})
+        return {**_plain_refs(content.get("schema", {})), "$defs": definitions()}
+
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, RequestValidationError):
             raise error
-        found = [_explain(app, request, one) for one in error.errors()]
+        # The first to need it waits for the API's description, which takes a while: nobody else does.
+        schema = await asyncio.to_thread(body_schema, request.scope.get("route"), request.method)
+        found = [_explain(one, schema) for one in error.errors()]
         detail = "; ".join(str(fault) for fault in found)
         return answer(request, 422, "Invalid input", detail, [_fault(fault) for fault in found])
 
@@ -131,24 +145,13 @@ def _fault(fault: Fault) -> dict[str, Any]:
     return {"key": fault.key, "detail": fault.detail}
 
 
-def _explain(app: FastAPI, request: Request, error: dict[str, Any]) -> Fault:
+def _explain(error: dict[str, Any], body_schema: dict[str, Any]) -> Fault:
     """One of FastAPI's errors; its place begins with where it was: body, query, path or header."""
     where, *path = error["loc"]
     if error["type"] == "json_invalid":
         return Fault("", f"the body is no JSON: {error['ctx']['error'].lower()} at character {path[0]}")
-    schema = _body_schema(app, request) if where == "body" else {}
-    fault = faults([{**error, "loc": path}], schema)[0]
+    fault = faults([{**error, "loc": path}], body_schema if where == "body" else {})[0]
     return fault if fault.key else Fault(str(where), fault.detail)
-
-
-def _body_schema(app: FastAPI, request: Request) -> dict[str, Any]:
-    """JSON schema of the body that this request should have had, from the API's own description."""
-    document = app.openapi()
-    route = request.scope.get("route")
-    operation = document["paths"].get(getattr(route, "path", ""), {}).get(request.method.lower(), {})
-    content = operation.get("requestBody", {}).get("content", {}).get("application/json", {})
-    definitions = document.get("components", {}).get("schemas", {})
-    return {**_plain_refs(content.get("schema", {})), "$defs": _plain_refs(definitions)}
 
 
 def _plain_refs(node: Any) -> Any:
