@@ -1,10 +1,11 @@
-"""The gate of ``robot run``: one that was found, and ends."""
+"""The gate of ``robot run``: one that was found, and ends; one of its own, and what becomes of it beside others."""
 
 from types import SimpleNamespace
 
 import pytest
 
-from skytether.cli.robot_gate import FoundGate
+from skytether.cli import robot_gate
+from skytether.cli.robot_gate import FoundGate, OwnGate
 
 
 class Own:
@@ -67,3 +68,67 @@ def test_a_gate_that_is_started_anew_or_ended_later_is_left_alone(robot):
     assert robot.look(60.0) == ""
     robot.gate.close()
     assert not robot.made
+
+
+class Started:
+    """An own gate whose processes are played, in a folder that another guard may have."""
+
+    def __init__(self, monkeypatch):
+        self.now, self.there, self.guard_pid, self.asked, self.processes = 100.0, False, 7, [], []
+        monkeypatch.setattr(OwnGate, "_start", lambda _: self.start())
+        monkeypatch.setattr(robot_gate, "listens", lambda folder: True)
+        monkeypatch.setattr(robot_gate, "_there", lambda folder: self.there)
+        monkeypatch.setattr(robot_gate, "ask", self.ask)
+        safety = SimpleNamespace(place=lambda: "run")
+        self.gate = OwnGate("robot.yaml", safety, assumed=True, clock=lambda: self.now)
+
+    def start(self):
+        process = SimpleNamespace(pid=7, status=None)
+        process.poll = lambda: process.status
+        self.processes.append(process)
+        return process
+
+    def ask(self, folder, request, timeout):
+        self.asked.append(request["do"])
+        return {"guard_pid": self.guard_pid, "stopped": ""}
+
+    def look(self, seconds):
+        for _ in range(round(seconds / 0.5)):
+            self.now += 0.5
+            self.gate.look()
+
+
+@pytest.fixture
+def started(monkeypatch):
+    return Started(monkeypatch)
+
+
+def test_the_own_gate_is_started_once_with_the_robot(started):
+    started.gate.wait()
+    started.look(5.0)
+    assert started.asked == ["status", "status", "start"]
+
+
+def test_a_gate_of_somebody_else_is_neither_reset_nor_started(started):
+    started.guard_pid = 8
+    started.gate.wait()
+    started.look(50.0)
+    assert set(started.asked) == {"status"}
+
+
+def test_what_begins_late_is_not_the_start_of_the_robot(started):
+    """A gate that comes up a minute after the person looked lets nobody drive."""
+    started.now += 60.0
+    started.gate.wait()
+    started.look(5.0)
+    assert started.asked == []
+
+
+def test_where_another_guard_has_the_folder_none_is_started_every_second(started):
+    started.there = True
+    started.processes[0].status = 1
+    started.look(60.0)
+    assert len(started.processes) == 1
+    started.there = False
+    started.look(1.0)
+    assert len(started.processes) == 2

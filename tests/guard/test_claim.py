@@ -1,8 +1,13 @@
-"""The folder of a guard: whoever has it, and whether it still leads to the guard."""
+"""The folder of a guard: whoever has it, whether it still leads to the guard, and what is left of one that died."""
+
+import os
+import socket
+import threading
 
 import pytest
 
-from skytether.guard.claim import LOCK_FILE, Claim, ClaimError
+from skytether.guard.claim import LOCK_FILE, Claim, ClaimError, Heir, guarded
+from skytether.guard.protocol import STOP_SOCKET
 
 
 @pytest.fixture
@@ -35,7 +40,51 @@ def test_a_folder_that_is_replaced_is_lost(claim, tmp_path):
 
 def test_a_folder_has_one_guard(claim, tmp_path):
     with pytest.raises(ClaimError, match="another gate runs"):
-        Claim(str(tmp_path / "run"))
+        Claim(str(tmp_path / "run"), 0.0)
     (tmp_path / "file").touch()
     with pytest.raises(ClaimError, match="cannot use the folder"):
         Claim(str(tmp_path / "file"))
+
+
+def test_a_guard_that_listens_is_not_waited_for(claim, tmp_path):
+    folder = tmp_path / "run"
+    (folder / STOP_SOCKET).unlink()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(folder / STOP_SOCKET))
+        assert not guarded(str(folder))
+        listener.listen(0)
+        assert guarded(str(folder))
+        with pytest.raises(ClaimError, match="another gate runs"):
+            Claim(str(folder), 3600.0)
+    assert not guarded(str(folder))
+
+
+def test_one_that_ends_is_waited_for(claim, tmp_path):
+    """It has closed its sockets, and waits for its disk."""
+    ends = threading.Timer(0.2, os.close, [claim._lock])
+    ends.start()
+    Claim(str(tmp_path / "run"), 60.0)
+    ends.join()
+
+
+def test_what_is_left_of_a_guard_has_the_folder_until_it_ends(claim, tmp_path):
+    folder = str(tmp_path / "run")
+    gate, writer = Heir(folder), Heir(folder)
+    assert not gate.may()
+    os.close(claim._lock)  # it died
+    assert gate.may()
+    assert writer.may()
+    with pytest.raises(ClaimError):
+        Claim(folder, 0.0)
+    assert gate.may()
+    gate.close()
+    with pytest.raises(ClaimError):
+        Claim(folder, 0.0)
+    writer.close()
+    late = Heir(folder)
+    Claim(folder, 0.0)
+    assert not late.may()
+
+
+def test_where_nobody_can_have_a_lock_the_wheels_are_told(tmp_path):
+    assert Heir(str(tmp_path / "none")).may()

@@ -13,8 +13,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 
+from skytether.guard.claim import guarded
+from skytether.guard.folder import objection
 from skytether.guard.latch import FIRST_ACT
 from skytether.robot.safety.client import GateError, ask, listens
 from skytether.robot.safety.config import SafetyConfig
@@ -33,7 +36,9 @@ _POLL_S = 0.05
 _STRANGE_S = 15.0
 """A gate that was there when we came, and ends so soon after, was the one of an agent that has died."""
 _GONE_S = 1.0
-"""A gate that listens no more for so long has ended, or is started anew by whoever looks after it."""
+"""A guard that listens no more for so long has ended, or is started anew by whoever looks after it."""
+_ASSUMED_S = _START_S + _STRANGE_S
+"""Whoever starts the robot has looked at it so long ago at most."""
 _ASK_S = 3.0
 
 NO_GATE = (
@@ -46,6 +51,11 @@ ASSUMED = (
 )
 
 
+def _there(folder: Path) -> bool:
+    """Whether a guard has a folder that can be relied upon; its gate may be on its way."""
+    return guarded(str(folder)) and not objection(str(folder))
+
+
 class OwnGate:
     """A gate that was started here.
 
@@ -53,13 +63,17 @@ class OwnGate:
         config: The robot.yaml.
         safety: Its section.
         assumed: There is none: whoever starts the robot has reset and started it, as far as there is something to.
+        clock: Monotonic seconds.
     """
 
-    def __init__(self, config: Path, safety: SafetyConfig, *, assumed: bool) -> None:
+    def __init__(
+        self, config: Path, safety: SafetyConfig, *, assumed: bool, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._config = config
         self._folder = safety.place()
-        self._assumed = assumed
-        self._started_at = time.monotonic()
+        self._clock = clock
+        self._started_at = clock()
+        self._assumed_until = self._started_at + _ASSUMED_S if assumed else -inf
         self._process = self._start()
 
     def wait(self) -> None:
@@ -76,17 +90,17 @@ class OwnGate:
             if time.monotonic() > end:
                 raise GateError(f"the gate does not listen in {self._folder} after {_START_S:.0f} s")
             time.sleep(_POLL_S)
-        if self._assumed:
+        if self._clock() < self._assumed_until:
             self._let_go(start=False)
 
     def look(self) -> str:
-        """Start it again if it has ended by itself. Returns a sentence about that; empty: it runs."""
-        if self._assumed and listens(self._folder):
-            self._let_go(start=True)
-            self._assumed = False  # that was for this start; from now on a person is asked
-        status = self._process.poll()
-        now = time.monotonic()
-        if status is None or now - self._started_at < _AGAIN_S:
+        """Start it again if it has ended by itself. Returns a sentence about that; empty: it runs, or another does."""
+        status, now = self._process.poll(), self._clock()
+        if status is None:
+            if now < self._assumed_until and listens(self._folder) and self._let_go(start=True):
+                self._assumed_until = -inf  # that was for this start; from now on a person is asked
+            return ""
+        if now - self._started_at < _AGAIN_S or _there(self._folder):
             return ""
         self._started_at = now
         self._process = self._start()
@@ -104,14 +118,22 @@ class OwnGate:
         command = [sys.executable, "-m", "skytether.cli.own_gate", str(os.getpid()), str(self._config)]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
 
-    def _let_go(self, *, start: bool) -> None:
-        """Do what a person who starts the robot does; a stop that somebody asked for stays."""
+    def _let_go(self, *, start: bool) -> bool:
+        """Do what a person who starts the robot does; a stop that somebody asked for stays.
+
+        Returns:
+            Whether the gate that listens is the one that was started here: of another nothing is asked.
+        """
         with contextlib.suppress(GateError):
-            stopped = ask(self._folder, {"do": "status"}, _ASK_S)["stopped"]
+            status = ask(self._folder, {"do": "status"}, _ASK_S)
+            if status.get("guard_pid") != self._process.pid:  # what is started becomes the guard
+                return False
+            stopped = status["stopped"]
             if stopped == FIRST_ACT:
                 ask(self._folder, {"do": "reset", "only": FIRST_ACT}, _ASK_S)
             if start and stopped in ("", FIRST_ACT):
                 ask(self._folder, {"do": "start"}, _ASK_S)
+        return True
 
 
 class FoundGate:
@@ -122,7 +144,7 @@ class FoundGate:
         safety: Its section.
         assumed: See `OwnGate`.
         make: Starts another one.
-        there: Whether a gate listens in the folder.
+        there: Whether a guard listens in the folder; its gate may be on its way.
         clock: Monotonic seconds.
     """
 
@@ -133,7 +155,7 @@ class FoundGate:
         *,
         assumed: bool,
         make: Callable[..., OwnGate] = OwnGate,
-        there: Callable[[Path], bool] = listens,
+        there: Callable[[Path], bool] = _there,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config = config
@@ -198,7 +220,7 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         console.print(f"warning: {NO_GATE}", style="yellow", markup=False, soft_wrap=True)
         yield None
         return
-    if listens(safety.place()):
+    if _there(safety.place()):
         try:
             strange = other_wheels(config, safety.place())
         except (ConfigError, OSError) as error:
@@ -219,7 +241,7 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         try:
             own.wait()
         except GateError as error:
-            if not listens(safety.place()):  # else another one was faster
+            if not _there(safety.place()):  # else another one was faster
                 fail(str(error))
         yield own
     finally:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import fcntl
 import os
+import socket
 import threading
 import time
 
 from .folder import objection
+from .protocol import STOP_SOCKET
 
 LOCK_FILE = "lock"
 _LOOK_S = 0.5
+_ENDS_S = 10.0
+"""For what is left of the guard before: it waits for a disk, or its gate and writer brake."""
+_AGAIN_S = 0.05
 
 
 class ClaimError(Exception):
@@ -25,12 +30,13 @@ class Claim:
 
     Args:
         folder: It is made if it is not there.
+        patience_s: With a guard that ends, and with the gate and the writer of one that is gone [s].
 
     Raises:
         ClaimError: Another guard has it, or it cannot be made.
     """
 
-    def __init__(self, folder: str) -> None:
+    def __init__(self, folder: str, patience_s: float = _ENDS_S) -> None:
         self.lost = ""
         """What is not there any more, or another one; empty: all is in its place."""
         path = os.path.join(folder, LOCK_FILE)
@@ -44,11 +50,14 @@ class Claim:
             raise ClaimError(f"cannot use the folder {folder} for the gate's sockets: {error.strerror}") from error
         finally:
             os.umask(before)
+        end = time.monotonic() + patience_s
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            while not _locked(self._lock, fcntl.LOCK_EX):
+                if guarded(folder) or time.monotonic() > end:
+                    raise ClaimError(f"another gate runs in {folder}; end it, or name another safety.folder")
+                time.sleep(_AGAIN_S)
         except OSError as error:
-            os.close(self._lock)
-            raise ClaimError(f"another gate runs in {folder}; end it, or name another safety.folder") from error
+            raise ClaimError(f"cannot lock the folder {folder}: {error.strerror}") from error
         self._files = {path: _identity(os.fstat(self._lock))}
 
     def add(self, path: str) -> None:
@@ -75,6 +84,58 @@ class Claim:
         while not self.lost:
             time.sleep(_LOOK_S)
             self.look()
+
+
+class Heir:
+    """A gate or a writer whose guard is gone: it stops the wheels, and meanwhile no other guard can have the folder.
+
+    One that stood still until another guard was there has nothing to say any more.
+
+    Args:
+        folder: Of the guard, which has it.
+    """
+
+    def __init__(self, folder: str) -> None:
+        try:  # now, as no disk is waited for later
+            path = os.path.join(folder, LOCK_FILE)
+            self._lock: int | None = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except OSError:
+            self._lock = None
+
+    def may(self) -> bool:
+        """Whether it may tell the wheels something. Does not wait."""
+        try:
+            return self._lock is None or _locked(self._lock, fcntl.LOCK_SH)
+        except OSError:  # a file system without locks: then no other guard has one either
+            return True
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def guarded(folder: str) -> bool:
+    """Whether a guard listens in a folder, even if it hangs. Does not wait."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+        link.setblocking(False)
+        try:
+            link.connect(os.path.join(folder, STOP_SOCKET))
+        except (BlockingIOError, PermissionError):  # its queue is full, or it is another user's
+            return True
+        except OSError:
+            return False
+        return True
+
+
+def _locked(file: int, how: int) -> bool:
+    """Whether a lock is had, or nobody else has it."""
+    try:
+        fcntl.flock(file, how | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:

@@ -13,6 +13,7 @@ import pytest
 
 from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
+from skytether.guard.claim import LOCK_FILE, Claim
 from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
@@ -228,6 +229,18 @@ def test_a_guard_that_is_gone_is_noticed(bench):
     bench.guard.close()
     bench.loop.turn()
     assert bench.loop._heartbeat.gone
+
+
+def test_a_gate_that_goes_on_beside_another_guard_tells_the_wheels_nothing(tmp_path):
+    (tmp_path / LOCK_FILE).touch()
+    bench = Bench(tmp_path)
+    told = list(bench.hardware.told)
+    bench.guard.close()
+    another = Claim(str(tmp_path))
+    bench.loop.run()
+    assert bench.hardware.told == told
+    assert not another.lost
+    bench.close()
 
 
 def test_what_is_no_command_and_a_flood_of_them_are_named_once(bench, caplog):

@@ -23,7 +23,7 @@ import pytest
 from skytether.guard.record import decode
 from skytether.guard.velocity import STANDSTILL
 from skytether.lab.safety.record import now
-from skytether.lab.safety.robot import PlayedRobot
+from skytether.lab.safety.robot import LIMITS, PlayedRobot
 from skytether.lab.safety.stage import Stage
 from skytether.messages import Bool
 from skytether.robot.safety.client import GateError
@@ -126,6 +126,31 @@ def test_in_every_order_of_deaths_the_wheels_are_told_to_stop(robot, first, how,
         left.resume()
     time.sleep(0.5)
     check(stage)
+
+
+def test_a_gate_that_goes_on_beside_another_guard_tells_the_wheels_nothing(robot):
+    gate = robot.signal("gate", signal.SIGSTOP)
+    robot.signal("guard", signal.SIGKILL)
+    robot.guard.wait(30)
+    robot.go()
+    stage = Stage(robot)
+    os.kill(gate, signal.SIGCONT)
+    time.sleep(1.0)
+    check(stage)
+    assert all(told.velocity != STANDSTILL for told in robot.record.since(now() - 1.0))
+    assert robot.alive("guard")
+
+
+def test_a_guard_that_is_started_anew_waits_until_the_gate_of_the_one_before_has_braked(tmp_path):
+    with PlayedRobot(tmp_path, {"limits": {**LIMITS, "linear_braking": 0.1}}) as robot:
+        robot.go()
+        stage = Stage(robot)
+        robot.signal("guard", signal.SIGKILL)
+        robot.guard.wait(30)
+        robot.start_guard()
+        stands(robot)
+        robot.go()
+        check(stage)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])

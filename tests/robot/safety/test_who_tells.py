@@ -14,6 +14,7 @@ import pytest
 
 from skytether.guard import board
 from skytether.guard.board import Board
+from skytether.guard.claim import LOCK_FILE, Claim
 from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
@@ -179,3 +180,15 @@ def test_whoever_goes_on_after_a_while_goes_on_from_what_was_told(stage, gone, s
     assert stage.told[-1][2] == WANTED
     assert stage.spoke(back + 3 * PERIOD) == ["writer"]
     assert stage.spoke(since) in (["writer"], ["gate", "writer"], ["writer", "gate", "writer"])
+
+
+def test_a_writer_that_goes_on_beside_another_guard_tells_the_wheels_nothing(tmp_path):
+    (tmp_path / LOCK_FILE).touch()
+    stage = Stage(tmp_path)
+    another = Claim(str(tmp_path))
+    for end in stage.sockets[:3]:
+        end.close()
+    stage.writer.run()
+    assert not stage.told
+    assert not another.lost
+    stage.close()

@@ -21,6 +21,7 @@ from typing import Any
 
 from skytether.guard import privileges
 from skytether.guard.board import Board
+from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
 from skytether.guard.latch import Keeper, boot_id
 from skytether.guard.loop import LATCH_FILE
@@ -93,6 +94,7 @@ class GateLoop:
         )
         self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
+        self._heir = Heir(str(folder))
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
         self._notices = Notices(_log)
@@ -122,7 +124,11 @@ class GateLoop:
         stood = 0.0
         while stood < _LAST_STOPS_S:
             self._heartbeat.hear()
-            stands = self._heartbeat.stop_wheels(self._clock()) == STANDSTILL
+            now = self._clock()
+            if not self._heir.may():
+                _log.error("another guard has the wheels by now; the gate ends")
+                return
+            stands = self._heartbeat.stop_wheels(now) == STANDSTILL
             stood = stood + self._period if stands else 0.0
             time.sleep(self._period)
 
@@ -162,6 +168,7 @@ class GateLoop:
         """Close the sockets."""
         self._requests.close()
         self._commands.close()
+        self._heir.close()
         if self._feed is not None:
             self._feed.close()
 

@@ -19,6 +19,7 @@ from math import nan
 
 from skytether.guard import privileges
 from skytether.guard.board import Board, Role
+from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
 from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat, unpack_enable
 from skytether.guard.settings import thaw
@@ -66,6 +67,7 @@ class Writer:
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
         self._teller = Teller(wheels, self._watch, board, Role.FIRST, self._period, clock)
         self._notices = Notices(_log)
+        self._heir = Heir(str(config.place()))
         self._gone = False
         self._wanted_at = nan
         self._due = clock()
@@ -78,15 +80,19 @@ class Writer:
         _log.error("the guard is gone; the writer stops the wheels and ends")
         stood = 0.0
         while stood < _LAST_STOPS_S:
-            select.select([], [], [], self._period)
-            self._tell(self._clock())
+            now = self._clock()
+            if not self._heir.may():
+                _log.error("another guard has the wheels by now; the writer ends")
+                return
+            self._tell(now)
             stood = stood + self._period if self._watch.told.velocity == STANDSTILL else 0.0
+            select.select([], [], [], self._period)
 
     def turn(self) -> None:
         """Take in what the guard wants, and tell the wheels if it is time."""
         heard = self._hear()
         now = self._clock()
-        if not heard and now < self._due:
+        if self._gone or (not heard and now < self._due):
             return
         told = self._tell(now)
         self._due = self._watch.due(now, self._repeat_s) if told else now + self._period / 2
