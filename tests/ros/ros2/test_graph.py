@@ -1,7 +1,10 @@
 """What tokens tell of a graph, and what does not fit."""
 
+from types import SimpleNamespace
+
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName, RmwZenoh
 from skytether.ros.ros2.graph import Graph, learned_hash, mismatches
+from skytether.ros.ros2.node import Ros2Node
 
 TALKER = Endpoint(Kind.PUBLISHER, "/chatter", "std_msgs/msg/String", "RIHS01_aa", node="/talker")
 OURS = Endpoint(Kind.SUBSCRIPTION, "/chatter", "std_msgs/msg/String", "RIHS01_aa")
@@ -49,3 +52,22 @@ def test_what_does_not_meet_does_not_have_to_fit():
 def test_a_hash_is_learned_from_the_other_side_only():
     assert learned_hash(OURS, [TALKER]) == "RIHS01_aa"
     assert learned_hash(OURS, [other(kind=Kind.SUBSCRIPTION), other(type="x/msg/Y"), other(type_hash="")]) == ""
+
+
+def test_an_answer_that_took_too_long_is_no_graph_without_anybody():
+    """Zenoh tells it by a reply that is an error, beside those that came in time: asked again, with more patience."""
+    node = Ros2Node(RmwZenoh(0), router="tcp/127.0.0.1:1", say=lambda _: None)
+    told, late = (SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in ("a", "b")), SimpleNamespace(ok=None)
+    first, second = told
+    answers, asked = [[first, late], [late], [first, second]], []
+
+    def get(_, timeout):
+        asked.append(timeout)
+        return answers.pop(0)
+
+    live = SimpleNamespace(get=get)
+    session = SimpleNamespace(info=SimpleNamespace(routers_zid=lambda: ["r"]), liveliness=lambda: live)
+    node._look_at_all(session)
+    assert asked == sorted(asked)
+    assert not answers
+    assert {key for key, _ in node._changes} == {"a", "b"}

@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain, repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -38,7 +39,7 @@ MAX_CHANGES = 100_000
 MAX_SAID = 1000
 """Troubles that are remembered, so that each is told once."""
 _POLL_S = 0.5
-_LOOK_S = 2.0
+_LOOK_S = (2.0, 4.0, 8.0, 16.0)
 _RETRY_S = (0.25, 0.5, 1.0, 2.0)
 _H = TypeVar("_H", bound=Handle)
 
@@ -238,10 +239,8 @@ class Ros2Node:
         live = session.liveliness()
         token = live.declare_token(self.dialect.node_token(ours, self._name))
         watch = live.declare_subscriber(self.dialect.watched, self._on_token, history=True)
-        # The same again, but known to be complete: who waits until we have joined knows the whole graph.
-        present = live.get(self.dialect.watched, timeout=_LOOK_S)
-        self._changes.extend((str(reply.ok.key_expr), True) for reply in present if reply.ok is not None)
         try:
+            self._look_at_all(session)
             while not self._closing.is_set():
                 self._look_at_router(session)
                 changed = self._take_changes(graph)
@@ -265,6 +264,17 @@ class Ros2Node:
                 _retract(handle, things)
             watch.undeclare()  # type: ignore[no-untyped-call]
             token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _look_at_all(self, session: zenoh.Session) -> None:
+        """Ask for what the subscription tells too, until an answer is whole: who has joined knows the whole graph."""
+        for patience in chain(_LOOK_S, repeat(_LOOK_S[-1])):
+            if self._closing.is_set():
+                return
+            self._look_at_router(session)
+            replies = list(session.liveliness().get(self.dialect.watched, timeout=patience))
+            self._changes.extend((str(reply.ok.key_expr), True) for reply in replies if reply.ok is not None)
+            if all(reply.ok is not None for reply in replies):  # else one says that the router took too long
+                return
 
     def _declare(self, session: zenoh.Session, ours: str, number: int, handle: Handle) -> list[Any]:
         token = self.dialect.token(ours, number, self._name, handle.endpoint)
