@@ -11,7 +11,7 @@ import pytest
 from skytether.api import client
 from skytether.api.rest import InstanceCreate
 from skytether.orchestrator.runtimes.base import LogStream
-from skytether.orchestrator.runtimes.process import FileLog
+from skytether.orchestrator.runtimes.file_log import FileLog
 from skytether.testing.runtimes import FakeRuntime
 
 

@@ -135,7 +135,7 @@ def test_secrets_are_readable_by_the_owner_only_and_neither_in_arguments_nor_env
     until(runtime, Phase.RUNNING)
     folder = tmp_path / "instances/i1"
     assert folder.stat().st_mode & 0o777 == 0o700
-    for name in ("grant.json", "log", "run.json"):
+    for name in ("own/grant.json", "log", "run.json"):
         assert (folder / name).stat().st_mode & 0o777 == 0o600, name
     proc = Path("/proc") / str(pid_of(tmp_path))
     assert KEY.encode() not in (proc / "environ").read_bytes() + (proc / "cmdline").read_bytes()
@@ -149,7 +149,7 @@ def test_the_grant_holds_what_only_the_runtime_knows(open_runtime: Open, tmp_pat
     runtime = open_runtime()
     runtime.start(launch(say="hello"))
     until(runtime, Phase.RUNNING)
-    grant = Grant.model_validate_json((tmp_path / "instances/i1/grant.json").read_bytes())
+    grant = Grant.model_validate_json((tmp_path / "instances/i1/own/grant.json").read_bytes())
     assert grant.params == {"say": "hello"}
     assert grant.session_key == KEY
     assert grant.bind_host == "127.0.0.1"
@@ -378,7 +378,7 @@ def test_a_folder_that_cannot_be_written_is_a_failure_in_words(open_runtime: Ope
 def test_a_ready_file_with_rubbish_in_it_is_no_ready_file(tmp_path: Path, open_runtime: Open, content: bytes) -> None:
     runtime = open_runtime()
     runtime.start(launch(entrypoint="this"))
-    (tmp_path / "instances/i1/ready.json").write_bytes(content)
+    (tmp_path / "instances/i1/own/ready.json").write_bytes(content)
     assert runtime.observe()["i1"].port is None
     assert until(runtime, Phase.EXITED).port is None
     runtime.start(launch(attempt=2, entrypoint="this"))  # it is read once more, for the port to keep

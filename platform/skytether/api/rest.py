@@ -297,6 +297,9 @@ class Site(SiteCreate):
     """Blocked: it answers, and what runs there runs on, but nothing can be started."""
     reason: str = ""
     """Why it is not ready."""
+    isolation: tuple[str, ...] = ()
+    """What holds its instances: ``own user``, ``own mounts``, ``Landlock 7``, ``seccomp``; empty: nothing that the
+    orchestrator knows of."""
     cpu: float | None = None
     memory_mb: int | None = None
     gpu: int | None = None

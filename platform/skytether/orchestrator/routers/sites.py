@@ -27,6 +27,7 @@ def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
         images=asked.images,
         state="unreachable" if unreachable else "blocked" if blocked else "ready",
         reason=unreachable or blocked,
+        isolation=site.runtime.isolation() if caller.robot is None else (),
         cpu=total.cpu if total else None,
         memory_mb=total.memory_mb if total else None,
         gpu=total.gpu if total else None,

@@ -151,6 +151,10 @@ class Runtime(ABC):
         """Why nothing can be started at present, though the site answers; empty: nothing is known. From any thread."""
         return ""
 
+    def isolation(self) -> tuple[str, ...]:
+        """What keeps instances from one another and from the site, a few words each, for people."""
+        return ()
+
     @abstractmethod
     def capacity(self) -> Capacity:
         """What the site offers.

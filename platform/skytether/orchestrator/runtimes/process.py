@@ -1,15 +1,19 @@
 """Instances as processes on this machine (Linux), one folder each.
 
-The folder holds the grant (0600), the ready file that the service writes, the log, and ``run.json``: pid, start time
-and boot, by which the process is found again after the orchestrator's own restart and never mistaken for another one
-with the same pid. Each process leads a session of its own, so that it survives the orchestrator, and so that all it
-started can be ended with it. There are no limits on memory and processor here: that is what containers are for.
+The folder holds the log and ``run.json``: pid, start time and boot, by which the process is found again after the
+orchestrator's own restart and never mistaken for another one with the same pid. In its folder ``own``, the only one
+that a run may write into beside that for its data, are the grant (0600) and the ready file that the service writes; it
+is made anew for each run, so that none finds there what an earlier one left for the orchestrator to fall over. Each
+process leads a session of its own, so that it survives the orchestrator, and so that all it started can be ended with
+it. There are no limits on memory and processor here: that is what containers are for. What a process may reach is told
+in ``confinement``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import os
 import platform
@@ -19,10 +23,9 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,12 +38,19 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
 from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
+from .confinement import confined, free_user, opened, readable, this_machine
 from .disk import MOST_FILES, size_of
+from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
-from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, session_members, stat_of
+from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, processes_of, session_members, stat_of
 
-_PASSED_ON = ("HOME", "LANG", "LC_ALL", "PATH", "TMPDIR", "TZ")
+log = logging.getLogger(__name__)
+
+_PASSED_ON = ("LANG", "LC_ALL", "PATH", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
+_OWN = "own"
+_OWN_MB = 64
+"""MiB that a run may have in its own folder, which is also its home and has its temporary files."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
 _WEIGH = 2.0
@@ -48,8 +58,6 @@ _WEIGH = 2.0
 _MEASURE = 2.0
 """Seconds between two readings of processor time, memory and ready file of a child that runs; whether it still does is
 looked at each time."""
-_LAST_LINE = 300
-"""Characters of a log's last line that are told."""
 
 
 def _absolute(path: Path) -> Path:
@@ -79,6 +87,16 @@ class ProcessOptions(Strict):
     """Folders with services that are not installed."""
     environment: dict[str, str] = {}
     """More variables for the services."""
+    readable: tuple[Annotated[Path, AfterValidator(_absolute)], ...] = ()
+    """More folders and files that services may read, beside the system's, Python's and ``python_path``: models, maps, a
+    ROS that is not in /usr or /opt/ros."""
+    writable: tuple[Annotated[Path, AfterValidator(_absolute)], ...] = ()
+    """More that they may write into, devices such as /dev/video0 among them."""
+    groups: tuple[Annotated[int, Field(ge=1, lt=1 << 31)], ...] = ()
+    """Numbers of groups that services are in, where each has a user of its own: those that own such files."""
+    confined: bool = True
+    """Held as far as this machine can (``isolation`` of the site says with what); false: they are the orchestrator's
+    user and may do all that it may."""
     log_bytes: Annotated[int, Field(ge=1024)] = 4 << 20
     """Above this a log is cut to its newer half. Looked at once a second: a flood goes over it until then."""
     data_mb: Annotated[int, Field(ge=1)] = 20_480
@@ -101,6 +119,9 @@ class _Run:
     """Of the instance; all that is looked at again and again is named by text, for paths are slow to put together."""
     data: str = ""
     """Folder for what the service produces."""
+    ready_file: str = ""
+    user: int | None = None
+    """Whose process it is, where it has one of its own."""
     child: subprocess.Popen[bytes] | None = None
     """None for one that an earlier orchestrator started."""
     asked_to_end: bool = False
@@ -136,6 +157,16 @@ class ProcessRuntime(Runtime):
         if not sys.platform.startswith("linux"):
             raise RuntimeFailure("the process runtime needs Linux: use a container site")
         self._options = options
+        self._machine = this_machine() if self._options.confined else None
+        self._readable = readable((*self._options.readable, *map(Path, self._options.python_path)), folder)
+        for path in (folder, self._options.folder) if self._machine else ():
+            if path and (by := opened(path, (*self._readable, *map(str, self._options.writable)))):
+                raise RuntimeFailure(
+                    f"services may reach {by}, which holds {path}: keep the orchestrator's state elsewhere"
+                )
+        if lacks := self._machine.lacks() if self._machine else "":
+            log.warning("site %s: %s", site, lacks)
+        log.info("site %s: instances are held by: %s", site, ", ".join(self.isolation()) or "nothing")
         if self._options.folder is not None:
             folder = self._options.folder / (self._options.owner or "")
         self._folder = folder / "instances"
@@ -159,10 +190,15 @@ class ProcessRuntime(Runtime):
                 process = ProcessId(*noted["process"])
             else:
                 # The orchestrator was killed between launch and note: the process is known by its grant.
-                process = find_by_environment(GRANT_VARIABLE, str(folder / "grant.json"))
+                process = find_by_environment(GRANT_VARIABLE, str(folder / _OWN / "grant.json"))
                 if process is not None:
                     _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-        return _Run(int(noted.get("attempt", 0)), process, str(folder), data=str(noted.get("data", "")))
+        ready, user = str(noted.get("ready", folder / "ready.json")), noted.get("user")
+        return _Run(int(noted.get("attempt", 0)), process, str(folder), str(noted.get("data", "")), ready, user)
+
+    @override
+    def isolation(self) -> tuple[str, ...]:
+        return self._machine.holds() if self._machine else ()
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return None if spec.entrypoint else "the service has no entrypoint, only an image: it needs a container site"
@@ -192,46 +228,68 @@ class ProcessRuntime(Runtime):
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
-            port = _port(folder / "ready.json") or _port(folder / "run.json")
-            self._prepare(launch, folder, data, port)
-            note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port}
+            noted = _read_json(folder / "run.json")
+            port = _port(Path(noted.get("ready", ""))) or _port(folder / "run.json")
+            user = self._user_for(noted)
+            ready = self._prepare(launch, folder, data, port, user)
+            note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port, "ready": ready}
+            note["user"] = user
             _write_private(folder / "run.json", json.dumps(note))
-            child = self._spawn(launch.spec, folder, data)
+            child = self._spawn(launch.spec, folder, data, user)
             process = ProcessId(child.pid, _start_time(child.pid))
             _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
-        self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), child)
+        self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), ready, user, child)
 
-    def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None) -> None:
-        ready = folder / "ready.json"
+    def _user_for(self, noted: Mapping[str, Any]) -> int | None:
+        """An instance's own, the same in all its runs, so that it can go on with its data; None: there are none."""
+        if not (self._machine and self._machine.user):
+            return None
+        known = noted.get("user")
+        return known if type(known) is int else free_user({run.user for run in self._runs.values() if run.user})
+
+    def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None, user: int | None) -> str:
+        """Make the run's own folder, with the grant in it; returns the path of the ready file."""
+        own = folder / _OWN
+        shutil.rmtree(own, ignore_errors=True)
+        own.mkdir(mode=0o700)
+        ready = str(own / "ready.json")
         grant = launch.grant.model_copy(
             update={
                 "bind_host": self._options.bind_host,
                 "bind_port": _free_or_zero(self._options.bind_host, port),
-                "ready_file": str(ready),
+                "ready_file": ready,
                 "data_dir": str(data),
             }
         )
-        ready.unlink(missing_ok=True)
-        _write_private(folder / "grant.json", grant.model_dump_json())
+        _write_private(own / "grant.json", grant.model_dump_json())
+        if user is not None:
+            for path in (own / "grant.json", own, data):  # the folder last: until then nobody else can reach into it
+                os.chown(path, user, user, follow_symlinks=False)
+        return ready
 
-    def _spawn(self, spec: ServiceSpec, folder: Path, data: Path) -> subprocess.Popen[bytes]:
+    def _spawn(self, spec: ServiceSpec, folder: Path, data: Path, user: int | None) -> subprocess.Popen[bytes]:
+        own = str(folder / _OWN)
         environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
-        environment |= {"PYTHONUNBUFFERED": "1", **self._options.environment}
+        environment |= {"PYTHONUNBUFFERED": "1", "HOME": own, "TMPDIR": own, **self._options.environment}
         if self._options.python_path:
             environment["PYTHONPATH"] = os.pathsep.join(self._options.python_path)
-        environment[GRANT_VARIABLE] = str(folder / "grant.json")
-        with open(os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab") as log:
-            # -P: what a service writes into its data folder must not be importable.
-            command = [sys.executable, "-P", "-m", str(spec.entrypoint)]
+        environment[GRANT_VARIABLE] = f"{own}/grant.json"
+        # -P: what a service writes into its data folder must not be importable.
+        command = [sys.executable, "-P", "-m", str(spec.entrypoint)]
+        if self._machine:
+            read = [*self._readable, spec.launch] if spec.launch and spec.launch.startswith("/") else self._readable
+            write = [*map(str, self._options.writable), own, str(data)]
+            command = confined(command, self._machine, read, write, user, self._options.groups)
+        with open(os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab") as output:
             return subprocess.Popen(
                 command,
                 env=environment,
                 cwd=data,
                 stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
+                stdout=output,
+                stderr=output,
                 start_new_session=True,
             )
 
@@ -260,7 +318,7 @@ class ProcessRuntime(Runtime):
             if run.child and status is None:
                 return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
             return Observation(
-                run.attempt, Phase.EXITED, exit_status=status, last_line=_last_line(Path(run.folder, "log"))
+                run.attempt, Phase.EXITED, exit_status=status, last_line=last_line(Path(run.folder, "log"))
             )
         port = _ready_port(run)
         phase = Phase.RUNNING if port else Phase.STARTING
@@ -292,20 +350,20 @@ class ProcessRuntime(Runtime):
             os.removedirs(run.data)
 
     def logs(self, instance: str, lines: int) -> str:
-        with contextlib.suppress(FileNotFoundError), self._log(instance).open("rb") as log:
-            log.seek(max(0, os.fstat(log.fileno()).st_size - self._options.log_bytes))
-            return b"".join(deque(log, maxlen=lines)).decode(errors="replace")
+        with contextlib.suppress(FileNotFoundError), self._log(instance).open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - self._options.log_bytes))
+            return b"".join(deque(file, maxlen=lines)).decode(errors="replace")
         return ""
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
-        log, run = self._log(instance), self._runs.get(instance)
+        path, run = self._log(instance), self._runs.get(instance)
 
         def ended() -> bool:
             # Of what another orchestrator began this one may know an older run only.
-            return (run is not None and run.child is not None and run.ended is not None) or not log.exists()
+            return (run is not None and run.child is not None and run.ended is not None) or not path.exists()
 
-        return None if ended() else FileLog(log, lines, ended)
+        return None if ended() else FileLog(path, lines, ended)
 
     def _log(self, instance: str) -> Path:
         """Of a run that another orchestrator of this machine may have begun, which this one does not know."""
@@ -331,6 +389,8 @@ class ProcessRuntime(Runtime):
         full = {robot: self._full(robot) for robot in {Path(run.data).parents[1].name for run in running}}
         for run in running:
             run.exceeds = full[Path(run.data).parents[1].name]
+            if (size_of(f"{run.folder}/{_OWN}", _OWN_MB << 20) or 0) > _OWN_MB << 20:
+                run.exceeds = f"has more than {_OWN_MB} MiB in its temporary folder"
             if run.exceeds:
                 run.seen = self._look(run)
 
@@ -339,53 +399,10 @@ class ProcessRuntime(Runtime):
             self._weigh()
             self._weighed_at = time.monotonic()
         for run in self._runs.values():
-            log = f"{run.folder}/log"
+            path = f"{run.folder}/log"
             with contextlib.suppress(FileNotFoundError):
-                if os.stat(log).st_size > self._options.log_bytes:
-                    _keep_newer_half(Path(log), self._options.log_bytes // 2)
-
-
-class FileLog(LogStream):
-    """Follows a log file; one that was cut is read on from where it is then."""
-
-    def __init__(self, path: Path, lines: int, ended: Callable[[], bool], poll: float = 0.1) -> None:
-        """``lines``: to begin with; ``ended``: whether no more will come; ``poll``: seconds between two looks."""
-        self._path = path
-        self._ended = ended
-        self._poll = poll
-        with path.open("rb") as file:
-            self._before = b"".join(deque(file, maxlen=lines)).decode(errors="replace")
-            self._at = file.tell()
-        self._closed = threading.Event()
-
-    def read(self) -> str | None:
-        if self._before:
-            text, self._before = self._before, ""
-            return text
-        deadline = time.monotonic() + 1
-        while not self._closed.is_set():
-            ended = self._ended()  # before the look: what is written until then is read
-            new = self._new()
-            if new:
-                return new
-            if ended:
-                return None
-            if time.monotonic() >= deadline:
-                return ""
-            self._closed.wait(self._poll)
-        return None
-
-    def _new(self) -> str:
-        with contextlib.suppress(FileNotFoundError), self._path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            file.seek(min(self._at, size))
-            content = file.read()
-            self._at = file.tell()
-            return content.decode(errors="replace")
-        return ""
-
-    def close(self) -> None:
-        self._closed.set()
+                if os.stat(path).st_size > self._options.log_bytes:
+                    keep_newer_half(Path(path), self._options.log_bytes // 2)
 
 
 _left_running: list[subprocess.Popen[bytes]] = []
@@ -401,10 +418,10 @@ def _all_children_run() -> bool:
 
 
 def _kill_all(run: _Run) -> None:
-    """End a run and everything in its session."""
+    """End a run and everything in its session, or of its own user: it may have left the session."""
     if run.process is None:
         return
-    for pid in session_members(run.process):
+    for pid in {*session_members(run.process), *processes_of(run.user)}:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
@@ -412,28 +429,6 @@ def _kill_all(run: _Run) -> None:
 def _start_time(pid: int) -> int:
     stat = ProcessStat.read(pid)
     return stat.start_time if stat else 0
-
-
-def _keep_newer_half(log: Path, keep: int) -> None:
-    """Cut in place: the service has the file open for appending. What it writes in this very moment may be lost."""
-    with log.open("rb+") as file:
-        file.seek(-keep, os.SEEK_END)
-        file.readline()
-        newer = file.read()
-        file.truncate(0)
-    with log.open("ab") as file:
-        file.write(newer)
-
-
-def _last_line(log: Path) -> str:
-    with contextlib.suppress(FileNotFoundError), log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - 8192))
-        lines = file.read().decode(errors="replace").split("\n")
-        for line in reversed(lines):
-            readable = "".join(c for c in line if c.isprintable()).strip()
-            if readable:
-                return readable[:_LAST_LINE]
-    return ""
 
 
 def _free_or_zero(host: str, port: int | None) -> int:
@@ -451,9 +446,9 @@ def _free_or_zero(host: str, port: int | None) -> int:
 
 def _ready_port(run: _Run) -> int | None:
     """Where a run listens; its ready file is read again where it was written again."""
-    path = f"{run.folder}/ready.json"
+    path = run.ready_file
     try:
-        stat = os.stat(path)
+        stat = os.stat(path, follow_symlinks=False)
     except OSError:
         return None
     written = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
@@ -472,7 +467,8 @@ def _port(path: Path) -> int | None:
 def _read_json(path: Path) -> dict[str, Any]:
     """Empty if it is not there, or not (yet) such a document."""
     try:
-        with path.open("rb") as file:
+        # The service may have put a link or a pipe there: neither is followed, and neither holds up whoever reads.
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
             document = json.loads(file.read(_NOTE_BYTES))
     except (OSError, ValueError, RecursionError):
         return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +82,16 @@ def session_members(leader: ProcessId) -> list[int]:
         return []
     members = (ProcessStat.read(pid) for pid in _pids() if _session(pid) == leader.pid)
     return [stat.pid for stat in members if stat and not stat.zombie]
+
+
+def processes_of(user: int | None) -> list[int]:
+    """Processes of a user that is one instance's own; None: nobody's."""
+    found = []
+    for pid in _pids() if user else []:
+        with contextlib.suppress(OSError):
+            if os.stat(_PROC / str(pid)).st_uid == user:
+                found.append(pid)
+    return found
 
 
 def find_by_environment(variable: str, value: str) -> ProcessId | None:

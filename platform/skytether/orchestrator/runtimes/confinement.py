@@ -1,0 +1,159 @@
+"""How an instance of a process site is held: what it may reach, and what this machine has to hold it with.
+
+Each may read the system's programs and libraries, Python with what the orchestrator imports, and what the options of
+its site add; it may write into its two folders alone. Landlock says so where the kernel has it; where the orchestrator
+is root, each instance is another user besides, and folders with secrets in them are covered. ``confine`` does it.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import pwd
+import secrets
+import stat
+import subprocess
+import sys
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import confine
+
+_READ = (
+    *("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/opt/ros", "/proc", "/sys"),
+    *("/etc/alternatives", "/etc/fonts", "/etc/gai.conf", "/etc/group", "/etc/host.conf", "/etc/hosts"),
+    *("/etc/ld.so.cache", "/etc/ld.so.conf", "/etc/ld.so.conf.d", "/etc/localtime", "/etc/mime.types"),
+    *("/etc/nsswitch.conf", "/etc/os-release", "/etc/passwd", "/etc/protocols", "/etc/python3", "/etc/resolv.conf"),
+    *("/etc/ros", "/etc/services", "/etc/ssl/certs", "/etc/ssl/openssl.cnf", "/etc/timezone"),
+)
+"""Not all of /etc, which holds other programs' secrets, nor /var and /home."""
+_WRITE = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+_COVER = ("/tmp", "/var/tmp", "/dev/shm", "/run")  # noqa: S108
+"""Where other programs leave files and sockets for everybody; the engine's socket is in /run."""
+_USERS = (61_184, 65_519)
+"""Numbers of users without a name, as systemd takes them for its dynamic users (systemd.exec(5))."""
+_PROBE_S = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What there is to hold an instance with."""
+
+    landlock: int
+    """Its version; 0: there is none."""
+    seccomp: bool
+    user: bool
+    """Each instance can be another user, with mounts of its own."""
+    why: str = ""
+    """Why it cannot."""
+
+    def holds(self) -> tuple[str, ...]:
+        """In words for people."""
+        landlock = f"Landlock {self.landlock}"
+        found = ("own user", self.user), ("own mounts", self.user), (landlock, self.landlock), ("seccomp", self.seccomp)
+        return tuple(name for name, there in found if there)
+
+    def lacks(self) -> str:
+        """What a file of the orchestrator is not protected from, and why; empty: nothing."""
+        if not self.landlock and not self.user:
+            return "instances can read all of the orchestrator's secrets: the kernel has no Landlock" + (
+                f", and there are no users of their own ({self.why})" if self.why else ""
+            )
+        return ""
+
+
+@functools.cache
+def this_machine() -> Machine:
+    """Tried once, by a process that ends."""
+    command = [sys.executable, "-I", "-S", confine.__file__, '{"probe": true}']
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_S, check=True)
+        has = json.loads(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        return Machine(0, seccomp=False, user=False, why=str(error))
+    return Machine(has["landlock"], has["seccomp"], has["user"], has.get("why", ""))
+
+
+def readable(more: Collection[Path], secret: Path) -> list[str]:
+    """What every instance of a site may read: the system's, Python's, what Python imports, what the site adds.
+
+    A folder that Python imports from only because the orchestrator was started in it is left out where it holds
+    ``secret``.
+    """
+    python = [sys.prefix, sys.base_prefix, os.path.realpath(sys.executable)]
+    imported = [path for path in sys.path if os.path.isabs(path) and not opened(secret, [path])]
+    return sorted({*_READ, *python, *imported, *map(str, more)})
+
+
+def opened(secret: Path, read: Sequence[str]) -> str | None:
+    """Which of these paths holds a folder with secrets; None: none."""
+    real = secret.resolve()
+    return next((path for path in read if real.is_relative_to(Path(path).resolve())), None)
+
+
+def covers(paths: Sequence[str]) -> list[str]:
+    """Folders to cover: those of other programs, and the outermost above each path that others may not pass through."""
+    found = [folder for folder in _COVER if os.path.isdir(folder) and not os.path.islink(folder)]
+    for path in paths:
+        if any(os.path.realpath(path).startswith(f"{folder}/") for folder in found):
+            continue
+        for folder in reversed(Path(os.path.realpath(path)).parents):
+            try:
+                passable = folder.stat().st_mode & stat.S_IXOTH
+            except OSError:
+                break
+            if not passable and folder != Path("/"):
+                found.append(str(folder))
+                break
+    return found
+
+
+def free_user(taken: Collection[int]) -> int:
+    """The number of a user that nobody is."""
+    first, last = _USERS
+    while True:
+        number = first + secrets.randbelow(last - first + 1)
+        if number in taken:
+            continue
+        try:
+            pwd.getpwuid(number)
+        except KeyError:
+            return number
+
+
+def confined(
+    command: Sequence[str],
+    machine: Machine,
+    read: Sequence[str],
+    write: Sequence[str],
+    user: int | None,
+    groups: Sequence[int],
+) -> list[str]:
+    """The command that gives up rights, then becomes this one.
+
+    Args:
+        command: With the absolute path of the program.
+        machine: What it has.
+        read: May be read, and run.
+        write: May be written, too; the last one is where it starts.
+        user: Who it becomes; None: nobody else.
+        groups: Of that user, by number.
+    """
+    asked = {
+        "command": list(command),
+        "read": list(read),
+        "write": [*_WRITE, *write],
+        "folder": write[-1],
+        "cover": covers([*read, *write]) if user is not None else [],
+        "user": user,
+        "groups": list(groups),
+        "landlock": bool(machine.landlock),
+        "connect": None,
+        "seccomp": machine.seccomp,
+        # Without mounts of its own, every socket in the file system that the orchestrator's user may use is in its
+        # reach, that of a Docker engine among them; Landlock does not mind those.
+        "families": ["inet", "inet6", "netlink", *(["unix"] if user is not None else [])],
+    }
+    return [sys.executable, "-I", "-S", confine.__file__, json.dumps(asked)]

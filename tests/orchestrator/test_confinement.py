@@ -1,0 +1,182 @@
+"""What an instance of a process site can reach: not the orchestrator's secrets, not the others."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec
+from skytether.orchestrator.runtimes import confinement, process
+from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.confinement import Machine, covers, free_user, opened, readable, this_machine
+from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
+
+INTRUDER = """
+import ctypes, json, os, socket, sys
+grant = json.load(open(os.environ["SKYTETHER_GRANT"]))
+state, parent = grant["params"]["say"], int(grant["params"]["parent"])
+tries = {
+    "operator.token": lambda: open(f"{state}/operator.token").read(),
+    "state listed": lambda: find(state, "operator.token"),
+    "instances listed": lambda: find(f"{state}/instances", "other"),
+    "own note": lambda: open(f"{state}/instances/i1/run.json").read(),
+    "other's grant": lambda: open(f"{state}/instances/other/own/grant.json").read(),
+    "other's data": lambda: open(f"{state}/data/robot/toy/other/kept").read(),
+    "shadow": lambda: open("/etc/shadow").read(),
+    "environment": lambda: open(f"/proc/{parent}/environ").read(),
+    "memory": lambda: open(f"/proc/{parent}/mem", "rb"),
+    "its root": lambda: os.listdir(f"/proc/{parent}/root/{state}"),
+    "signal": lambda: os.kill(parent, 0),
+    "socket": lambda: socket.socket(socket.AF_UNIX).connect(f"{state}/engine.sock"),
+    "code": lambda: open(sys.argv[0] + ".new", "w"),
+    "programs": lambda: open("/usr/local/bin/skytether-intruder", "w"),
+    "devices": lambda: os.mknod(f"{state}/data/walker/toy/i1/disk", 0o060600, os.makedev(254, 0)),
+    "root": lambda: os.setuid(0) if os.getuid() else os.chown(state, 1, 1),
+    "mounts": lambda: call("unshare", 0x00020000),
+    "users": lambda: call("unshare", 0x10000000),
+    "own data": lambda: open(f"{grant['data_dir']}/recording", "w"),
+    "own folder": lambda: open(grant["ready_file"] + ".draft", "w"),
+    "temporary": lambda: __import__("tempfile").TemporaryFile(),
+    "child": lambda: __import__("subprocess").run(["/bin/true"], check=True),
+}
+def find(folder, name):
+    if name not in os.listdir(folder):
+        raise OSError("there is another folder over it")
+def call(name, argument):
+    if getattr(ctypes.CDLL(None), name)(argument):
+        raise OSError(name)
+for name, attempt in tries.items():
+    try:
+        attempt()
+        print("did", name)
+    except OSError as error:
+        print("refused", name, error)
+"""
+ALLOWED = ["own data", "own folder", "temporary", "child"]
+
+
+def launch(attempt: int = 1, entrypoint: str = "skytether.testing.toy_service", **params: Any) -> Launch:
+    key = base64.b64encode(bytes(32)).decode()
+    topics: dict[str, Any] = {"session_id": "00112233445566aa", "session_key": key, "topics": ()}
+    grant = Grant(instance="i1", service="toy", robot="walker", params=params, **topics)
+    return Launch(attempt, ServiceSpec(entrypoint=entrypoint), grant)
+
+
+def until(runtime: ProcessRuntime, phase: Phase) -> Observation:
+    deadline = time.monotonic() + 60
+    while (seen := runtime.observe()["i1"]).phase is not phase:
+        assert time.monotonic() < deadline, seen
+        time.sleep(0.01)
+    return seen
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Iterator[Path]:
+    """A state folder with secrets, an instance of somebody else, and an engine's socket."""
+    folder = tmp_path / "state"
+    folder.mkdir(mode=0o700)
+    for path in ("operator.token", "instances/other/own/grant.json", "data/robot/toy/other/kept"):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text("secret")
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code/intruder.py").write_text(INTRUDER)
+    with socket.socket(socket.AF_UNIX) as engine, contextlib.chdir(folder):  # for a path that is short enough
+        engine.bind("engine.sock")
+        engine.listen()
+        yield folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("own_user", [True, False])
+def test_an_instance_reaches_its_own_folders_and_nothing_of_the_orchestrator(
+    state: Path, own_user: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = this_machine()
+    if not machine.landlock or not machine.seccomp:
+        pytest.skip("the kernel has no Landlock or no seccomp")
+    if own_user and not machine.user:
+        pytest.skip(f"no users of their own: {machine.why or 'not root'}")
+    monkeypatch.setattr(process, "this_machine", lambda: replace(machine, user=own_user))
+    runtime = ProcessRuntime("lab", state, ProcessOptions(python_path=(str(state.parent / "code"),)))
+    assert runtime.isolation()[-2:] == (f"Landlock {machine.landlock}", "seccomp")
+    runtime.start(launch(entrypoint="intruder", say=str(state), parent=os.getpid()))
+    seen = until(runtime, Phase.EXITED)
+    log = runtime.logs("i1", 100)
+    runtime.remove("i1")
+    assert seen.exit_status == 0, log
+    assert [line.removeprefix("did ") for line in log.splitlines() if line.startswith("did ")] == ALLOWED
+    assert log.count("refused ") == INTRUDER.count("lambda") - len(ALLOWED), log
+
+
+@pytest.mark.slow
+def test_two_instances_are_two_users_and_one_keeps_its_own(tmp_path: Path) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    runtime = ProcessRuntime("lab", tmp_path, ProcessOptions())
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    owner = (tmp_path / "data/walker/toy/i1").stat().st_uid
+    assert confinement._USERS[0] <= owner <= confinement._USERS[1]
+    assert (tmp_path / "instances/i1").stat().st_uid == 0  # what it cannot write, it cannot make a trap of
+    runtime.start(launch(attempt=2))
+    until(runtime, Phase.RUNNING)
+    assert (tmp_path / "data/walker/toy/i1").stat().st_uid == owner
+    runtime.remove("i1")
+
+
+def test_a_folder_that_holds_the_state_is_not_for_services(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeFailure, match=rf"services may reach {tmp_path}, which holds {tmp_path}/sites/lab"):
+        ProcessRuntime("lab", tmp_path / "sites/lab", ProcessOptions(readable=(tmp_path,)))
+    with pytest.raises(RuntimeFailure, match="services may reach"):
+        ProcessRuntime("lab", tmp_path / "sites/lab", ProcessOptions(writable=(tmp_path,)))
+
+
+def test_where_the_orchestrator_was_started_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert str(tmp_path) in readable([], Path("/var/lib/skytether"))
+    assert str(tmp_path) not in readable([], tmp_path / "state")
+    assert opened(tmp_path / "state", ["/usr", str(tmp_path)]) == str(tmp_path)
+    assert opened(tmp_path / "state", ["/usr"]) is None
+
+
+def test_the_outermost_folder_that_others_may_not_pass_is_covered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(confinement, "_COVER", ("/run",))
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as root:  # above pytest's own is one that others may not pass
+        for path, mode in (("", 0o755), ("a", 0o755), ("a/b", 0o700), ("a/b/c", 0o700), ("d", 0o755)):
+            os.makedirs(f"{root}/{path}", exist_ok=True)
+            os.chmod(f"{root}/{path}", mode)
+        assert covers([f"{root}/a/b/c/e", f"{root}/a/b/c", f"{root}/d", "/run/x"]) == ["/run", f"{root}/a/b"]
+
+
+def test_a_user_that_has_a_name_or_an_instance_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(confinement, "_USERS", (61_184, 61_186))
+    assert free_user({61_184, 61_186}) == 61_185
+
+
+def test_what_a_machine_lacks_is_said() -> None:
+    assert Machine(0, seccomp=True, user=False, why="not permitted").lacks() == (
+        "instances can read all of the orchestrator's secrets: the kernel has no Landlock, and there are no users of "
+        "their own (not permitted)"
+    )
+    assert Machine(7, seccomp=True, user=False).lacks() == ""
+    assert Machine(2, seccomp=False, user=True).holds() == ("own user", "own mounts", "Landlock 2")
+
+
+def test_a_link_or_a_pipe_for_a_ready_file_is_none_and_holds_nobody_up(tmp_path: Path) -> None:
+    (tmp_path / "real").write_text('{"port": 4000}')
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    os.mkfifo(tmp_path / "pipe")
+    assert process._port(tmp_path / "real") == 4000
+    assert process._port(tmp_path / "link") is None
+    assert process._port(tmp_path / "pipe") is None
