@@ -412,6 +412,8 @@ def test_the_ssh_client_asks_nobody() -> None:
     command = Tunnel(given).command(Path("/tmp/x/engine.sock"))
     assert command[-4:] == ["-L", "/tmp/x/engine.sock:/run/docker.sock", "me@edge", "cat"]
     assert "BatchMode=yes" in command
+    assert {"StrictHostKeyChecking=yes", "VerifyHostKeyDNS=no", "NoHostAuthenticationForLocalhost=no"} <= set(command)
+    assert {"UserKnownHostsFile=/k", "GlobalKnownHostsFile=/dev/null"} <= set(command)
     assert command[command.index("-p") + 1] == "2222"
     assert Tunnel(options(engine="ssh://edge")).command(Path("s"))[-3] == "s:/var/run/docker.sock"
 

@@ -240,3 +240,33 @@ def test_no_scope_makes_a_site_that_runs_as_the_orchestrator(served: Any, option
     assert [site.name for site in served.operator.sites()] == []
     served.client(every).create_site(SiteCreate(name="fake", tier="edge", runtime="fake"))
     served.operator.create_site(SiteCreate(name="here", tier="edge", runtime="process"))
+
+
+@pytest.mark.parametrize("option", [{"devices": ["/dev/sda"]}, {"groups": [6]}, {"guard_image": "evil:1"}])
+def test_no_scope_gives_a_site_of_containers_what_opens_the_machine(served: Any, option: dict[str, Any]) -> None:
+    every = served.operator.create_token(TokenCreate(name="every", scopes=SCOPES)).token
+    asked = SiteCreate(name="edge", tier="edge", runtime="docker", options=option)
+    with pytest.raises(ApiError, match=rf"{next(iter(option))} may open up the whole machine.*operator\.token"):
+        served.client(every).create_site(asked)
+    assert served.operator.sites() == []
+
+
+def test_scope_catalog_has_only_run_what_the_operator_allows(served_with: Any, manifest: Any) -> None:
+    served = served_with(catalog={"modules": ["ours.walk"], "images": ["registry.example/*"]})
+    token = served.operator.create_token(TokenCreate(name="cook", scopes=("catalog", "read"))).token
+    cook = served.client(token)
+    for spec, wrong in (
+        ({"entrypoint": "http.server"}, "may not have the module 'http.server'"),
+        ({"entrypoint": "ours.walk.more"}, "may not have the module"),
+        ({"graph": "ros1", "launch": "/tmp/any.launch"}, "may not have the module 'skytether.service.ros1'"),
+        ({"entrypoint": None, "image": "evil:1"}, "may not have the image 'evil:1'"),
+    ):
+        document = manifest("mine", **spec)
+        if "graph" in spec:
+            del document["spec"]["entrypoint"]
+        with pytest.raises(ApiError, match=wrong):
+            cook.put_service("mine", document)
+        served.operator.put_service("mine", document)
+        served.operator.delete_service("mine")
+    cook.put_service("mine", manifest("mine", entrypoint="ours.walk", image="registry.example/walk:1"))
+    cook.put_service("mine", manifest("mine", entrypoint="skytether_services.virtual_trail"))

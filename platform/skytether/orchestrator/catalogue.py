@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from skytether.api.manifest import Manifest
 from skytether.api.rest import Change
 from skytether.api.yaml import YamlError, read_yaml
 
-from .errors import ConflictError, Fault, InvalidError, NotFoundError
+from .errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
+from .settings import Catalog as Allowed
 from .store import Store
 from .validation import check_schema, parse
 
@@ -104,8 +106,10 @@ def _manifest_path(point: EntryPoint) -> Path:
 class Catalogue:
     """All services by name."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, allowed: Allowed | None = None) -> None:
+        """``allowed``: what others than the operator of the state folder may have run."""
         self._store = store
+        self._allowed = allowed or Allowed()
         self._fixed: dict[str, Manifest] = {}
         self._broken: Mapping[str, str] = {}
         self._parsed: dict[str, tuple[dict[str, Any], Manifest]] = {}
@@ -150,16 +154,25 @@ class Catalogue:
             raise NotFoundError(f"service '{name}' is installed but cannot be used: {self._broken[name]}")
         raise NotFoundError(f"there is no service '{name}'; {known((m.metadata.name for m in self.all()), name)}")
 
-    def put(self, name: str, manifest: Manifest, *, dry_run: bool = False) -> Change:
+    def put(self, name: str, manifest: Manifest, *, dry_run: bool = False, by_owner: bool = True) -> Change:
         """Add a service or change it for instances to come; with ``dry_run`` only say what that would do.
 
+        Args:
+            name: The service's.
+            manifest: What it is to be.
+            dry_run: Store nothing.
+            by_owner: By the operator of the state folder, who may have anything run.
+
         Raises:
+            ForbiddenError: Somebody else names a module or an image that is not allowed.
             InvalidError: Its name is another one, or its parameters' schema is none.
         """
         if manifest.metadata.name != name:
             raise InvalidError(
                 [Fault("metadata.name", f"is '{manifest.metadata.name}', but the address says '{name}'")]
             )
+        if not by_owner:
+            self._check_allowed(manifest)
         check_schema(manifest.spec.params, "spec.params")
         document = manifest.model_dump(mode="json", by_alias=True)
         stored, fixed = self._store.services().get(name), self._fixed.get(name)
@@ -168,6 +181,20 @@ class Catalogue:
         if not dry_run:
             self._store.put_service(name, document)
         return Change.CREATED if stored is None and fixed is None else Change.CHANGED
+
+    def _check_allowed(self, manifest: Manifest) -> None:
+        module, image = manifest.spec.entrypoint, manifest.spec.image
+        known_modules = {known.spec.entrypoint for known in self._fixed.values()} | set(self._allowed.modules)
+        if module is not None and module not in known_modules:
+            raise ForbiddenError(
+                f"this token may not have the module '{module}' run: name one of an installed service, add it to the "
+                "orchestrator's catalog.modules, or use the token in its state folder"
+            )
+        if image is not None and not any(fnmatchcase(image, pattern) for pattern in self._allowed.images):
+            raise ForbiddenError(
+                f"this token may not have the image '{image}' run: the orchestrator's catalog.images are "
+                f"{', '.join(self._allowed.images) or '(none)'}"
+            )
 
     def delete(self, name: str) -> None:
         """Remove a service that was put; what runs of it runs on. One that is gone already is no error.

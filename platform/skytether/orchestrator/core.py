@@ -89,7 +89,7 @@ class Orchestrator:
             self.quotas,
         )
         self.leadership = Leadership(self.store.lock(), self._elected)
-        self.catalogue = Catalogue(self.store)
+        self.catalogue = Catalogue(self.store, settings.catalog)
         self.strain = Strain()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)

@@ -150,6 +150,16 @@ class Quotas(Group):
     """Instances at one site; more wait for another one, or for room."""
 
 
+class Catalog(Group):
+    """What a token with the scope `catalog` may have run; the one in the state folder may name anything."""
+
+    modules: tuple[str, ...] = ()
+    """Python modules beside those of installed services and of `catalogue_dir`. At a site of processes they run on the
+    orchestrator's machine; `skytether.service.ros1` starts whatever a launch file says."""
+    images: tuple[str, ...] = ("*",)
+    """Patterns of images, such as `registry.example/*`; each site may narrow them (its `images`)."""
+
+
 class Tls(Group):
     """HTTPS without a proxy in front: both files, or none."""
 
@@ -254,6 +264,8 @@ class Settings(Group):
     """Bounds of what is kept and taken."""
     quotas: Quotas = Quotas()
     """How much one robot, service or site may have."""
+    catalog: Catalog = Catalog()
+    """What scope `catalog` may name."""
     weights: Weights = Weights()
     """What placement weighs."""
 

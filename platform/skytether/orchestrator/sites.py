@@ -239,6 +239,12 @@ class Sites:
                     f"instances at a site of the runtime '{asked.runtime}' are processes of the orchestrator's own "
                     "user: only the token in its state folder (operator.token) may make one"
                 )
+            given = sorted(kind.owner_options & asked.options.keys())
+            if given and not by_owner:
+                raise ForbiddenError(
+                    f"the options {', '.join(given)} may open up the whole machine of the site: only the token in the "
+                    "orchestrator's state folder (operator.token) may give them"
+                )
             asked = asked.model_copy(update={"options": kind.completed(asked.options)})
             self._must_be_unique(asked, kind.unique)
             runtime = self._make_runtime(asked)

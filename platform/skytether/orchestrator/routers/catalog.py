@@ -27,13 +27,13 @@ def get_service(core: Core, caller: Caller, service: str) -> Manifest:
 
 @router.put("/{service}", responses={201: {"model": Manifest, "description": "It is new"}, **says(403, 422)})
 def put_service(
-    core: Core, _: CatalogOperator, service: str, manifest: Manifest, response: Response, dry_run: bool = False
+    core: Core, caller: CatalogOperator, service: str, manifest: Manifest, response: Response, dry_run: bool = False
 ) -> Manifest:
     """Add a service, or change it for instances to come; the header Skytether-Change says which, or `unchanged`.
 
     With `dry_run` it is only looked at: the answer is the same, but the status is never 201.
     """
-    change = core.catalogue.put(service, manifest, dry_run=dry_run)
+    change = core.catalogue.put(service, manifest, dry_run=dry_run, by_owner=caller.owns_state)
     response.headers[CHANGE] = change
     if change is Change.CREATED and not dry_run:
         response.status_code = 201

@@ -125,6 +125,9 @@ class Runtime(ABC):
     """What it starts are processes of the orchestrator's own user, who has all its secrets: whoever chooses what runs
     there, or with which variables, is that user. Such a site is made by the operator of the state folder alone."""
 
+    owner_options: ClassVar[frozenset[str]] = frozenset()
+    """Options with which whoever chooses them has the site's machine; the operator of the state folder alone does."""
+
     @abstractmethod
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
         """Take charge of what is there already, also what an earlier orchestrator started.

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import socket
 import threading
+import time
 from collections.abc import Callable
 from socketserver import ThreadingMixIn
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
+from urllib.parse import urlsplit
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 MAX_REQUEST = 2**20
 """Bytes of a request: the longest is a list of publishers."""
+FROM_MASTER = ("shutdown", "publisherUpdate")
+"""What ends the node, or takes its topics to other publishers: only the machine of the master may, and this one."""
+_RESOLVED_S = 10.0
+"""So long a name's addresses are good: others may make us look it up."""
 _IDLE_S = 30.0
 """A connection that says nothing for so long is closed."""
 
@@ -46,6 +54,27 @@ class NodeApi(Protocol):
         ...
 
 
+class MasterHost:
+    """Whether somebody is on the master's machine. Safe from any thread."""
+
+    def __init__(self, master_uri: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._host = urlsplit(master_uri).hostname or ""
+        self._clock = clock
+        self._addresses: frozenset[str] = frozenset()
+        self._until = 0.0
+
+    def __call__(self, address: str) -> bool:
+        if ipaddress.ip_address(address.partition("%")[0]).is_loopback:
+            return True
+        if self._clock() >= self._until:
+            self._until = self._clock() + _RESOLVED_S
+            try:
+                self._addresses = frozenset(str(found[4][0]) for found in socket.getaddrinfo(self._host, None))
+            except OSError:  # the name server is away: those of before
+                return address in self._addresses
+        return address in self._addresses
+
+
 class _Handler(SimpleXMLRPCRequestHandler):
     rpc_paths = ()  # nodes ask at / or /RPC2
     timeout = _IDLE_S
@@ -59,6 +88,12 @@ class _Handler(SimpleXMLRPCRequestHandler):
             return
         super().do_POST()
 
+    def _dispatch(self, method: str, params: tuple[Any, ...]) -> Any:
+        asker, here, server = self.client_address[0], self.connection.getsockname()[0], cast("_Server", self.server)
+        if method in FROM_MASTER and asker != here and not server.trusts(asker):
+            return -1, f"{method} is taken from the machine of the master only", 0
+        return server._dispatch(method, params)  # noqa: SLF001 (the library's way to put something before it)
+
     def log_request(self, code: int | str = "-", size: int | str = "-") -> None:
         """Nobody reads it."""
 
@@ -69,6 +104,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     daemon_threads = True
     block_on_close = False
+    trusts: Callable[[str], bool]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that broke off, or a request that is none: the asker's matter."""
@@ -81,13 +117,19 @@ class SlaveServer:
         port: Where it listens.
     """
 
-    def __init__(self, api: NodeApi, bind: str) -> None:
+    def __init__(self, api: NodeApi, bind: str, trusts: Callable[[str], bool] | None = None) -> None:
         """Listen.
+
+        Args:
+            api: Answers.
+            bind: Address to listen on.
+            trusts: Whether an address is the master's; found by its name unless given.
 
         Raises:
             OSError: The address is not this machine's.
         """
         self._server = _Server((bind, 0), _Handler, allow_none=True, logRequests=False)
+        self._server.trusts = trusts or MasterHost(api.master_uri)
         self.port: int = self._server.server_address[1]
         for name, function in _methods(api).items():
             self._server.register_function(function, name)

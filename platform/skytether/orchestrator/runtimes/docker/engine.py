@@ -165,6 +165,12 @@ class Tunnel:
         address, ssh = self._options.address, self._options.ssh
         settings = {
             "BatchMode": "yes",  # nobody is there to answer a question
+            # Whatever the user's configuration says: an engine's machine that is not known is nobody's.
+            "StrictHostKeyChecking": "yes",
+            "VerifyHostKeyDNS": "no",
+            "NoHostAuthenticationForLocalhost": "no",
+            "UpdateHostKeys": "no",
+            "ForwardAgent": "no",
             "ConnectTimeout": str(_SSH_TIMEOUT),
             "ExitOnForwardFailure": "yes",
             "ServerAliveInterval": "5",
@@ -172,6 +178,7 @@ class Tunnel:
         }
         if ssh.known_hosts is not None:
             settings["UserKnownHostsFile"] = shlex.quote(ssh.known_hosts)
+            settings["GlobalKnownHostsFile"] = "/dev/null"  # this file says who it is, and no other
         command = ["ssh", "-T"]
         for key, value in settings.items():
             command += ["-o", f"{key}={value}"]

@@ -43,6 +43,7 @@ class DockerRuntime(Runtime):
     Options = DockerOptions
     unique = "owner"
     runs_as_us = False
+    owner_options = frozenset({"devices", "groups", "guard_image"})
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
