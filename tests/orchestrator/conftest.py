@@ -206,7 +206,8 @@ class Server:
 def served_in(folder: Path, server: Server, **settings: Any) -> Iterator[Served]:
     fleet = Fleet()
     (folder / "state.db").write_bytes(migrated())
-    core = Orchestrator(Settings(state_dir=folder, **{"timing": QUICK, **settings}), find_runtime=fleet)
+    ours = {"timing": QUICK, "catalog": {"modules": ["skytether.testing.toy_service"]}, **settings}
+    core = Orchestrator(Settings(state_dir=folder, **ours), find_runtime=fleet)
     core.start()
     core.sites.delete("local")
     server.app = create_app(core)
