@@ -66,9 +66,9 @@ def install(app: FastAPI) -> None:
         return _plain_refs(app.openapi().get("components", {}).get("schemas", {}))
 
     @cache
-    def body_schema(route: object, method: str) -> dict[str, Any]:
+    def body_schema(path: str, method: str) -> dict[str, Any]:
         """JSON schema of the body that a request should have had, from the API's own description."""
-        operation = app.openapi()["paths"].get(getattr(route, "path", ""), {}).get(method.lower(), {})
+        operation = app.openapi()["paths"].get(path, {}).get(method.lower(), {})
         content = operation.get("requestBody", {}).get("content", {}).get("application/json", {})
         return {**_plain_refs(content.get("schema", {})), "$defs": definitions()}
 
@@ -76,7 +76,8 @@ def install(app: FastAPI) -> None:
         if not isinstance(error, RequestValidationError):
             raise error
         # The first to need it waits for the API's description, which takes a while: nobody else does.
-        schema = await asyncio.to_thread(body_schema, request.scope.get("route"), request.method)
+        path = getattr(request.scope.get("route"), "path", "")  # routes cannot be keys of a cache
+        schema = await asyncio.to_thread(body_schema, path, request.method)
         found = [_explain(one, schema) for one in error.errors()]
         detail = "; ".join(str(fault) for fault in found)
         return answer(request, 422, "Invalid input", detail, [_fault(fault) for fault in found])
