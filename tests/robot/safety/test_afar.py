@@ -94,6 +94,34 @@ def test_an_orchestrator_that_is_away_changes_nothing(agent, orchestrator, gate,
     assert gate.stops == []
 
 
+def test_a_stop_that_was_not_kept_is_not_acknowledged_by_the_next_agent_either(agent, orchestrator, gate):
+    orchestrator.order = order()
+    gate.disk = False
+    for started in range(3):
+        afar = agent()
+        afar.step()
+        afar.step()
+        assert len(gate.stops) == 2 * (started + 1)
+    assert orchestrator.acknowledged == []
+    gate.disk = True
+    agent().step()
+    assert orchestrator.acknowledged == [("walker", "a")]
+
+
+def test_that_it_is_kept_is_not_believed_of_a_gate_whose_guard_does_not_answer(agent, orchestrator, gate):
+    """It has heard that last before the stop."""
+    orchestrator.order = order()
+    gate.disk = False
+    gate.status = lambda folder: {"stopped": gate.stopped, "kept": True, "guard": None}
+    afar = agent()
+    for _ in range(3):
+        afar.step()
+    assert orchestrator.acknowledged == []
+    gate.disk = True
+    afar.step()
+    assert orchestrator.acknowledged == [("walker", "a")]
+
+
 def test_an_order_that_comes_again_does_not_stop_again_after_a_reset(agent, orchestrator, gate):
     """Its acknowledgement is lost, a person resets the robot, the agent is restarted: the same order comes again."""
     orchestrator.order = order()

@@ -467,6 +467,25 @@ def test_a_source_that_sends_one_stamp_again_and_again_is_silent():
     assert "sends the same command again" in bench.last.troubles["key_vel:message"]
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_old_commands_that_take_turns_are_silence(count):
+    """Of a stamped source: what a hanging relay sends again and again."""
+    bench = Bench()
+    bench.agent = None
+    for _ in range(30):
+        bench.gate.sense("key_vel", stamped(0.0, bench.now + 1000.0), bench.now)
+        bench.run()
+    old = [stamped(0.4, bench.now + 1000.0 + 0.001 * number) for number in range(count)]
+    for turn in range(150):
+        bench.gate.sense("key_vel", old[turn % count], bench.now)
+        bench.run()
+    assert bench.wheels == 0
+    for _ in range(100):  # its clock was set back, and goes on
+        bench.gate.sense("key_vel", stamped(0.4, bench.now + 1.0), bench.now)
+        bench.run()
+    assert bench.wheels > 0
+
+
 @pytest.mark.parametrize(
     "bad", [twist(float("nan")), twist(0.1, inf), Bool(data=True), joy(1.0), Twist(linear=Vector3(y=0.2))]
 )

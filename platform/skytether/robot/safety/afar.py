@@ -87,10 +87,10 @@ class StopFromAfar:
             order = self._client.stop_order(self._robot)
             if order is None or order.acknowledged_at is not None or order.robot != self._robot:
                 return
-            if order.id not in self._obeyed and not self._obey(order):
-                return
-            if order.id == self._unkept and not self._kept(order):
-                return
+            if order.id not in self._obeyed:
+                if not (self._kept(order) if order.id == self._unkept else self._obey(order)):
+                    return
+                self._remember(order)
             self._client.acknowledge_stop(self._robot, order.id)
         except (ApiError, Unreachable) as error:
             self._notices.say("orders", f"orders to stop cannot be heard of: {error}", self._clock())
@@ -112,23 +112,27 @@ class StopFromAfar:
             return False
         _log.warning("%s", _reason(order))
         self._unkept = order.id if "note" in answer else ""
+        return not self._unkept
+
+    def _remember(self, order: StopOrder) -> None:
+        """Not sooner than it is kept: else the next start of the agent would acknowledge what is kept nowhere."""
+        self._unkept = ""
         self._obeyed = [*self._obeyed, order.id][-_REMEMBERED:]
         self._write()
-        return not self._unkept
 
     def _kept(self, order: StopOrder) -> bool:
         """Whether the stop is on a disk by now, or over: a person has reset the robot. Else it is asked for again."""
         try:
             status = self._status(self._folder)
-            guard = status.get("guard") or status
-            if guard.get("stopped") and not guard.get("kept") and "note" in self._stop(self._folder, _reason(order)):
+            guard = status.get("guard") or {}  # the gate would only say what it heard from the guard last
+            stopped = guard.get("stopped", status.get("stopped"))
+            if stopped and not guard.get("kept") and "note" in self._stop(self._folder, _reason(order)):
                 sentence = "a stop from afar is in effect, but could not be kept: it is not acknowledged yet"
                 self._notices.say("kept", sentence, self._clock())
                 return False
         except GateError as error:
             self._notices.say("gate", f"whether an order to stop was kept is not known: {error}", self._clock())
             return False
-        self._unkept = ""
         return True
 
     def _read(self) -> list[str]:

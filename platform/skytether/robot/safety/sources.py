@@ -22,6 +22,7 @@ from skytether.robot.supervisor import Limits, with_gap
 from . import joystick, latch
 from .joystick import Grip, Joystick, JoystickParams
 from .latch import ButtonParams, Latch
+from .stamps import StampRule, Stamps, date
 
 _STARTED = "the gate was started"
 _RESET = "the reset"
@@ -115,7 +116,7 @@ class _Source:
     wanted: Velocity = STANDSTILL
     heard_at: float = nan
     sequence: int = 0
-    stamp: tuple[int, int] = (0, 0)
+    stamps: Stamps = field(default_factory=Stamps)
 
     def speaks(self, now: float) -> bool:
         """Whether its last command is young enough; NaN and a clock that went back are silence."""
@@ -352,14 +353,20 @@ class Sources:
     def _hear_twist(self, name: str, message: Twist | TwistStamped, now: float) -> tuple[Command | None, str]:
         source = self._sources[name]
         twist, stamp = (message, (0, 0)) if isinstance(message, Twist) else (message.twist, _stamp(message))
-        if any(stamp) and stamp == source.stamp:
-            return None, "sends the same command again, which counts as silence"
-        source = replace(source, sequence=source.sequence + 1, stamp=stamp)
-        self._sources[name] = source
+        if any(stamp):
+            dated = date(StampRule.ORDER, source.stamps, stamp, now, inf)
+            self._sources[name] = source = replace(source, stamps=dated.stamps)
+            if dated.wrong:
+                return None, _WRONG[dated.wrong]
+        self._sources[name] = source = replace(source, sequence=source.sequence + 1)
         linear, angular, unused = twist.linear.x, twist.angular.z, unused_axes(twist)
         return Command(name, linear, angular, 0, source.sequence, now, 0.0, now, unused), ""
 
 
+_WRONG = {
+    "repeated": "sends the same command again, which counts as silence",
+    "older": "sends a command that is older than one before, which counts as silence until they go on for a second",
+}
 _HOLDS_BACK = frozenset({Grip.LOST, Grip.UNSURE})
 
 
