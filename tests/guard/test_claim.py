@@ -67,9 +67,17 @@ def test_one_that_ends_is_waited_for(claim, tmp_path):
     ends.join()
 
 
-def test_what_is_left_of_a_guard_has_the_folder_until_it_ends(claim, tmp_path):
+@pytest.fixture
+def link():
+    """Of a guard, to one that is not its child any more."""
+    made, guard = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with made, guard:
+        yield made
+
+
+def test_what_is_left_of_a_guard_has_the_folder_until_it_ends(claim, link, tmp_path):
     folder = str(tmp_path / "run")
-    gate, writer = Heir(folder), Heir(folder)
+    gate, writer = Heir(folder, link), Heir(folder, link)
     assert not gate.may()
     os.close(claim._lock)  # it died
     assert gate.may()
@@ -81,10 +89,18 @@ def test_what_is_left_of_a_guard_has_the_folder_until_it_ends(claim, tmp_path):
     with pytest.raises(ClaimError):
         Claim(folder, 0.0)
     writer.close()
-    late = Heir(folder)
+    late = Heir(folder, link)
     Claim(folder, 0.0)
     assert not late.may()
 
 
-def test_where_nobody_can_have_a_lock_the_wheels_are_told(tmp_path):
-    assert Heir(str(tmp_path / "none")).may()
+def test_a_guard_that_ends_in_order_leaves_the_wheels_to_its_writer(claim, link, tmp_path, monkeypatch):
+    """It still has the folder, and is still there."""
+    writer = Heir(str(tmp_path / "run"), link)
+    assert not writer.may()
+    monkeypatch.setattr(os, "getppid", os.getpid)
+    assert writer.may()
+
+
+def test_where_nobody_can_have_a_lock_the_wheels_are_told(tmp_path, link):
+    assert Heir(str(tmp_path / "none"), link).may()

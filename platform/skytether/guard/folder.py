@@ -47,8 +47,18 @@ def trusted(folder: str) -> tuple[int, ...]:
 
 def peer(link: socket.socket) -> int:
     """The user at the other end of a connected socket."""
+    return _peer(link)[1]
+
+
+def peer_process(link: socket.socket) -> int:
+    """The process that made a socket pair."""
+    return _peer(link)[0]
+
+
+def _peer(link: socket.socket) -> tuple[int, int, int]:
     data = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    return int(_CREDENTIALS.unpack(data)[1])
+    process, user, group = _CREDENTIALS.unpack(data)
+    return process, user, group
 
 
 def sender(ancillary: list[tuple[int, int, bytes]]) -> int | None:

@@ -94,7 +94,7 @@ class GateLoop:
         )
         self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
-        self._heir = Heir(str(folder))
+        self._heir = Heir(str(folder), guard)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
         self._notices = Notices(_log)

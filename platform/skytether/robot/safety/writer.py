@@ -67,7 +67,7 @@ class Writer:
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
         self._teller = Teller(wheels, self._watch, board, Role.FIRST, self._period, clock)
         self._notices = Notices(_log)
-        self._heir = Heir(str(config.place()))
+        self._heir = Heir(str(config.place()), guard)
         self._gone = False
         self._wanted_at = nan
         self._due = clock()
