@@ -132,3 +132,17 @@ def test_where_another_guard_has_the_folder_none_is_started_every_second(started
     started.there = False
     started.look(1.0)
     assert len(started.processes) == 2
+
+
+def test_one_that_ends_again_and_again_is_started_less_and_less_often(started):
+    """Somebody has broken robot.yaml under way."""
+    for _ in range(120):
+        started.processes[-1].status = 2
+        started.look(0.5)
+    assert 4 <= len(started.processes) <= 7
+    started.processes[-1].status = None
+    started.look(60.0)
+    started.processes[-1].status = -9
+    count = len(started.processes)
+    started.look(0.5)
+    assert len(started.processes) == count + 1, "one that ran is started at once"

@@ -3,11 +3,13 @@
 import fcntl
 import json
 import os
+import resource
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 
 import pytest
 from hypothesis import given
@@ -16,7 +18,7 @@ from hypothesis import strategies as st
 from skytether.guard import record, settings
 from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
-from skytether.guard.requests import Requests
+from skytether.guard.requests import Requests, readable
 from skytether.guard.velocity import Velocity
 from skytether.guard.wheels import SocketWheels
 
@@ -59,6 +61,26 @@ def test_many_idle_clients_hold_nobody_up(asked):
     assert len(requests.sockets()) <= 17
     for one in idle:
         one.close()
+
+
+def test_clients_with_large_numbers_are_answered(asked):
+    """A node of a graph in the same process may have a thousand connections; `select` knows 1,024 descriptors."""
+    requests, path, _ = asked
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(2048, hard), hard))
+    try:
+        with ExitStack() as many, open(os.devnull, "rb") as null:
+            for _ in range(1050):
+                many.callback(os.close, os.dup(null.fileno()))
+            idle, link = many.enter_context(connect(path)), many.enter_context(connect(path))
+            requests.turn()
+            assert link.fileno() > 1023
+            link.send(b'{"do": "status"}')
+            requests.turn()
+            assert readable([idle, link], 30.0) == [link]
+            assert json.loads(link.recv(100)) == {"do": "status"}
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_an_answer_may_come_later(asked):

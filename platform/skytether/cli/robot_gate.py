@@ -30,8 +30,10 @@ _START_S = 20.0
 """For a gate to listen: it reads the configuration, and becomes another program."""
 _END_S = 10.0
 """For it to brake and end."""
-_AGAIN_S = 1.0
-"""Between two starts of one that ended by itself."""
+_AGAIN_S, _AGAIN_MOST_S = 1.0, 16.0
+"""Between two starts of one that ended by itself; twice as long each time that it ends soon: a start takes a second of
+a processor, and a robot.yaml that is broken under way stays so until somebody mends it."""
+_SOON_S = 10.0
 _POLL_S = 0.05
 _STRANGE_S = 15.0
 """A gate that was there when we came, and ends so soon after, was the one of an agent that has died."""
@@ -72,7 +74,7 @@ class OwnGate:
         self._config = config
         self._folder = safety.place()
         self._clock = clock
-        self._started_at = clock()
+        self._started_at, self._again_s = clock(), _AGAIN_S
         self._assumed_until = self._started_at + _ASSUMED_S if assumed else -inf
         self._process = self._start()
 
@@ -100,8 +102,10 @@ class OwnGate:
             if now < self._assumed_until and listens(self._folder) and self._let_go(start=True):
                 self._assumed_until = -inf  # that was for this start; from now on a person is asked
             return ""
-        if now - self._started_at < _AGAIN_S or _there(self._folder):
+        ran = now - self._started_at
+        if ran < self._again_s or _there(self._folder):
             return ""
+        self._again_s = min(2 * self._again_s, _AGAIN_MOST_S) if ran < self._again_s + _SOON_S else _AGAIN_S
         self._started_at = now
         self._process = self._start()
         return f"the gate ended with status {status}; it is started again"

@@ -9,7 +9,7 @@ import json
 import os
 import select
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
 from .descriptors import receive, refuse
@@ -25,6 +25,15 @@ _STOP = b'{"do": "stop"'
 Reply = Mapping[str, object]
 Handler = Callable[[Mapping[str, object]], "Reply | Callable[[], Reply | None]"]
 """Gets a request; gives the answer, or something to be asked at every turn until it has one."""
+
+
+def readable(sockets: Sequence[socket.socket], timeout_s: float) -> list[socket.socket]:
+    """Those with something to take, or at their end. By `poll`: `select` knows no descriptor above 1,023."""
+    looks = select.poll()
+    by_number = {one.fileno(): one for one in sockets}
+    for number in by_number:
+        looks.register(number, select.POLLIN)
+    return [by_number[number] for number, _ in looks.poll(timeout_s * 1000)]
 
 
 class Requests:
@@ -63,8 +72,7 @@ class Requests:
             answer = pending() if pending is not None else None
             if answer is not None:
                 self._send(client, answer)
-        ready, _, _ = select.select(self.sockets(), [], [], 0)
-        for source in ready[:_EACH_TURN]:
+        for source in readable(self.sockets(), 0.0)[:_EACH_TURN]:
             if source is self._listener:
                 self._accept()
             else:

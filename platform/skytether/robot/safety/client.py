@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import select
 import socket
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from skytether.guard.clock import now as boottime
 from skytether.guard.descriptors import receive, refuse
 from skytether.guard.folder import objection, peer, sender, trusted
 from skytether.guard.protocol import STOP_SOCKET
+from skytether.guard.requests import readable
 from skytether.guard.velocity import Velocity
 
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, pack_command, unpack_state
@@ -167,7 +167,7 @@ def stop(folder: Path, reason: str = "", timeout: float = 3.0) -> dict[str, Any]
     end = time.monotonic() + timeout
     try:
         while links and (left := end - time.monotonic()) > 0:
-            for link in select.select(list(links), [], [], left)[0]:
+            for link in readable(list(links), left):
                 path = links.pop(link)
                 with link:
                     try:
