@@ -104,6 +104,17 @@ def promises() -> list[str]:
     return part.splitlines()[2:]
 
 
+def test_what_the_page_of_security_says_that_holds_is_held_by_tests() -> None:
+    text = (ROOT / "docs" / "security.md").read_text()
+    rows = text.partition("## What holds\n")[2].partition("\n## ")[0].strip().splitlines()[4:]
+    assert len(rows) > 15
+    for row in rows:
+        named = re.findall(r"`([\w/]+\.py)::(test_\w+)`", row)
+        assert named, f"no test holds: {row}"
+        for file, name in named:
+            assert f"def {name}(" in (ROOT / "tests" / file).read_text(), f"{file}::{name} of: {row}"
+
+
 def test_each_promise_of_the_gate_names_tests_that_are_there() -> None:
     assert len(promises()) > 15
     for row in promises():

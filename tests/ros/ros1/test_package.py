@@ -19,6 +19,7 @@ UNITS = [
     PACKAGE / "systemd" / "skytether-robot.service",
     ROOT / "docs" / "examples" / "robot" / "skytether-gate.service",
 ]
+ORCHESTRATOR = ROOT / "docs" / "examples" / "orchestrator" / "skytether-orchestrator.service"
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ def test_the_package_s_files_are_what_catkin_and_roslaunch_read():
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
-@pytest.mark.parametrize("source", UNITS, ids=lambda path: path.name)
+@pytest.mark.parametrize("source", [*UNITS, ORCHESTRATOR], ids=lambda path: path.name)
 def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
     unit = tmp_path / source.name
     text = source.read_text()
@@ -94,6 +95,17 @@ def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
     checked = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
     assert checked.returncode == 0
     assert unit.name not in checked.stderr
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+@pytest.mark.parametrize(
+    ("source", "tenths"), [(UNITS[0], 26), (UNITS[1], 26), (ORCHESTRATOR, 19)], ids=["robot", "gate", "orchestrator"]
+)
+def test_the_units_are_scored(source, tenths):
+    """Of 100, the worst; a unit that says nothing has 96."""
+    words = ["systemd-analyze", "security", "--offline=true", f"--threshold={tenths}", "--no-pager", str(source)]
+    scored = subprocess.run(words, capture_output=True, text=True)
+    assert scored.returncode == 0, scored.stdout.splitlines()[-1]
 
 
 def test_agent_and_gate_meet_in_one_folder():
