@@ -11,7 +11,7 @@ AGAIN := --reruns 2 --reruns-delay 3
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest $(AGAIN) --durations 30 -m "slow
 
-.PHONY: demo test slow-engine-ros1 slow-others unit images fuzz check fmt docs lock clean
+.PHONY: demo test slow-engine-ros1 slow-others unit images fuzz check fmt docs licences lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -49,6 +49,9 @@ fmt: $(READY) ## format, and mend what can be mended
 
 docs: $(READY) ## the pages that are made from the code
 	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
+
+licences: $(READY) ## the licences of all that requirements.lock names, as a page
+	$(BIN)/python .ci/licences.py > docs/licences.md
 
 lock: $(READY) ## resolve pyproject.toml anew into requirements.lock
 	$(BIN)/pip install --quiet uv

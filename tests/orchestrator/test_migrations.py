@@ -62,6 +62,7 @@ INSTANCE: dict[str, Any] = {
     "pinned": None,
     "spare": False,
     "claim": None,
+    "key_id": "",
 }
 """A value for every column that a table had at any time; what a version has not is left out."""
 ROWS: dict[str, dict[str, Any]] = {

@@ -115,6 +115,29 @@ def test_without_a_certificate_nothing_listens_beyond_loopback_unasked(
         assert client.sites()
 
 
+def test_a_renewed_certificate_is_used_without_a_restart(program: Callable[..., Program], tmp_path: Path) -> None:
+    cert, key = certificate(tmp_path)
+    running = program(tls={"certificate": str(cert), "key": str(key)})
+    running.start().close()
+    url = (running.folder / "address").read_text().strip()
+    token = (running.folder / "operator.token").read_text().strip()
+    (tmp_path / "new").mkdir()
+    new, new_key = certificate(tmp_path / "new")
+    with Client(url, token, ca_file=cert) as open_before:
+        assert open_before.sites()
+        cert_before = cert.read_bytes()
+        key.write_bytes(new_key.read_bytes())  # half of the pair: not used
+        until(lambda: "cannot be used" in running.log, running)
+        (tmp_path / "old.pem").write_bytes(cert_before)
+        with Client(url, token, ca_file=tmp_path / "old.pem") as client:
+            assert client.sites()
+        cert.write_bytes(new.read_bytes())
+        until(lambda: "was renewed" in running.log, running)
+        with Client(url, token, ca_file=new) as client:
+            assert client.sites()
+        assert open_before.sites()
+
+
 def test_a_certificate_that_cannot_be_used_is_one_sentence(program: Callable[..., Program], tmp_path: Path) -> None:
     cert, key = certificate(tmp_path)
     key.write_text("rubbish")

@@ -130,7 +130,7 @@ def test_what_makes_no_sense_is_refused(served: Any, asked: TokenCreate, status:
 
 
 def test_the_operators_own_token_is_renewed_at_the_machine(served: Any) -> None:
-    with pytest.raises(ApiError, match="deleting its file"):
+    with pytest.raises(ApiError, match="skytether orchestrator rotate operator-token"):
         served.operator.rotate_token()
 
 

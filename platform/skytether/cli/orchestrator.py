@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -129,6 +130,42 @@ def verify_audit(
 StateDir = Annotated[
     Path | None, typer.Option(help="Folder of the orchestrator's state.  [default: ~/.local/state/skytether]")
 ]
+
+
+class Secret(StrEnum):
+    """What can be made anew."""
+
+    SECRET_KEY = "secret-key"  # noqa: S105 (its name)
+    OPERATOR_TOKEN = "operator-token"  # noqa: S105
+
+
+@app.command("rotate")
+def rotate(
+    what: Annotated[
+        Secret, typer.Argument(help="What all keys of sessions are derived from, or the operator's token.")
+    ],
+    state_dir: StateDir = None,
+    secrets_dir: Annotated[
+        Path | None, typer.Option(help="Where these are, if not in the state folder.", envvar="SKYTETHER_SECRETS_DIR")
+    ] = None,
+) -> None:
+    """Make a secret anew while the orchestrator runs, which uses it within seconds; no session ends.
+
+    Sessions keep the secret key that they began with; it stays beside the new one, and is deleted when the last of them
+    has ended. The old operator's token is worth nothing from then on.
+    """
+    from skytether.orchestrator.defaults import default_state_dir
+    from skytether.orchestrator.rotation import rotate_key, rotate_operator
+    from skytether.orchestrator.security import SecretFileError
+
+    folder = (secrets_dir or state_dir or default_state_dir()).expanduser()
+    try:
+        if what is Secret.SECRET_KEY:
+            console.print(f"sessions that run keep {rotate_key(folder)}", markup=False, soft_wrap=True)
+        else:
+            console.print(f"made {rotate_operator(folder)} anew", markup=False, soft_wrap=True)
+    except SecretFileError as error:
+        fail(str(error))
 
 
 @app.command("backup")

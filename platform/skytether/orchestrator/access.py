@@ -251,7 +251,8 @@ class Access:
         own = id_ == OWN or (by.token is not None and id_ == by.token.id)
         if own and by.token is None:
             raise NotFoundError(
-                "the operator's token of the state folder is renewed by deleting its file and a restart"
+                "the operator's token of the state folder is renewed there: "
+                "skytether orchestrator rotate operator-token"
             )
         if not own or ttl_s is not None:
             by.require_scope("tokens")

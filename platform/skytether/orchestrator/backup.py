@@ -12,8 +12,10 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+from .security import KEY, OLD_KEY, OPERATOR
+
 DATABASE = "state.db"
-SECRETS = ("secret.key", "operator.token")
+SECRETS = (KEY, OPERATOR)
 
 
 class BackupError(Exception):
@@ -44,7 +46,7 @@ def backup(state_dir: Path, to: Path) -> list[str]:
                 source.backup(copy)  # consistent, whatever is written meanwhile
                 copy.execute("PRAGMA journal_mode=DELETE")  # one file
             copied.append(DATABASE)
-        for name in SECRETS:
+        for name in (*SECRETS, *_old_keys(state_dir)):
             _copy(state_dir / name, to / name)
             copied.append(name)
     except (OSError, sqlite3.Error) as error:
@@ -66,12 +68,17 @@ def restore(source: Path, state_dir: Path) -> list[str]:
         raise BackupError(f"{state_dir} holds {', '.join(present)}: move that away first, or give another --state-dir")
     try:
         state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-        put = [name for name in (DATABASE, *SECRETS) if (source / name).exists()]
+        put = [name for name in (DATABASE, *SECRETS, *_old_keys(source)) if (source / name).exists()]
         for name in put:
             _copy(source / name, state_dir / name)
     except OSError as error:
         raise BackupError(f"cannot write {state_dir}: {error.strerror}") from error
     return put
+
+
+def _old_keys(folder: Path) -> list[str]:
+    """Of sessions from before a rotation, the oldest first: so they stay by time."""
+    return [path.name for path in sorted(folder.glob(f"{OLD_KEY}*"), key=lambda path: path.stat().st_mtime_ns)]
 
 
 def _copy(source: Path, to: Path) -> None:

@@ -29,6 +29,7 @@ from .moves import Moves
 from .quotas import Quotas
 from .reconcile import Reconciler
 from .reports import PERIOD, Reports
+from .rotation import Rotation
 from .runtimes.base import Runtime
 from .security import SecretFileError, Secrets, close_folder
 from .settings import Settings
@@ -74,6 +75,9 @@ class Orchestrator:
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
+        self.store.key_id = lambda: secrets.fingerprint
+        self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
+        self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
         self.quotas = Quotas(self.store, settings.quotas)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
@@ -173,7 +177,7 @@ class Orchestrator:
         """
         self.catalogue.load(self.settings.catalogue_dir)
         self.store.migrate()
-        if not self.store.agree("secret.key", self._secrets.fingerprint):
+        if not self.rotation.agree():
             raise SecretFileError(
                 "the database belongs to orchestrators with another secret.key: give this one the same (--secrets-dir)"
             )
@@ -182,6 +186,7 @@ class Orchestrator:
         self.sites.start(self.settings.local_site)
         self.placer.start()
         self.writer.start()
+        self.keeper.start()
 
     def _write_reports(self) -> float:
         with contextlib.suppress(*GONE):  # they are kept until it answers
@@ -249,6 +254,7 @@ class Orchestrator:
         if self.settings.stop_instances:
             self._stop_instances()
         self.sites.stop()
+        self.keeper.stop(timeout=1.0)
         self.writer.stop(timeout=1.0)
         self._write_last()
         self.elector.stop(timeout=1.0)

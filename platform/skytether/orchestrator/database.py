@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -139,10 +139,14 @@ class Database:
             asked = connection.scalars(text(f"SELECT DISTINCT application_name FROM pg_stat_activity WHERE {ours}"))  # noqa: S608
             return [name for name in asked if name]
 
-    def agree(self, name: str, value: str) -> bool:
-        """Note a fact at first, and from then on say whether it is still the same."""
+    def agree(self, name: str, value: str, earlier: Sequence[str] = ()) -> bool:
+        """Note a fact at first, or when it was one of the earlier ones; and then say whether it is still the same."""
         if self._insert(facts, {"name": name, "value": value}):
             return True
+        if earlier:
+            with self._writing() as connection:
+                changed = update(facts).where(facts.c.name == name, facts.c.value.in_(earlier)).values(value=value)
+                connection.execute(changed)
         with self._reader.connect() as connection:
             return connection.scalar(select(facts.c.value).where(facts.c.name == name)) == value
 

@@ -240,7 +240,7 @@ class Instances:
                     f"the key of instance '{instance}' was handed out already, and not to you: delete it, and ask for "
                     "another one; if nobody of yours has it, the robot's token leaked"
                 )
-        return SessionKey(key=base64.b64encode(self._secrets.session_key(record.session_id)).decode())
+        return SessionKey(key=base64.b64encode(self._secrets.session_key(record.session_id, record.key_id)).decode())
 
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.

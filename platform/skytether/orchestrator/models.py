@@ -137,6 +137,7 @@ instances = Table(
     Column("pinned", String(63)),
     Column("spare", Boolean, nullable=False, server_default=false()),
     Column("claim", String(64), comment="SHA-256 of the claim that got the session's key; NULL: nobody did"),
+    Column("key_id", String(32), nullable=False, server_default=""),
     Column("version", Integer, nullable=False),
 )
 

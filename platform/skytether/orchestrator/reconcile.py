@@ -397,7 +397,7 @@ class Reconciler:
             idle_exit_s=_SPARE_IDLE if record.spare else Grant.model_fields["idle_exit_s"].default,
             params=record.params,
             session_id=record.session_id,
-            session_key=base64.b64encode(self._secrets.session_key(record.session_id)).decode(),
+            session_key=base64.b64encode(self._secrets.session_key(record.session_id, record.key_id)).decode(),
             topics=spec.topics,
             launch=spec.launch,
             remap=spec.remap,

@@ -91,6 +91,8 @@ class Record:
     """The one site where it may run; None: any but that of the one it replaces."""
     spare: bool = False
     """Warm, and nobody's yet: it has no robot and no lease."""
+    key_id: str = ""
+    """Fingerprint of the secret key that its session's is derived from; empty: from before they were noted."""
     version: int = 1
     """Counts changes: who changes a record must have seen the last one."""
 

@@ -14,6 +14,7 @@ import secrets
 import stat
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -21,6 +22,9 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 TOKEN_MARK = "sky-"  # noqa: S105 (a mark by which scanners can find leaked tokens, no secret)
 PREFIX_LENGTH = len(TOKEN_MARK) + 8
+KEY, OPERATOR = "secret.key", "operator.token"
+OLD_KEY = "secret.key.old-"
+"""Before the fingerprint, in the name of a file with a key that sessions still use."""
 _DATABASE = ("state.db", "state.db-wal", "state.db-shm", "state.db-journal")
 log = logging.getLogger(__name__)
 
@@ -77,6 +81,20 @@ def close_folder(folder: Path, *, with_database: bool) -> None:
         ) from error
 
 
+def replace_secret(path: Path, content: bytes) -> None:
+    """Put a secret into a file, mode 0600, complete or not at all, whatever is there."""
+    draft = path.with_name(f"draft-{path.name}.{secrets.token_hex(4)}")
+    _write(draft, content)
+    draft.replace(path)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
     """Read a secret, or make it at the first start (mode 0600, complete or not there at all).
 
@@ -91,11 +109,8 @@ def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
 
 def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
     if not path.exists():
-        draft = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
-        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(make())
-            file.flush()
-            os.fsync(file.fileno())
+        draft = path.with_name(f"draft-{path.name}.{secrets.token_hex(4)}")
+        _write(draft, make())
         with contextlib.suppress(FileExistsError):
             os.link(draft, path)
         draft.unlink()
@@ -107,8 +122,18 @@ def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
     return content
 
 
+@dataclass(frozen=True, repr=False)
+class _Held:
+    """What is in the files; taken over as one, for other threads use it meanwhile."""
+
+    current: bytes
+    old: tuple[bytes, ...]
+    """Of sessions that began before the last rotation, the oldest first."""
+    operator: TokenHash
+
+
 class Secrets:
-    """The two secrets of an orchestrator."""
+    """The secrets of an orchestrator, as they are in their files now. Safe from any thread."""
 
     def __init__(self, folder: Path) -> None:
         """Read or make ``operator.token`` and ``secret.key``.
@@ -116,26 +141,105 @@ class Secrets:
         Raises:
             SecretFileError: One of them cannot be used.
         """
-        self._key = secret_file(folder / "secret.key", lambda: secrets.token_bytes(32))
-        token = secret_file(folder / "operator.token", lambda: f"{new_token()}\n".encode())
+        self._folder = folder
+        secret_file(folder / KEY, new_key)
+        secret_file(folder / OPERATOR, new_operator)
+        self._seen = self._signature()
+        self._held = self._read()
+
+    def look(self) -> bool:
+        """Whether the files are others than before; what is in them is used from now on.
+
+        Raises:
+            SecretFileError: One of them cannot be used; what was used before still is.
+        """
+        seen = self._signature()
+        if seen == self._seen:
+            return False
+        self._seen = seen
+        self._held = self._read()
+        return True
+
+    def _read(self) -> _Held:
+        current = _kept_secret(self._folder / KEY)  # first: a rotation keeps the old one before it puts the new one
         try:
-            self._operator = TokenHash.of(token.decode("ascii").strip())
-        except UnicodeDecodeError as error:
-            path = folder / "operator.token"
-            raise SecretFileError(
-                f"{path} holds no token: delete it, and a new one is made at the next start"
-            ) from error
+            old = sorted(self._folder.glob(f"{OLD_KEY}*"), key=lambda path: path.stat().st_mtime_ns)
+        except OSError as error:
+            raise SecretFileError(f"cannot read {self._folder}: {error.strerror}") from error
+        keys = tuple(key for key in map(_kept_secret, old) if key != current)
+        return _Held(current, keys, _operator(self._folder / OPERATOR))
+
+    def _signature(self) -> tuple[tuple[str, int, int], ...]:
+        files = [self._folder / KEY, self._folder / OPERATOR, *sorted(self._folder.glob(f"{OLD_KEY}*"))]
+        found = []
+        for path in files:
+            with contextlib.suppress(OSError):
+                now = path.stat()
+                found.append((path.name, now.st_ino, now.st_mtime_ns))
+        return tuple(found)
 
     def is_operator(self, token: str) -> bool:
-        return self._operator.matches(token)
+        return self._held.operator.matches(token)
 
     @property
     def fingerprint(self) -> str:
         """By which orchestrators tell whether they have the same secret key; it tells nothing of the key."""
-        info = b"skytether fingerprint"
-        return HKDF(algorithm=SHA256(), length=16, salt=None, info=info).derive(self._key).hex()
+        return fingerprint_of(self._held.current)
 
-    def session_key(self, session_id: str) -> bytes:
-        """32 bytes; always the same for the same session, so that no database needs to hold them."""
+    @property
+    def old_fingerprints(self) -> tuple[str, ...]:
+        """Of the keys before, the oldest first."""
+        return tuple(map(fingerprint_of, self._held.old))
+
+    def session_key(self, session_id: str, of: str = "") -> bytes:
+        """32 bytes; always the same for the same session, so that no database needs to hold them.
+
+        Args:
+            session_id: The session's.
+            of: Fingerprint of the secret key that it began with; empty: the oldest, from before they were noted.
+
+        Raises:
+            SecretFileError: That key is not here.
+        """
+        key = self._key(of)
+        if key is None and self.look():  # another orchestrator was quicker to see a rotation
+            key = self._key(of)
+        if key is None:
+            raise SecretFileError(f"the secret key {of} that session {session_id} began with is not in {self._folder}")
         info = b"skytether session " + session_id.encode()
-        return HKDF(algorithm=SHA256(), length=32, salt=None, info=info).derive(self._key)
+        return HKDF(algorithm=SHA256(), length=32, salt=None, info=info).derive(key)
+
+    def _key(self, of: str) -> bytes | None:
+        held = self._held
+        keys = [*held.old, held.current]
+        return next((key for key in keys if fingerprint_of(key) == of), None) if of else keys[0]
+
+
+def _kept_secret(path: Path) -> bytes:
+    def missing() -> bytes:
+        raise SecretFileError(f"{path} is gone: put it back, all keys of sessions are derived from it")
+
+    return secret_file(path, missing)
+
+
+def _operator(path: Path) -> TokenHash:
+    try:
+        return TokenHash.of(_kept_secret(path).decode("ascii").strip())
+    except UnicodeDecodeError as error:
+        raise SecretFileError(f"{path} holds no token: delete it, and a new one is made at the next start") from error
+
+
+@lru_cache(maxsize=16)
+def fingerprint_of(key: bytes) -> str:
+    """Of a secret key."""
+    return HKDF(algorithm=SHA256(), length=16, salt=None, info=b"skytether fingerprint").derive(key).hex()
+
+
+def new_key() -> bytes:
+    """What ``secret.key`` holds."""
+    return secrets.token_bytes(32)
+
+
+def new_operator() -> bytes:
+    """What ``operator.token`` holds."""
+    return f"{new_token()}\n".encode()

@@ -27,6 +27,7 @@ from skytether.bridge.echo import EchoServer
 
 from . import logs
 from .app import create_app
+from .certificate import LiveCertificate
 from .core import Orchestrator
 from .db import AddressError
 from .door import Door, GuardedProtocol
@@ -38,6 +39,8 @@ log = logging.getLogger(__name__)
 
 _DRAIN = 5
 """Whole seconds that requests under way get at shutdown."""
+_CERTIFICATE_TICKS = 20
+"""Tenths of a second between two looks whether the certificate was renewed."""
 _BACKLOG = 512
 _FILES = 16_384
 """Open files, connections among them; beyond that nobody could be served in time."""
@@ -185,6 +188,11 @@ class _Server(uvicorn.Server):
             raise StartError(
                 f"the certificate {tls.certificate} with the key {tls.key} cannot be used: {why}", usage=True
             ) from error
+        self._certificate = (
+            LiveCertificate(config.ssl, tls.certificate, tls.key)
+            if config.ssl and tls.certificate and tls.key
+            else None
+        )
         self._core = core
         self._address = core.settings.state_dir / "address"
         host, port = listener.getsockname()[:2]
@@ -204,6 +212,11 @@ class _Server(uvicorn.Server):
         draft.write_text(f"{self._url}\n")
         draft.replace(self._address)
         log.info("listening on %s, state in %s", self._url, self._core.settings.state_dir)
+
+    async def on_tick(self, counter: int) -> bool:
+        if self._certificate is not None and counter % _CERTIFICATE_TICKS == 0:
+            self._certificate.look()
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._address.unlink(missing_ok=True)

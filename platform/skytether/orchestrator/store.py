@@ -170,6 +170,8 @@ class Store(Database):
         self._robot_names = robot_names
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
+        self.key_id: Callable[[], str] = lambda: ""
+        """Fingerprint of the secret key with which sessions begin now."""
         self._seen: dict[str, Record] = {}
 
     # Instances
@@ -180,6 +182,7 @@ class Store(Database):
         Raises:
             KeyReusedError: The key was used with another body.
         """
+        record = record.after({"key_id": self.key_id()})
         try:
             with self._writing() as connection:
                 connection.execute(insert(instances).values(**_values(record)))
@@ -195,6 +198,11 @@ class Store(Database):
         self._remember(record)
         self.on_change(record.id)
         return record
+
+    def keys_in_use(self) -> set[str]:
+        """Fingerprints of the secret keys of all instances that have not ended."""
+        with self._reader.connect() as connection:
+            return set(connection.scalars(select(instances.c.key_id).where(_LIVE).distinct()))
 
     def made_with(self, owner: str, key: str, body_sha256: str) -> Record | None:
         """The instance that was made with an idempotency key; None if the key is new.
