@@ -32,26 +32,24 @@ def test_an_address_is_sent_three_times_what_came_from_it_at_most():
     assert list(claims.shares(1, 1)) == []
 
 
-def test_challenges_are_spaced_and_no_two_are_the_same():
+def test_challenges_are_spaced_and_each_is_of_one_address():
     claims = Claims()
-    stamps = []
-    for address in ("a", "b"):
+    for challenge, address in ((7, "a"), (8, "b")):
         assert claims.heard(address, 1, 0.0, 5.0)
-        stamps.append(int(claims.challenge(address, 5.0) * 1e6))
+        claims.challenge(address, challenge, 5.0)
         assert not claims.heard(address, 1, 0.0, 5.0 + 0.9 * SPACING)
         assert claims.heard(address, 1, 0.0, 5.0 + SPACING)
-    assert stamps == [5_000_000, 5_000_001]
-    assert claims.answered(4_999_999) is None
-    assert claims.answered(stamps[1]) == ("b", 0.0)
+    assert claims.answered(0) is None
+    assert claims.answered(8) == ("b", 0.0)
     assert len(claims) == 0
-    assert claims.answered(stamps[0]) is None
+    assert claims.answered(7) is None
 
 
 def test_claims_are_bounded():
     claims = Claims()
     for i in range(100):
         claims.heard(i, 10, 0.0, 0.0)
-        claims.challenge(i, 0.0)
+        claims.challenge(i, i + 1, 0.0)
     assert len(claims) == MAX_CLAIMS
     assert [address for address, _ in claims.shares(1, None)] == [96, 97, 98, 99]
 

@@ -32,7 +32,7 @@ receivers = st.builds(ReceiverRow, st.integers(0, 65_535), *[counter] * 7, *[sec
 @given(
     st.builds(
         Ping, st.integers(0, 255), st.integers(0, 255), st.booleans(), st.integers(0, 65_535),
-        st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**32 - 1), feedback,
+        st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), feedback,
     ),
     st.integers(0, 1400),
 )  # fmt: skip
@@ -43,12 +43,12 @@ def test_pings_travel(ping, padding):
 
 
 def test_a_hold_beyond_all_bounds_is_cut():
-    cut = Ping(0, 0, True, 0, 1, 2**32 - 1, NOTHING)
+    cut = Ping(0, 0, True, 0, 1, 0, 2**32 - 1, NOTHING)
     assert pull_control(push_ping(cut._replace(hold=2**40))) == cut
 
 
 def test_sums_wrap_and_feedback_that_makes_no_sense_is_refused():
-    ping = Ping(0, 0, True, 0, 1, 0, NOTHING)
+    ping = Ping(0, 0, True, 0, 1, 0, 0, NOTHING)
     wrapped = pull_control(push_ping(ping._replace(feedback=NOTHING._replace(settled=2**32 + 5))))
     assert wrapped.feedback.settled == 5
     for field in ("queue", "rate", "time", "time_squared"):

@@ -2,9 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 
-from skytether.wire import Role, control
+from skytether.lab.link_model import LinkConditions
+from skytether.wire import Role, control, packet
+from skytether.wire.ciphers import HandshakeTags
 from skytether.wire.message import Message
 from skytether.wire.paths import MAX_PATHS
 from skytether.wire.sender import INNER
@@ -31,7 +34,8 @@ NOTHING = control.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
 def ping(path=0, **fields):
     return control.push_ping(
         control.Ping(
-            **{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "hold": 0, "feedback": NOTHING} | fields
+            **{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "challenge": 0, "hold": 0, "feedback": NOTHING}
+            | fields
         )
     )
 
@@ -43,6 +47,38 @@ def test_any_time_stamp_is_echoed(world, role, stamp):
     say(link, role, ping(), stamp=stamp)
     link.run(1.0)
     assert all(end.stats(link.now).connected for end in link.sessions.values())
+
+
+def test_who_has_the_key_cannot_have_somebody_else_flooded_by_guessing_challenges(world):
+    """Every time that the question may have been asked at, and some bits, as answers from an address that got it."""
+    link = world.link(record=True)
+    path = link.sessions[SERVICE]._paths.get(0)
+    link.publish(SERVICE, "cmd_vel", b"x")
+    say(link, ROBOT, ping(), address="victim")
+    assert list(path.claims._open) == ["victim"]
+    asked_at = round(link.now * 1e6)
+    for guess in range(asked_at - 5, asked_at + 6):
+        for challenge in (0, 1, guess):
+            say(link, ROBOT, ping(ask=False, echo=guess, challenge=challenge), address="victim")
+    assert path.address == "robot"
+
+
+def test_a_question_from_two_addresses_proves_neither_whatever_paths_it_names(world):
+    """HELLO names a path: by one from a victim's address, by another from where the answer is read."""
+    slow = LinkConditions(delay=0.05)
+    link = world.link(connect=False, up=slow, down=slow, record=True)
+    link.run(0.04)
+    hello = bytearray(link.sent[ROBOT][0][1])
+    hello[packet.PATH_AT] = 7
+    HandshakeTags(link.sessions[ROBOT]._seeker._key, b"hello").put(np.frombuffer(hello, np.uint8).reshape(1, -1))
+    link.inject(SERVICE, bytes(hello), "victim")
+    link.run(0.066)
+    say(link, ROBOT, ping(7), path=7, address="victim")
+    addresses = {p.path: p.address for p in link.sessions[SERVICE].stats(link.now).paths}
+    assert addresses == {0: None, 7: None}
+    link.run(0.5)
+    addresses = {p.path: p.address for p in link.sessions[SERVICE].stats(link.now).paths}
+    assert "victim" not in addresses.values()
 
 
 @pytest.mark.parametrize("role", Role)

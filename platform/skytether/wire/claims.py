@@ -2,7 +2,8 @@
 
 An authentic message from another address may come from a peer that moved, or from somebody who repeats what he
 overheard, faster than the network carries it. So it is a claim, no more: the address in use stays in use, and a
-challenge goes to the other one. Only an answer to it moves the session. Until then the claimed address is sent
+challenge goes to the other one: random bits, which no peer can repeat that did not get them, not even one that has the
+key and names somebody else's address. Only an answer to it moves the session. Until then the claimed address is sent
 copies of what goes to the one in use, so that a peer that did move misses little; with the challenges they are at most
 `ALLOWANCE` times the bytes that came from there, so that nobody is flooded by a session he has no part in.
 """
@@ -39,11 +40,10 @@ class Claim:
 class Claims:
     """The claims on one path."""
 
-    __slots__ = ("_latest", "_open")
+    __slots__ = ("_open",)
 
     def __init__(self) -> None:
         self._open: OrderedDict[Hashable, Claim] = OrderedDict()
-        self._latest = 0
 
     def __len__(self) -> int:
         return len(self._open)
@@ -68,13 +68,11 @@ class Claims:
         claim.left += ALLOWANCE * size
         return now >= claim.asked_at + SPACING
 
-    def challenge(self, address: Hashable, now: float) -> float:
-        """Make a challenge: the time that it has to bear, ``now`` or little more, for no two may be the same."""
+    def challenge(self, address: Hashable, challenge: int, now: float) -> None:
+        """These random bits are sent to an address now."""
         claim = self._open[address]
         claim.asked_at = now
-        self._latest = max(self._latest + 1, int(now * 1e6))
-        claim.challenges.append(self._latest)
-        return (self._latest + 0.5) / 1e6  # so that it is cut to just these microseconds
+        claim.challenges.append(challenge)
 
     def sent(self, address: Hashable, size: int) -> None:
         """So many bytes went to an address."""
@@ -82,15 +80,15 @@ class Claims:
         if claim is not None:
             claim.left -= size
 
-    def answered(self, echo: int) -> tuple[Hashable, float] | None:
-        """The peer answers what bore that time (microseconds).
+    def answered(self, challenge: int) -> tuple[Hashable, float] | None:
+        """The peer answers with these bits.
 
         Returns:
             The address that it was sent to, and ``since`` of the claim; None if it was no challenge. All claims are
             settled then.
         """
         for address, claim in self._open.items():
-            if echo in claim.challenges:
+            if challenge in claim.challenges:
                 self._open.clear()
                 return address, claim.since
         return None

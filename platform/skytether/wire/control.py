@@ -14,7 +14,7 @@ ACK = 4
 MISSING = 5
 FORWARD = 6
 
-_PING = struct.Struct(">BBBBHQIfffIIIff")
+_PING = struct.Struct(">BBBBHQQIfffIIIff")
 _REPORT = struct.Struct(">BHH")
 _SENDER = struct.Struct(">HIQQQQQQ")
 _RECEIVER = struct.Struct(">HQQQQQQQffffffff")
@@ -60,6 +60,8 @@ class Ping(NamedTuple):
     """Size of the datagram that asks, or of the one that is answered, if that was padded; else 0."""
     echo: int | None
     """The peer's latest time stamp (microseconds of its clock); None if it sent none yet."""
+    challenge: int
+    """64 random bits that the answer repeats, of a question to an address that has to be proven; else 0."""
     hold: int
     """Microseconds since that arrived."""
     feedback: Feedback
@@ -151,7 +153,7 @@ def push_ping(ping: Ping, padding: int = 0) -> bytes:
     echo = NO_ECHO if ping.echo is None else min(max(ping.echo, 0), NO_ECHO - 1)  # a peer may claim any time
     hold, feedback = min(max(ping.hold, 0), 2**32 - 1), ping.feedback
     sums = (value & 0xFFFFFFFF for value in (feedback.settled, feedback.lost, feedback.runs))
-    head = PING, ping.path, ping.cost, ping.ask, ping.size, echo, hold
+    head = PING, ping.path, ping.cost, ping.ask, ping.size, echo, ping.challenge, hold
     return _PING.pack(*head, *feedback[:3], *sums, *feedback[6:]) + bytes(padding)
 
 
@@ -193,12 +195,12 @@ def pull_control(data: bytes) -> Control | None:
     try:
         kind = data[0]
         if kind == PING:
-            _, path, cost, ask, size, echo, hold, *fields = _PING.unpack_from(data)
+            _, path, cost, ask, size, echo, challenge, hold, *fields = _PING.unpack_from(data)
             feedback = Feedback(*fields)
             known = feedback if feedback.capacity != math.inf else feedback[1:]
             if min(feedback) < 0 or not all(map(math.isfinite, known)):
                 return None
-            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, hold, feedback)
+            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, challenge, hold, feedback)
         if kind == REPORT:
             _, count_s, count_r = _REPORT.unpack_from(data)
             at = _REPORT.size

@@ -140,7 +140,7 @@ class Greeter:
                 answer.epoch = self._make_epoch(answer.outcome)
             if answer.reason:
                 self._refuse(answer.reason)
-            answer.asked(path, address)
+            answer.asked(address)
             self._send(answer.common, answer.message, self._paths.choice.active, address)
 
     def _on_welcome(self, hello: Hello, common: bytes, message: bytes, path: int, now: float) -> None:

@@ -172,13 +172,13 @@ class Pending:
     """t2 and t3."""
     epoch: Epoch | None = None
     """What the session made of the outcome."""
-    askers: dict[int, Hashable] = field(default_factory=dict)
-    """Where the only HELLO by a path came from; None: there were several."""
+    askers: set[Hashable] = field(default_factory=set)
+    """Where HELLO came from; of many addresses two."""
 
-    def asked(self, path: int, address: Hashable) -> None:
+    def asked(self, address: Hashable) -> None:
         """WELCOME goes to that address."""
-        if self.askers.setdefault(path, address) != address:
-            self.askers[path] = None
+        if len(self.askers) < 2:
+            self.askers.add(address)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,18 +272,18 @@ class Doorkeeper:
                 return pending.epoch
         return None
 
-    def confirm(self, epoch: Epoch) -> dict[int, Hashable]:
+    def confirm(self, epoch: Epoch) -> Hashable | None:
         """A message sealed with a pending handshake's keys arrived: all HELLOs so far are used up.
 
         Returns:
-            By path where the only HELLO of that handshake came from: who confirms from there gets what is sent there.
+            The only address that WELCOME was sent to: who confirms got it there. None if there were several.
         """
-        askers: dict[int, Hashable] = {}
+        asker: Hashable | None = None
         for name, pending in list(self._pending.items()):
-            if pending.epoch is epoch:
-                askers = pending.askers
+            if pending.epoch is epoch and len(pending.askers) == 1:
+                (asker,) = pending.askers
             self._retire(name)
-        return askers
+        return asker
 
     def forget(self, now: float) -> None:
         """Drop what was not confirmed in time."""

@@ -29,6 +29,7 @@ FORGET_AFTER = 10.0
 """Seconds without a message after which the service's end forgets a path, if others are there."""
 PING_SPACING = 0.02
 """Least time between pings sent as answers to anything but a ping."""
+CHALLENGE_SIZE = 8
 LOSS_WEIGHT = 1.0
 """Seconds of delay that losing every packet is as bad as."""
 BETTER = 0.7, 0.01
@@ -65,6 +66,7 @@ class Paths:
         moved: Called when the peer of a path has another address, with the time since when what was sent to the one
             before may not have arrived.
         tell: Takes events: the peer moved, another path became the active one.
+        entropy: Source of random bytes.
         now: Time.
     """
 
@@ -75,6 +77,7 @@ class Paths:
         changed: Callable[[Choice, float], None],
         moved: Callable[[Path, float, float], None],
         tell: Callable[[Event], None],
+        entropy: Callable[[int], bytes],
         now: float,
     ) -> None:
         self._config = config
@@ -82,6 +85,7 @@ class Paths:
         self._changed = changed
         self._moved = moved
         self._tell = tell
+        self._entropy = entropy
         self._paths: dict[int, Path] = {0: Path(0, config, now)}
         self._numbers: dict[int, int] = {}
         """Next packet numbers of paths that are closed: none is used twice with the same keys."""
@@ -199,13 +203,14 @@ class Paths:
             path.echo = sent_at, now
             path.take_feedback(ping.feedback, now)
         if ping.ask:
-            answer = Ping(path.id, path.cost, False, ping.size, round(sent_at * 1e6), 0, path.feedback(now))
+            echo = round(sent_at * 1e6)
+            answer = Ping(path.id, path.cost, False, ping.size, echo, ping.challenge, 0, path.feedback(now))
             self._say(path, push_ping(answer), None if address == path.address else address, now)
         elif first:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
             return None
-        if path.claims and (proven := path.claims.answered(ping.echo)) is not None:
+        if path.claims and not ping.ask and (proven := path.claims.answered(ping.challenge)) is not None:
             self._move(path, *proven, now)
         asked_at, hold = ping.echo / 1e6, ping.hold / 1e6
         rtt = now - asked_at - hold
@@ -237,8 +242,9 @@ class Paths:
                 if proven:
                     self._move(path, address, path.heard_at, now)
                 elif path.claims.heard(address, size, path.heard_at, now):
-                    stamp = path.claims.challenge(address, now)
-                    self._say(path, push_ping(_ping(path, True, 0, now)), address, stamp)
+                    challenge = int.from_bytes(self._entropy(CHALLENGE_SIZE)) or 1
+                    path.claims.challenge(address, challenge, now)
+                    self._say(path, push_ping(_ping(path, True, 0, now, challenge)), address, now)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
             self.ping_soon(path, now)
@@ -401,13 +407,13 @@ class Paths:
                 self._tell(PathSwitched(choice.active.id, reason))
 
 
-def _ping(path: Path, ask: bool, size: int, now: float) -> Ping:
+def _ping(path: Path, ask: bool, size: int, now: float, challenge: int = 0) -> Ping:
     """A question, or only the answer to the peer's latest."""
     if path.echo is None:
         echo, hold = None, 0
     else:
         echo, hold = round(path.echo[0] * 1e6), int((now - path.echo[1]) * 1e6)
-    return Ping(path.id, path.cost, ask, size, echo, hold, path.feedback(now))
+    return Ping(path.id, path.cost, ask, size, echo, challenge, hold, path.feedback(now))
 
 
 def _badness(path: Path) -> float:

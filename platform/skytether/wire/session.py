@@ -73,7 +73,7 @@ class Session:
         self._table = index_topics(topics)
         self._config = config or Config()
         self._events: deque[Event] = deque()
-        self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, now)
+        self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, entropy, now)
         self._peer: Hashable | None = None
         self._sender = Sender(self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
@@ -410,7 +410,7 @@ class Session:
         asked_from: Hashable | None = None
         if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
             if self._door is not None:
-                asked_from = self._door.confirm(epoch).get(path)
+                asked_from = self._door.confirm(epoch)
             self._start_epoch(epoch, now)
         came_by = self._paths.get(path)
         if came_by is None and self._door is not None:
