@@ -310,7 +310,7 @@ def test_used_hellos_and_pending_handshakes_are_bounded(world, topics):
     from skytether.wire.handshake import NO_KEYS, Hello
 
     for i in range(Doorkeeper.MAX_USED + 100):
-        hello = Hello(1, bytes(32), topics[:1], i % 256, NO_KEYS, bytes(8), world.random.randbytes, 0.0)
+        hello = Hello(1, bytes(32), topics[:1], i % 256, NO_KEYS, bytes(8), world.random.randbytes, i)
         answer = door.answer(hello.common, hello.message, NO_KEYS, {5}, 0.0)
         assert answer.outcome.epoch != 5
     assert len(door._pending) == door.MAX_PENDING

@@ -172,6 +172,47 @@ def test_handshakes_in_any_order_later_end_nothing_and_make_no_keys(world, monke
     assert kinds(link, ROBOT) == kinds(link, SERVICE) == [Connected]
 
 
+def test_questions_after_keys_of_then_make_no_keys_later(world, monkeypatch):
+    """HELLOs of an outage, answered by a ping because the service still had the keys, again after the next handshake."""
+    link = world.link(record=True, up=DELAY, down=DELAY)
+    start = link.now
+    link.roads[0].set(LinkConditions(cut=True))
+    link.run(6.0)
+    link.roads[0].set(DELAY)
+    link.run(1.0)
+    seen = [p for at, p in link.sent[ROBOT] if p[0] == packet.HELLO and at >= start]
+    assert len(set(seen)) >= 2
+    link.sessions[ROBOT]._seeker.rekey(link.now)
+    link.run(0.5)
+    assert link.sessions[SERVICE].stats(link.now).handshakes == 2
+    exchanged = []
+    monkeypatch.setattr(crypto, "exchange", lambda *keys: exchanged.append(keys))
+    counts, packets = refused(link, SERVICE), len(link.sent[SERVICE])
+    for one in seen:
+        link.inject(SERVICE, one, "elsewhere")
+    assert refused(link, SERVICE) - counts == {"hello_replayed": len(seen)}
+    assert len(link.sent[SERVICE]) == packets
+    assert exchanged == []
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_hellos_that_no_service_heard_keep_no_robot_out(world, restarted):
+    """Somebody kept them, of this life of the robot or of one before, and sends five while the robot is answered."""
+    cut = LinkConditions(cut=True)
+    link = world.link(connect=False, record=True, up=cut, down=cut)
+    link.run(30.0)
+    kept = list(dict.fromkeys(p for _, p in link.sent[ROBOT] if p[0] == packet.HELLO))[:5]
+    if restarted:
+        link.replace(ROBOT, world.session(ROBOT, now=link.now))
+    link.roads[0].set(LinkConditions(delay=0.05))
+    while not any(p[0] == packet.WELCOME for _, p in link.sent[SERVICE]):
+        link.run(0.01)
+    for one in kept:
+        link.inject(SERVICE, one, "elsewhere")
+    link.run(0.12)
+    assert kinds(link, SERVICE) == [Connected]
+
+
 def test_an_old_welcome_answers_no_new_hello(world):
     """While the robot asks for new keys, all answers that it ever got come again, before the right one."""
     link = world.link(record=True, robot={"config": Config(rekey_after=0.5)}, up=DELAY, down=DELAY)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -168,6 +168,8 @@ class Pending:
     outcome: Outcome | None
     """None: refused."""
     reason: str
+    life: bytes
+    """The robot's."""
     made_at: float
     """t2 and t3."""
     epoch: Epoch | None = None
@@ -192,6 +194,8 @@ class Doorkeeper:
     MAX_PENDING = 4
     MAX_USED = 1024
     """HELLOs remembered so as not to be answered again."""
+    MAX_LIVES = 1024
+    """Lives of robots whose newest HELLO is remembered: whoever makes another waits for no answer to one before."""
     PENDING_TIME = 10.0
     """Seconds until an unconfirmed handshake is forgotten. The robot makes a new HELLO sooner than that."""
 
@@ -202,6 +206,8 @@ class Doorkeeper:
         self._life = entropy(LIFE_SIZE)
         self._pending: OrderedDict[bytes, Pending] = OrderedDict()
         self._used: OrderedDict[bytes, None] = OrderedDict()
+        self._newest: OrderedDict[bytes, int] = OrderedDict()
+        """t1 of the newest HELLO, by life."""
 
     def answer(self, common: bytes, message: bytes, held: bytes, taken: set[int], now: float) -> Pending | Resume | str:
         """Read a HELLO.
@@ -230,8 +236,12 @@ class Doorkeeper:
         if len(plaintext) < MIN_HELLO:
             return "hello_malformed"
         public, robot_holds, life, proposed, t1, length = _HELLO.unpack_from(plaintext)
+        newest = self._newest.get(life, -1)
         if robot_holds == held != NO_KEYS:
+            self._note(life, max(t1, newest))
             return Resume()
+        if t1 <= newest:
+            return "hello_replayed"
         try:
             offered = pull_offer(plaintext[_HELLO.size : _HELLO.size + length])
         except ValueError:
@@ -240,8 +250,8 @@ class Doorkeeper:
         shared = crypto.exchange(private, public)
         if shared is None:
             return "hello_malformed"
-        while len(self._pending) >= self.MAX_PENDING:
-            self._retire(next(iter(self._pending)))
+        self._note(life, t1)
+        self._make_room()
         busy = taken | {p.outcome.epoch for p in self._pending.values() if p.outcome}
         epoch = next(e % 256 for e in range(proposed, proposed + 256) if e % 256 not in busy)
         reason, agreed = "", []
@@ -261,7 +271,7 @@ class Doorkeeper:
         if not reason:
             to_service, to_robot, resume = crypto.data_keys(self._key, shared, message, welcome)
             outcome = Outcome(epoch, Ciphers(to_robot, to_service, resume, packet_id), agreed, life)
-        pending = Pending(welcome_common, welcome, outcome, reason, now)
+        pending = Pending(welcome_common, welcome, outcome, reason, life, now)
         self._pending[name] = pending
         return pending
 
@@ -292,6 +302,20 @@ class Doorkeeper:
             if pending.made_at + self.PENDING_TIME > now:
                 return
             self._retire(name)
+
+    def _note(self, life: bytes, t1: int) -> None:
+        """That is the newest HELLO of a life."""
+        self._newest[life] = t1
+        self._newest.move_to_end(life)
+        if len(self._newest) > self.MAX_LIVES:
+            self._newest.popitem(last=False)
+
+    def _make_room(self) -> None:
+        """The life that has most gives way: HELLOs of long ago that somebody repeats do not push out that of now."""
+        while len(self._pending) >= self.MAX_PENDING:
+            lives = Counter(pending.life for pending in self._pending.values())
+            most = max(lives.values())
+            self._retire(next(name for name, pending in self._pending.items() if lives[pending.life] == most))
 
     def _retire(self, name: bytes) -> None:
         del self._pending[name]
