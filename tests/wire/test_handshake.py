@@ -7,6 +7,7 @@ import pytest
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Disconnected, Refused, Role, Session, Topic, packet
 from skytether.wire.handshake import Doorkeeper
+from skytether.wire.loss import LossModel
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 IN = Direction.IN
@@ -302,6 +303,30 @@ def relay(link, first):
     first.handle_timer(link.now)
     for batch in first.transmit(link.now):
         link.inject(ROBOT, bytes(batch.data), "service", batch.segment)
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.3, 0.9])
+def test_an_answer_is_at_most_three_times_as_long_however_much_is_lost(world, loss):
+    """Its parity is planned by what the peer, or whoever drops packets, makes this end believe."""
+    share = world.random.random
+    fields = "period", "lifespan", "delivery"
+    table = [Topic(f"topic{i}", "a/msg/B", IN, **{name: share() for name in fields}) for i in range(12)]
+    link = world.link(connect=False, record=True, robot={"topics": table}, service={"topics": table})
+    link.sessions[SERVICE]._paths.get(0).redundancy.model = LossModel(loss)
+    link.run(0.03)
+    asked = sum(len(p) for _, p in link.sent[ROBOT] if p[0] == packet.HELLO)
+    answered = [len(p) for _, p in link.sent[SERVICE] if p[0] == packet.WELCOME]
+    assert len(answered) >= 2
+    assert sum(answered) <= 3 * asked
+    link.run(0.5)
+    assert link.sessions[SERVICE].stats(link.now).connected
+
+
+def test_why_a_peer_refuses_is_one_short_line(world):
+    link = world.link(connect=False)
+    link.sessions[ROBOT]._greeter._refuse("\x1b[2Jgone\n" + "x" * 100_000)
+    (refused,) = [e for e in iter(link.sessions[ROBOT].next_event, None) if isinstance(e, Refused)]
+    assert refused.reason == "?[2Jgone?" + "x" * 291
 
 
 @pytest.mark.slow

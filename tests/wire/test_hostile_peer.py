@@ -34,7 +34,16 @@ NOTHING = control.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
 def ping(path=0, **fields):
     return control.push_ping(
         control.Ping(
-            **{"path": path, "cost": 0, "ask": True, "size": 0, "echo": None, "challenge": 0, "hold": 0, "feedback": NOTHING}
+            **{
+                "path": path,
+                "cost": 0,
+                "ask": True,
+                "size": 0,
+                "echo": None,
+                "challenge": 0,
+                "hold": 0,
+                "feedback": NOTHING,
+            }
             | fields
         )
     )

@@ -173,7 +173,7 @@ def test_handshakes_in_any_order_later_end_nothing_and_make_no_keys(world, monke
 
 
 def test_questions_after_keys_of_then_make_no_keys_later(world, monkeypatch):
-    """HELLOs of an outage, answered by a ping because the service still had the keys, again after the next handshake."""
+    """HELLOs of an outage, answered by a ping as the service still had the keys, again after the next handshake."""
     link = world.link(record=True, up=DELAY, down=DELAY)
     start = link.now
     link.roads[0].set(LinkConditions(cut=True))

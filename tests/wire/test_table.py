@@ -1,5 +1,7 @@
 """Joining the topic tables."""
 
+import json
+import zlib
 from dataclasses import replace
 
 import pytest
@@ -87,3 +89,11 @@ def test_hashes_of_two_encodings_are_not_compared():
     assert (agreed.type_hash, agreed.encoding) == ("11", "ros1")
     ((_, agreed),) = join([replace(robot, type_hash="")], {"a": service})
     assert agreed.type_hash == ""
+
+
+def test_a_table_of_many_rows_is_refused_at_once():
+    """Of many names the last twice, and more rows than there may be: to compare each with each takes seconds."""
+    rows = [[f"t{i}", "a/msg/B", "in", "", ""] for i in range(8000)]
+    for table in ([*rows, rows[-1]], [rows[0]] * 65_536):
+        with pytest.raises(ValueError, match=r"t7999: is in the table twice|more topics"):
+            pull_offer(zlib.compress(json.dumps(table).encode()))

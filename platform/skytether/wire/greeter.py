@@ -6,6 +6,7 @@ keys begin is the session's business.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Hashable
 
@@ -13,7 +14,7 @@ from .ciphers import HandshakeTags
 from .config import MIN_MTU
 from .epoch import Epoch
 from .events import Event, Refused
-from .handshake import NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
+from .handshake import MAX_REASON, NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
 from .ledger import Ledger
 from .packet import HELLO, SHARD_AT, WELCOME
 from .path import Path, Transmit
@@ -21,6 +22,8 @@ from .paths import Paths
 from .seeker import Seeker
 from .sender import Sender
 
+AMPLIFICATION = 3
+"""Bytes of an answer for each that was asked with, for nobody knows yet who asks."""
 MAX_RAW = 8
 """Handshake messages waiting to be sent: answers to a flood of repeated HELLOs stop here."""
 
@@ -141,7 +144,8 @@ class Greeter:
             if answer.reason:
                 self._refuse(answer.reason)
             answer.asked(address)
-            self._send(answer.common, answer.message, self._paths.choice.active, address)
+            most = AMPLIFICATION * len(message)
+            self._send(answer.common, answer.message, self._paths.choice.active, address, most)
 
     def _on_welcome(self, hello: Hello, common: bytes, message: bytes, path: int, now: float) -> None:
         welcome = hello.open(common, message)
@@ -170,6 +174,7 @@ class Greeter:
             self._paths.ping_to(address, known, now)
 
     def _refuse(self, reason: str) -> None:
+        reason = "".join(c if c.isprintable() else "?" for c in reason[:MAX_REASON])  # the peer's words, for a log
         if reason != self._refusal:
             self._refusal = reason
             self._events.append(Refused(reason))
@@ -178,10 +183,13 @@ class Greeter:
         send, receive = self._ledger.topics(outcome.topics)
         return Epoch(outcome.epoch, outcome.ciphers, tuple(t for _, t in outcome.topics), send, receive, outcome.life)
 
-    def _send(self, common: bytes, message: bytes, path: Path, address: Hashable) -> None:
+    def _send(self, common: bytes, message: bytes, path: Path, address: Hashable, most: float = math.inf) -> None:
+        """At most so many bytes: parity, which comes last, is left out first."""
         if len(self.waiting) >= MAX_RAW:
             return
         packets, size = cut(common, message, MIN_MTU - SHARD_AT, path.redundancy.parity, self._tags)
+        if len(packets) > most:
+            packets = packets[: int(most // size) * size]
         path.pacer.spend(len(packets))
         path.packets_sent += -(-len(packets) // size)
         path.bytes_sent += len(packets)

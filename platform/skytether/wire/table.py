@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -34,8 +35,7 @@ def index_topics(topics: Sequence[Topic]) -> dict[str, Topic]:
     """
     table = {t.name: t for t in topics}
     if len(table) < len(topics):
-        names = [t.name for t in topics]
-        twice = next(n for n in names if names.count(n) > 1)
+        twice, _ = Counter(t.name for t in topics).most_common(1)[0]
         raise ValueError(f"topic {twice}: is in the table twice")
     if len(topics) > MAX_TOPICS:
         raise ValueError(f"a session carries at most {MAX_TOPICS} topics, not {len(topics)}")
@@ -85,6 +85,8 @@ def pull_offer(data: bytes) -> list[Topic]:
         ValueError: Not a table.
     """
     rows = _pull(data)
+    if len(rows) > MAX_TOPICS:
+        raise ValueError("more topics than a session carries")
     topics = []
     for row in rows:
         name, type_name, direction, type_hash, encoding = _strings(row, 5)
