@@ -232,6 +232,24 @@ def test_what_it_writes_stays(docker_site: DockerSite, runtime: DockerRuntime) -
     assert docker("run", "--rm", "-v", f"{volume}:/d", "--entrypoint", "cat", toy, "/d/i1/recording") == "kept"
 
 
+def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room(
+    docker_site: DockerSite, tmp_path: Path
+) -> None:
+    with closing(docker_site.open(tmp_path, data_mb=1)) as runtime:
+        runtime.start(launch(docker_site))
+        until_phase(runtime, Phase.RUNNING)
+        (container,) = docker_site.containers()
+        inside(container, "open('/run/skytether/data/i1/much', 'wb').write(bytes(3 << 20)); print(1)")
+        runtime._scales.weigh()
+        assert "has more than 1 MiB in the volume" in runtime.observe()["i1"].exceeds
+        with pytest.raises(RuntimeFailure, match="has more than 1 MiB"):
+            runtime.start(launch(docker_site, "i2"))
+        inside(container, "import os; os.remove('/run/skytether/data/i1/much'); print(1)")
+        runtime._scales.weigh()
+        assert runtime.observe()["i1"].exceeds == ""
+        runtime.remove("i1")
+
+
 def test_ends_are_told_apart(docker_site: DockerSite, runtime: DockerRuntime) -> None:
     runtime.start(launch(docker_site, "hog", params={"hog_mb": 200}, needs={"memory_mb": 40}))
     runtime.start(launch(docker_site, "killed"))

@@ -61,6 +61,8 @@ class Seen:
     ill: str = ""
     """What its health check says, when that has failed for good."""
     gpus: frozenset[int] = frozenset()
+    volume: str = ""
+    """That of its data."""
     ready: bool = False
     """Its ready file was seen."""
     last_line: str = ""
@@ -235,6 +237,7 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
     state = inspected["State"]
     published = (inspected["NetworkSettings"].get("Ports") or {}).get(f"{INNER_PORT}/udp") or []
     health = state.get("Health") or {}
+    mounts = inspected.get("Mounts") or ()
     return Seen(
         id=inspected["Id"],
         instance=labels[_INSTANCE],
@@ -246,6 +249,7 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
         host_port=int(published[0]["HostPort"]) if published else None,
         ill=_complaint(health) if health.get("Status") == "unhealthy" else "",
         gpus=frozenset(int(number) for number in labels.get(_GPUS, "").split(",") if number.isdecimal()),
+        volume=next((str(m.get("Name", "")) for m in mounts if m.get("Destination") == f"{_ROOT}/{_DATA}"), ""),
     )
 
 
@@ -275,8 +279,8 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
     )
 
 
-def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None) -> Observation:
-    """What the contract calls it."""
+def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None, exceeds: str = "") -> Observation:
+    """What the contract calls it; ``exceeds``: what it wrote too much of."""
     if seen.ended:
         signalled = _SIGNALLED < seen.exit_code <= _SIGNALLED + _SIGNALS
         return Observation(
@@ -288,8 +292,9 @@ def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None) 
         )
     if seen.runs and seen.ready and seen.host_port is not None:
         used = asdict(usage) if usage is not None else {}
-        return Observation(seen.attempt, Phase.RUNNING, options.advertised, seen.host_port, detail=seen.ill, **used)
-    return Observation(seen.attempt, Phase.STARTING)
+        where = options.advertised, seen.host_port
+        return Observation(seen.attempt, Phase.RUNNING, *where, detail=seen.ill, exceeds=exceeds, **used)
+    return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds)
 
 
 def _how_it_ended(seen: Seen) -> str:

@@ -63,6 +63,9 @@ class DockerOptions(Strict):
     groups: tuple[Annotated[int, Field(ge=1, lt=1 << 31)], ...] = ()
     """Numbers of the groups that own these files on the engine's machine (``stat -c %g /dev/video0``): a service that
     asks for a device is in them, and may open it where it is not open to all."""
+    data_mb: Annotated[int, Field(ge=1)] = 20_480
+    """MiB in the volume that keeps what one service writes for one robot; what writes beyond is ended, and not started
+    until there is room. Looked at every half minute: a fast writer goes over it until then."""
     pull: Literal["missing", "always", "never"] = "missing"
     """When to fetch a service's image from its registry. `skytether/...` without a registry is never fetched but by its
     digest: these are built here (`make images`), and anybody may have the name elsewhere."""

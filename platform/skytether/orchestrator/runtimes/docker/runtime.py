@@ -24,8 +24,9 @@ from .images import check_credentials
 from .launch import Job, kill, remove
 from .logs import ContainerLog
 from .network import ensure_network, remove_network
-from .objects import Seen, observation, refusal
+from .objects import Seen, data_volume, observation, refusal
 from .options import DockerOptions
+from .volumes import Scales
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ class DockerRuntime(Runtime):
         self._options = options
         self._owner = options.owner or _kept_owner(folder)
         self._engine = Engine(options)
+        self._scales = Scales(self._engine, options.data_mb)
         self._lock = threading.Lock()
         self._jobs: dict[str, Job] = {}
         self._asked: set[str] = set()
@@ -120,6 +122,9 @@ class DockerRuntime(Runtime):
 
     def start(self, launch: Launch) -> None:
         self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
+        full = self._scales.exceeds(data_volume(self._owner, launch))
+        if full:
+            raise RuntimeFailure(full)
         with self._lock:
             job, newest = self._jobs.get(launch.instance), self._newest(launch.instance)
             if job is not None and job.attempt == launch.attempt and not job.unanswered:
@@ -142,7 +147,7 @@ class DockerRuntime(Runtime):
         # One that was made and not begun is no run: the orchestrator was killed in between, or a job is just at it.
         meter = self._follower.meter
         found = {
-            instance: observation(seen, self._options, meter.usage(seen.id))
+            instance: observation(seen, self._options, meter.usage(seen.id), self._scales.exceeds(seen.volume))
             for instance, seen in newest.items()
             if seen.status != "created"
         }
@@ -208,6 +213,7 @@ class DockerRuntime(Runtime):
     def tidy(self) -> None:
         """Remove what was begun by halves, and see whether what the network lacked is there by now."""
         self._remove_unbegun()
+        self._scales.begin()
         trying = self._early is not None and self._early.is_alive()
         if self._blocked and not trying and time.monotonic() - self._tried_at >= _AGAIN_S:
             self._begin_early()

@@ -1,0 +1,107 @@
+"""What a service has written into its volume, and what becomes of one that wrote too much."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import nullcontext
+from typing import Any
+
+from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.docker.objects import Seen, observation, parse
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.volumes import Scales, sizes
+
+DISK = {
+    "Volumes": [
+        {"Name": "full", "UsageData": {"Size": (2 << 20) + 1, "RefCount": 1}},
+        {"Name": "good", "UsageData": {"Size": 2 << 20, "RefCount": 1}},
+        {"Name": "elsewhere", "UsageData": {"Size": -1, "RefCount": -1}},
+        {"Name": "unknown"},
+    ]
+}
+
+
+class FakeEngine:
+    """Says what is on its disk, or nothing."""
+
+    def __init__(self) -> None:
+        self.disk: dict[str, Any] = dict(DISK)
+        self.asks = 0
+        self.hangs: threading.Event | None = None
+        self.refuses = False
+
+    def asked(self) -> Any:
+        return nullcontext()
+
+    def api(self, _timeout_s: float) -> FakeEngine:
+        return self
+
+    def df(self) -> dict[str, Any]:
+        self.asks += 1
+        if self.hangs is not None:
+            self.hangs.wait(30)
+        if self.refuses:
+            raise RuntimeFailure("no")
+        return self.disk
+
+
+def test_what_the_engine_says_of_its_volumes() -> None:
+    assert sizes(DISK) == {"full": (2 << 20) + 1, "good": 2 << 20}
+    assert sizes({}) == sizes({"Volumes": None}) == {}
+
+
+def test_a_volume_that_holds_too_much_is_named_until_there_is_room() -> None:
+    engine = FakeEngine()
+    scales = Scales(engine, 2)  # type: ignore[arg-type]
+    assert scales.exceeds("full") == "", "not looked at yet"
+    scales.weigh()
+    assert scales.exceeds("full").startswith("has more than 2 MiB in the volume full (the site's data_mb)")
+    assert not any(map(scales.exceeds, ("good", "elsewhere", "unknown", "")))
+    engine.disk = {"Volumes": []}
+    scales.weigh()
+    assert scales.exceeds("full") == ""
+
+
+def test_an_engine_that_takes_its_time_is_asked_once_and_holds_nobody_up() -> None:
+    engine, now = FakeEngine(), [0.0]
+    engine.hangs = threading.Event()
+    scales = Scales(engine, 2, lambda: now[0])  # type: ignore[arg-type]
+    for _ in range(5):
+        scales.begin()
+        now[0] += 100.0
+    engine.hangs.set()
+    assert engine.asks == 1
+    for thread in threading.enumerate():
+        if thread.name == "docker-volumes":
+            thread.join(30)
+    assert scales.exceeds("full")
+    engine.refuses = True
+    scales.begin()
+    for thread in threading.enumerate():
+        if thread.name == "docker-volumes":
+            thread.join(30)
+    assert engine.asks == 2
+    assert scales.exceeds("full"), "what was known stays known"
+
+
+def test_what_wrote_too_much_is_seen_so() -> None:
+    options = DockerOptions()
+    running = Seen("c", "i1", 1, "running", host_port=7, ready=True, volume="full")
+    assert observation(running, options, exceeds="too much").exceeds == "too much"
+    assert observation(Seen("c", "i1", 1, "running"), options, exceeds="too much").exceeds == "too much"
+    assert observation(running, options).phase is Phase.RUNNING
+    mounts = [
+        {"Destination": "/run/skytether", "Name": "grant"},
+        {"Destination": "/run/skytether/data", "Name": "skytether-me-data-walker-toy"},
+    ]
+    described = {
+        "Id": "c1",
+        "Config": {"Labels": {"skytether.io/instance": "i1", "skytether.io/attempt": "3"}},
+        "HostConfig": {"Memory": 0},
+        "NetworkSettings": {},
+        "State": {"Status": "running", "ExitCode": 0, "OOMKilled": False},
+        "Mounts": mounts,
+    }
+    seen = parse(described)
+    assert seen is not None
+    assert seen.volume == "skytether-me-data-walker-toy"
