@@ -107,6 +107,7 @@ def test_without_a_certificate_nothing_listens_beyond_loopback_unasked(
     told = program(host="0.0.0.0", insecure_http=True)
     with told.start() as client:
         assert client.sites()
+    assert told.end() == 0
     cert, key = certificate(tmp_path)
     secret = program(host="0.0.0.0", tls={"certificate": str(cert), "key": str(key)})
     secret.start().close()
