@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -279,6 +280,9 @@ def test_a_site_that_can_start_nothing_says_why(served: Any) -> None:
     operator = served.operator
     assert [(s.state, s.reason, s.cpu) for s in operator.sites()] == [("blocked", "the network is missing", 64)]
     waiting = operator.create_instance(ASK)
+    end = time.monotonic() + 10
+    while not operator.get_instance(waiting.id).reason and time.monotonic() < end:  # until the placer has looked
+        time.sleep(0.02)
     with pytest.raises(NotRunning, match=r"is pending after 0.2 s: waiting for a site: lab: the network is missing"):
         operator.wait_running(waiting.id, timeout=0.2)
     runtime.obstacle = ""
