@@ -38,4 +38,5 @@ def instance_of(process: psutil.Process) -> str | None:
         grant = process.environ().get(GRANT_VARIABLE)
     except psutil.Error:
         return None
-    return Path(grant).parent.name if grant else None
+    parts = Path(grant or "").parts
+    return parts[parts.index("instances") + 1] if "instances" in parts[:-1] else None
