@@ -6,6 +6,7 @@ import base64
 import importlib.util
 import io
 import json
+import socket
 import sys
 import tarfile
 from contextlib import closing, nullcontext
@@ -19,7 +20,7 @@ from docker.errors import ImageNotFound
 from pydantic import ValidationError
 
 from skytether.api.grant import Grant
-from skytether.api.manifest import ServiceSpec
+from skytether.api.manifest import Opening, ServiceSpec
 from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
@@ -28,7 +29,7 @@ from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials, ensure_image
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
-from skytether.orchestrator.runtimes.docker.network import bridge_of, rules
+from skytether.orchestrator.runtimes.docker.network import bridge_of, resolve, rules
 from skytether.orchestrator.runtimes.docker.objects import (
     Seen,
     advised,
@@ -64,7 +65,7 @@ def launch(**given: Any) -> Launch:
 
 
 def body(given: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    asked = {"image": "sha256:1", "port": None, "gpus": (), "cores": 4.0} | more
+    asked = {"image": "sha256:1", "port": None, "gpus": (), "cores": 4.0, "hosts": {}} | more
     return container(launch(**(given or {})), options(), "me", **asked)
 
 
@@ -74,7 +75,9 @@ def test_a_container_may_do_nothing_that_it_need_not() -> None:
     assert made["User"] == "65532:65532"
     assert host["ReadonlyRootfs"] is True
     assert host["CapDrop"] == ["ALL"]
-    assert host["SecurityOpt"] == ["no-new-privileges"]
+    unprivileged, profile = host["SecurityOpt"]
+    assert unprivileged == "no-new-privileges"
+    assert json.loads(profile.removeprefix("seccomp="))["defaultAction"] == "SCMP_ACT_ERRNO"
     assert host["NetworkMode"] == "skytether"
     assert not host.keys() & {"Privileged", "CapAdd", "Binds", "PidMode", "IpcMode", "UsernsMode"}
 
@@ -172,7 +175,7 @@ def test_devices_and_gpus_are_handed_over() -> None:
     assert body()["HostConfig"]["DeviceRequests"] == []
     asked = options(devices=["/dev/video0"], groups=[44])
     for needs, groups in (({"devices": ["/dev/video0"]}, ["44"]), ({}, [])):
-        made = container(launch(needs=needs), asked, "me", "x", None, (), 4.0)
+        made = container(launch(needs=needs), asked, "me", "x", None, (), 4.0, {})
         assert made["HostConfig"]["GroupAdd"] == groups
 
 
@@ -205,7 +208,7 @@ def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
 
 def test_published_and_advertised_addresses_are_two_things() -> None:
     asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
-    bindings = container(launch(), asked, "me", "x", 7700, (), 4.0)["HostConfig"]["PortBindings"]
+    bindings = container(launch(), asked, "me", "x", 7700, (), 4.0, {})["HostConfig"]["PortBindings"]
     assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
     seen = observation(Seen("c", "i1", 1, "running", host_port=7700, ready=True), asked)
     assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)
@@ -400,11 +403,74 @@ def test_credentials_must_be_private(tmp_path: Path) -> None:
         check_credentials(str(file))
 
 
-def test_the_filter_is_of_one_network() -> None:
+def test_the_profile_of_calls_is_an_allow_list_and_another_may_be_named(tmp_path: Path) -> None:
+    (profile,) = (json.loads(row[8:]) for row in options().security if row.startswith("seccomp="))
+    allowed = {name for row in profile["syscalls"] if row["action"] == "SCMP_ACT_ALLOW" for name in row["names"]}
+    forbidden = {"ptrace", "process_vm_readv", "mount", "unshare", "setns", "bpf", "keyctl", "io_uring_setup", "chroot"}
+    assert not allowed & (forbidden | {"clone3", "userfaultfd", "perf_event_open", "open_by_handle_at", "personality"})
+    assert {row["args"][0]["value"] for row in profile["syscalls"] if row["names"] == ["socket"]} == {1, 2, 10, 16}
+    assert options(seccomp="default").security == ["no-new-privileges"]
+    (tmp_path / "own.json").write_text('{"defaultAction": "SCMP_ACT_ALLOW"}')
+    own = options(seccomp=str(tmp_path / "own.json")).security
+    assert own == ["no-new-privileges", 'seccomp={"defaultAction": "SCMP_ACT_ALLOW"}']
+    with pytest.raises(RuntimeFailure, match="seccomp /nowhere"):
+        DockerRuntime("edge", tmp_path, options(seccomp="/nowhere"))
+
+
+def test_the_bridge_is_of_one_network() -> None:
     assert len(bridge_of("n" * 200)) <= 15
     assert bridge_of("a") != bridge_of("b")
-    for hook in ("input", "forward"):
-        assert f'{hook} iifname "{bridge_of("a")}" drop' in rules("a")
+
+
+def test_the_filter_lets_out_what_is_opened_and_answers() -> None:
+    assert "policy drop" in rules({})
+    assert rules({}).count(" accept") == 3  # loopback, answers, neighbours
+    names = ("192.0.2.7:443", "192.0.2.0/24:53/udp", "[2001:db8::7]:8883", "[2001:db8::/32]:123/udp")
+    made = rules(resolve(map(Opening.of, names)))
+    for wanted in (
+        "ip daddr 192.0.2.7/32 tcp dport 443 accept",
+        "ip daddr 192.0.2.0/24 udp dport 53 accept",
+        "ip6 daddr 2001:db8::7/128 tcp dport 8883 accept",
+        "ip6 daddr 2001:db8::/32 udp dport 123 accept",
+    ):
+        assert wanted in made
+
+
+def test_a_name_is_looked_up_once_and_known_within(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(host: str, port: int, **_: Any) -> list[Any]:
+        if host == "nowhere.example":
+            raise socket.gaierror("unknown")
+        return [(0, 0, 0, "", (f"192.0.2.{n}", port)) for n in (1, 2, 1)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    found = resolve([Opening.of("API.example:443")])
+    assert found == {Opening("api.example", 443): ("192.0.2.1", "192.0.2.2")}
+    made = body(hosts={"api.example": ("192.0.2.1", "192.0.2.2")})
+    assert made["HostConfig"]["ExtraHosts"] == ["api.example:192.0.2.1", "api.example:192.0.2.2"]
+    with pytest.raises(RuntimeFailure, match=r"needs\.egress: nowhere\.example has no address"):
+        resolve([Opening.of("nowhere.example:443")])
+
+
+def test_a_site_opens_what_its_operator_says() -> None:
+    wants = spec(needs={"egress": ["api.example.org:443", "192.0.2.7:123/udp"]})
+    assert refusal(wants, options()) == (
+        "the site lets nobody connect to api.example.org:443/tcp, 192.0.2.7:123/udp: "
+        "add it to the site's option 'egress'"
+    )
+    assert refusal(wants, options(egress=["*.example.org:443/tcp", "192.0.2.*:123/udp"])) is None
+    assert refusal(wants, options(egress=["*"])) is None
+    for wrong in (
+        "api.example.org",
+        "api:0",
+        "api:70000",
+        "http://api:1",
+        "192.0.2.300/24:1",
+        "a b:1",
+        "-x:1",
+        "x:1/sctp",
+    ):
+        with pytest.raises(ValidationError):
+            spec(needs={"egress": [wrong]})
 
 
 def test_the_ssh_client_asks_nobody() -> None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
-from skytether.orchestrator.runtimes.docker.network import table_of
 from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
 
 
@@ -79,15 +78,11 @@ class DockerSite:
                 self.docker(kind, "rm", *(["-f", "-v"] if kind == "container" else ["-f"]), *names)
 
     def close(self) -> None:
-        """Remove the network and its filter too."""
+        """Remove the network too."""
         self.clean()
         self.docker("network", "rm", self.network)
-        self._nft(f"delete table {table_of(self.network)}")
 
-    def filtered(self) -> bool:
-        """Whether the network's filter is there."""
-        return self._nft(f"list table {table_of(self.network)}") == 0
-
-    def _nft(self, script: str) -> int:
-        command = ["docker", "-H", self.engine, "run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN"]
-        return subprocess.run([*command, self.images.name("guard"), script], capture_output=True).returncode
+    def nft(self, network: str, script: str) -> str:
+        """What nftables says to a script in a network, ``host`` or ``container:ID``."""
+        command = ["run", "--rm", "--network", network, "--cap-add", "NET_ADMIN", self.images.name("guard")]
+        return self.docker(*command, script)

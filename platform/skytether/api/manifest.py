@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -13,6 +14,13 @@ NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", description="lower-case letters, digits and '-'")]
 Tier = Literal["robot", "edge", "cloud"]
 Device = Annotated[str, Field(pattern=r"^/dev/[A-Za-z0-9._/-]+$")]
+Egress = Annotated[
+    str,
+    Field(
+        pattern=r"^([A-Za-z0-9][A-Za-z0-9.-]{0,252}(/[0-9]{1,2})?|\[[0-9A-Fa-f:.]{2,45}(/[0-9]{1,3})?\]):[0-9]{1,5}(/(tcp|udp))?$"
+    ),
+]
+"""HOST:PORT, of TCP, or HOST:PORT/udp; HOST is a name, an address or a network, IPv6 in brackets."""
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
@@ -29,6 +37,24 @@ class Strict(BaseModel):
     """Base of everything that people or programs send us: no unknown keys, no silent changes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+class Opening(NamedTuple):
+    """One host and port that a service may connect to."""
+
+    host: str
+    port: int
+    protocol: Literal["tcp", "udp"] = "tcp"
+
+    @classmethod
+    def of(cls, text: str) -> Opening:
+        """From an entry of ``needs.egress``."""
+        address, _, protocol = text.rpartition("/") if text.endswith(("/tcp", "/udp")) else (text, "", "tcp")
+        host, _, port = address.rpartition(":")
+        return cls(host.strip("[]").lower(), int(port), "udp" if protocol == "udp" else "tcp")
+
+    def __str__(self) -> str:
+        return f"{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}/{self.protocol}"
 
 
 class TopicSpec(Strict):
@@ -154,6 +180,9 @@ class Needs(Strict):
     """As container images name them (``amd64``, ``arm64``); empty: any."""
     devices: tuple[Device, ...] = ()
     """Device files, ``/dev/video0``; a container site must offer each."""
+    egress: Annotated[tuple[Egress, ...], Field(max_length=64)] = ()
+    """What it may connect to, HOST:PORT[/udp]; all else is closed, at a container site, which must offer each. A name's
+    addresses are looked up at each start, and in the container's hosts file."""
     max_rtt_ms: Annotated[float, Field(gt=0)] | None = None
     """Above this the robot's fallback takes over; None: any."""
     max_loss: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -162,6 +191,24 @@ class Needs(Strict):
     """Instances that are kept running for nobody, with the parameters that were asked for last: a request that has
     the same ones gets one of them at once, and so does a robot whose instance fails."""
     tiers: Annotated[tuple[Tier, ...], Field(min_length=1)] = ("robot", "edge", "cloud")
+
+    @field_validator("egress")
+    @classmethod
+    def _egress_can_be_opened(cls, egress: tuple[str, ...]) -> tuple[str, ...]:
+        for text in egress:
+            opening = Opening.of(text)
+            if not 0 < opening.port < 65_536:
+                raise ValueError(f"'{text}': a port is 1 to 65535")
+            if "/" in opening.host or ":" in opening.host:
+                try:
+                    ipaddress.ip_network(opening.host, strict=False)
+                except ValueError as error:
+                    raise ValueError(f"'{text}': {error}") from None
+        return egress
+
+    @property
+    def openings(self) -> tuple[Opening, ...]:
+        return tuple(dict.fromkeys(map(Opening.of, self.egress)))
 
 
 class Limits(Strict):

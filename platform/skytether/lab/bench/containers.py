@@ -59,12 +59,10 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str) -> Iterator[Ser
         yield ServiceImage(image, manifest.spec.topics)
     finally:
         orchestrator.stop()
-        _clean(owner, options["network"], options["guard_image"])
+        _clean(owner, options["network"])
 
 
-def _clean(owner: str, network: str, guard: str) -> None:
-    from skytether.orchestrator.runtimes.docker.network import table_of
-
+def _clean(owner: str, network: str) -> None:
     containers = docker("ps", "-aq", "--filter", f"label=skytether.io/owner={owner}").split()
     if containers:
         docker("rm", "-f", "-v", *containers)
@@ -72,7 +70,6 @@ def _clean(owner: str, network: str, guard: str) -> None:
     if volumes:
         docker("volume", "rm", *volumes)
     docker("network", "rm", network)
-    docker("run", "--rm", "--network", "host", "--cap-add", "NET_ADMIN", guard, f"delete table {table_of(network)}")
 
 
 def docker_run(service: ServiceImage) -> float:

@@ -15,6 +15,7 @@ from datetime import datetime
 from http import HTTPStatus
 from typing import Any
 
+import requests
 import urllib3
 from docker.errors import NotFound
 
@@ -172,19 +173,17 @@ class Follower:
             # By the engine's clock: events from before the list are looked at again, and none is missed.
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
             quiet = self._engine.api(self._quiet_s)
-            self._stream = quiet.events(since=since, filters={**mine, "type": ["container"]}, decode=True)
-            try:
-                there = {row["Id"] for row in api.containers(all=True, filters=mine)}
-            except BaseException:
-                self._end_stream()
-                raise
+            there = {row["Id"] for row in api.containers(all=True, filters=mine)}
+        self._look_at_all(there)
+        self._failure = None
+        self._looked.set()
+        if not self._connected:
+            self._connected = True
+            self._on_connect()
         try:
-            self._look_at_all(there)
-            self._failure = None
-            self._looked.set()
-            if not self._connected:
-                self._connected = True
-                self._on_connect()
+            # Podman answers with the first event only, so that silence until then says nothing of the engine.
+            with self._engine.asked(), suppress(requests.ReadTimeout):
+                self._stream = quiet.events(since=since, filters={**mine, "type": ["container"]}, decode=True)
             self._read_events()
         finally:
             self._end_stream()

@@ -5,15 +5,19 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext, suppress
 from typing import Protocol
 
 from docker.errors import APIError, NotFound
 
+from skytether.api.manifest import Opening
+
 from ..base import Launch, RuntimeFailure
 from .engine import Engine, EngineGoneError, explain
 from .follow import Follower
 from .images import ensure_image
+from .network import close_off, guard_image, is_ours, resolve
 from .objects import Seen, advised, container, free_gpus, free_port, grant_archive, name_of
 from .options import DockerOptions
 
@@ -179,26 +183,43 @@ class Job:
 
     def _begin(self, image: str, port: int | None, gpus: tuple[int, ...]) -> Seen:
         cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
-        body = container(self.launch, self._options, self._owner, image, port, gpus, cores)
+        network, openings = self._options.network, resolve(self.launch.spec.needs.openings)
+        hosts = {opening.host: found for opening, found in openings.items() if "/" not in found[0]}
+        body = container(self.launch, self._options, self._owner, image, port, gpus, cores, hosts)
         name = name_of(self._owner, self.launch.instance, self.attempt)
+        guard = guard_image(self._engine, self._options) if is_ours(self._engine, network) else None
         with self._engine.asked():
             api = self._engine.api()
             made = str(api.create_container_from_config(body, name)["Id"])
             try:
                 api.put_archive(made, *grant_archive(self.launch))
+                if guard is not None:
+                    api.disconnect_container_from_network(made, network)
                 api.start(made)
+                if guard is not None:
+                    self._connect(guard, made, openings)
             except BaseException as error:
                 remove(self._engine, self._follower, made)
                 said = explain(error) if isinstance(error, APIError) else ""
                 if any(words in said for words in _TAKEN):
                     raise _PortTakenError(said) from error
-                if said == f"network {self._options.network} not found":
+                if said == f"network {network} not found":
                     raise _NetworkGoneError(said) from error
                 raise
         seen = self._follower.look(made)
         if seen is None:
             raise RuntimeFailure("its container was removed by somebody else")
         return seen
+
+    def _connect(self, guard: str, made: str, openings: Mapping[Opening, Iterable[str]]) -> None:
+        """Let it have the network, closed off; one that has ended meanwhile needs none."""
+        try:
+            close_off(self._engine, self._options, guard, made, openings)
+            self._engine.api().connect_container_to_network(made, self._options.network)
+        except (APIError, RuntimeFailure):
+            seen = self._follower.look(made)
+            if seen is None or not seen.ended:
+                raise
 
 
 class _NetworkGoneError(RuntimeFailure):

@@ -1,18 +1,24 @@
-"""The instances' network: robots reach them through published ports, and they reach nobody.
+"""The instances' network: robots reach them through published ports, and they reach nobody but what their site opens.
 
-A bridge of the engine lets its containers talk to every port of the engine's machine, which may be the orchestrator's.
-Only a filter there can prevent that, and only a container can set one on any engine: it runs once, with the network of
-the machine and the right to configure it, and ends.
+What an instance may begin is filtered in its own network namespace, where no reload of the machine's firewall gets to,
+and which it has no right to configure. It is started without a network; a container of the guard's image, which shares
+that namespace and nothing else with the machine, sets the filter and ends; then the network is connected. So nothing
+has any right to the machine's own network, and an instance whose filter could not be set has none.
 """
 
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import logging
+import socket
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 from docker import APIClient
 from docker.errors import APIError, NotFound
+
+from skytether.api.manifest import Opening
 
 from ..base import RuntimeFailure
 from .engine import Engine, explain, status_of
@@ -22,45 +28,71 @@ from .options import DockerOptions
 log = logging.getLogger(__name__)
 
 _OURS = "skytether.io/network"
+_FILTERED = "filtered"
+"""The label's value; networks of earlier releases have another, and a filter on the engine's machine."""
 _GUARD = "skytether.io/guard"
 _GUARD_TIMEOUT_S = 30
 _LEFT_S = 2 * _GUARD_TIMEOUT_S
 """A container of a guard that is older than another one by so much was left behind: its orchestrator was killed."""
+_TABLE = "inet skytether"
 
 
 def bridge_of(network: str) -> str:
     """Name of the network's interface on the engine's machine: 15 characters at most."""
-    return f"sky-{hashlib.sha256(network.encode()).hexdigest()[:10]}"
+    return f"skt-{hashlib.sha256(network.encode()).hexdigest()[:10]}"
 
 
-def table_of(network: str) -> str:
-    """The filter's table."""
-    return f"inet skytether_{bridge_of(network)[4:]}"
-
-
-def rules(network: str) -> str:
-    """What the filter is told. Setting it again changes nothing.
+def rules(openings: Mapping[Opening, Iterable[str]]) -> str:
+    """What the filter of one instance is told.
 
     Answers to whom called first are let through: to robots, and to the engine's own proxy of published ports.
+
+    Args:
+        openings: What it may begin, with the addresses of each.
     """
-    bridge, table = bridge_of(network), table_of(network)
-    chains = "".join(
-        f"add chain {table} {hook} {{ type filter hook {hook} priority -5; policy accept; }}; "
-        f'add rule {table} {hook} iifname "{bridge}" ct state established,related accept; '
-        f'add rule {table} {hook} iifname "{bridge}" drop; '
-        for hook in ("input", "forward")
-    )
-    return f"add table {table}; flush table {table}; {chains}"
+    allowed = [
+        f"{'ip6' if ':' in address else 'ip'} daddr {address} {opening.protocol} dport {opening.port} accept"
+        for opening, addresses in openings.items()
+        for address in addresses
+    ]
+    neighbours = "icmpv6 type { nd-neighbor-solicit, nd-neighbor-advert } accept"
+    always = ['oifname "lo" accept', "ct state established,related accept", neighbours]
+    chain = f"add chain {_TABLE} output {{ type filter hook output priority 0; policy drop; }}"
+    added = "".join(f"add rule {_TABLE} output {rule}; " for rule in (*always, *allowed))
+    return f"add table {_TABLE}; {chain}; {added}"
+
+
+def resolve(openings: Iterable[Opening]) -> dict[Opening, tuple[str, ...]]:
+    """The addresses of what is opened, as they are now: an instance keeps these, and has nobody to ask for others.
+
+    Those of a network, or of an address, are written with their prefix; those of a name are not.
+
+    Raises:
+        RuntimeFailure: A name has none.
+    """
+    found: dict[Opening, tuple[str, ...]] = {}
+    for opening in openings:
+        with suppress(ValueError):
+            found[opening] = (str(ipaddress.ip_network(opening.host, strict=False)),)
+            continue
+        try:
+            rows = socket.getaddrinfo(opening.host, opening.port, type=socket.SOCK_STREAM)
+        except OSError as error:
+            raise RuntimeFailure(f"needs.egress: {opening.host} has no address: {error}") from error
+        found[opening] = tuple(dict.fromkeys(str(row[4][0]) for row in rows))
+    return found
 
 
 def ensure_network(engine: Engine, options: DockerOptions) -> None:
-    """Have the network, closed off. One that somebody else made is left as it is.
+    """Have the network, and what its instances are closed off with. One that somebody else made is left as it is.
 
     Raises:
         EngineGoneError: The engine does not answer.
         RuntimeFailure: It cannot be made.
     """
     found = _labels(engine, options.network)
+    if found is not None and found.get(_OURS, _FILTERED) != _FILTERED:
+        found = _labels(engine, options.network) if not _removed(engine, options.network) else None
     with engine.asked():
         if found is None:
             try:
@@ -68,35 +100,47 @@ def ensure_network(engine: Engine, options: DockerOptions) -> None:
                     options.network,
                     driver="bridge",
                     check_duplicate=True,
-                    labels={_OURS: "closed", "app.kubernetes.io/managed-by": "skytether"},
+                    labels={_OURS: _FILTERED, "app.kubernetes.io/managed-by": "skytether"},
                     options={
                         "com.docker.network.bridge.name": bridge_of(options.network),
                         "com.docker.network.bridge.enable_icc": "false",
-                        "com.docker.network.bridge.enable_ip_masquerade": "false",
                     },
                 )
             except Exception as error:
                 if status_of(error) != 409:  # another orchestrator was faster
                     raise
-    if _OURS in (found if found is not None else _labels(engine, options.network) or {}):
-        _guard(engine, options)
+    if is_ours(engine, options.network):
+        guard_image(engine, options)
 
 
-def remove_network(engine: Engine, options: DockerOptions) -> None:
-    """Remove network and filter, if they are ours and nobody is in there: another site may use the same.
+def is_ours(engine: Engine, network: str) -> bool:
+    """Whether instances there are to be closed off; also while it is not there, for it would be made.
 
     Raises:
         EngineGoneError: The engine does not answer.
     """
-    if _OURS not in (_labels(engine, options.network) or {}):
-        return
+    labels = _labels(engine, network)
+    return labels is None or _OURS in labels
+
+
+def remove_network(engine: Engine, options: DockerOptions) -> None:
+    """Remove the network, if it is ours and nobody is in there: another site may use the same.
+
+    Raises:
+        EngineGoneError: The engine does not answer.
+    """
+    if is_ours(engine, options.network):
+        _removed(engine, options.network)
+
+
+def _removed(engine: Engine, network: str) -> bool:
     with engine.asked():
         try:
-            engine.api().remove_network(options.network)
+            engine.api().remove_network(network)
         except APIError as error:
-            log.info("network %s stays: %s", options.network, explain(error))
-            return
-    run_guard(engine, options.guard_image, f"delete table {table_of(options.network)}")
+            log.info("network %s stays: %s", network, explain(error))
+            return False
+    return True
 
 
 def _labels(engine: Engine, network: str) -> dict[str, str] | None:
@@ -107,35 +151,52 @@ def _labels(engine: Engine, network: str) -> dict[str, str] | None:
             return None
 
 
-def _guard(engine: Engine, options: DockerOptions) -> None:
+def guard_image(engine: Engine, options: DockerOptions) -> str:
+    """The id of the guard's image, which is on the engine.
+
+    Raises:
+        EngineGoneError: The engine does not answer.
+        RuntimeFailure: It is missing.
+    """
     try:
-        image = ensure_image(engine, options, options.guard_image, lambda _: None, by_digest=True)
+        return ensure_image(engine, options, options.guard_image, lambda _: None, by_digest=True)
     except RuntimeFailure as error:
         raise type(error)(
             f"the network of the instances cannot be closed off: {error} "
             "(option 'guard_image'), or name a network of your own (option 'network')"
         ) from error
-    said, status = run_guard(engine, image, rules(options.network))
+
+
+def close_off(
+    engine: Engine, options: DockerOptions, image: str, container: str, openings: Mapping[Opening, Iterable[str]]
+) -> None:
+    """Set the filter of a container that runs, and is not connected to any network yet.
+
+    Raises:
+        EngineGoneError: The engine does not answer.
+        RuntimeFailure: It was not set.
+    """
+    said, status = _run_guard(engine, image, container, rules(openings), options.security)
     if status:
         raise RuntimeFailure(f"the network of the instances cannot be closed off: {said.strip() or f'status {status}'}")
 
 
-def run_guard(engine: Engine, image: str, script: str) -> tuple[str, int]:
-    """Let nftables on the engine's machine do what a script says; returns what it said, and its status."""
+def _run_guard(engine: Engine, image: str, container: str, script: str, security: list[str]) -> tuple[str, int]:
+    """Let nftables do what a script says in a container's network; returns what it said, and its status."""
     body = {
         "Image": image,
         "Entrypoint": ["/usr/sbin/nft"],
         "Cmd": [script],
-        "User": "0:0",
+        "User": "0:0",  # the right below is root's alone; it goes for the network of that container only
         "HostConfig": {
-            "NetworkMode": "host",
+            "NetworkMode": f"container:{container}",
             "ReadonlyRootfs": True,
             "PidsLimit": 16,
             "Memory": 64 << 20,
             "IpcMode": "none",
             "CapDrop": ["ALL"],
             "CapAdd": ["NET_ADMIN"],
-            "SecurityOpt": ["no-new-privileges"],
+            "SecurityOpt": security,
         },
         "Labels": {_GUARD: "", "app.kubernetes.io/managed-by": "skytether"},
     }

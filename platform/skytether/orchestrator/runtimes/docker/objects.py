@@ -6,6 +6,7 @@ import io
 import tarfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 from skytether.api.grant import GRANT_VARIABLE
@@ -101,6 +102,9 @@ def refusal(spec: ServiceSpec, options: DockerOptions) -> str | None:
     missing = [device for device in spec.needs.devices if device not in options.devices]
     if missing:
         return f"the site does not offer {', '.join(missing)}: add it to the site's option 'devices'"
+    closed = [str(to) for to in spec.needs.openings if not any(fnmatchcase(str(to), p) for p in options.egress)]
+    if closed:
+        return f"the site lets nobody connect to {', '.join(closed)}: add it to the site's option 'egress'"
     return None
 
 
@@ -137,6 +141,7 @@ def container(
     port: int | None,
     gpus: tuple[int, ...],
     cores: float,
+    hosts: Mapping[str, Iterable[str]],
 ) -> dict[str, Any]:
     """The body of the engine's call that creates a container.
 
@@ -148,6 +153,7 @@ def container(
         port: UDP port to publish; None: the engine's choice.
         gpus: Numbers of its GPUs.
         cores: Of the engine's machine, which refuses a limit above them.
+        hosts: Addresses of the names that it may connect to.
     """
     spec, grant = launch.spec, launch.grant
     inner = f"{INNER_PORT}/udp"
@@ -174,10 +180,11 @@ def container(
             "NetworkMode": options.network,
             "PortBindings": {inner: [{"HostIp": options.bound, "HostPort": str(port or "")}]},
             "Dns": ["127.0.0.1"],  # nobody to ask: names would be a way out
+            "ExtraHosts": [f"{name}:{address}" for name, addresses in hosts.items() for address in addresses],
             "Init": True,  # as process 1, a service that has no handler yet could not be ended
             "ReadonlyRootfs": True,
             "CapDrop": ["ALL"],
-            "SecurityOpt": ["no-new-privileges"],
+            "SecurityOpt": options.security,
             "Memory": memory,
             "MemorySwap": memory,  # none beyond it: a service that swaps is of no use to a robot
             "NanoCpus": int(limit * 1e9),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import json
+from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import SplitResult, urlsplit
 
@@ -9,12 +12,24 @@ from pydantic import Field, model_validator
 
 from skytether.api.manifest import Device, Strict
 
+from ..base import RuntimeFailure
 from ..hosts import AdvertisedHost, BindHost, check_advertised
 
 LOCAL_SOCKET = "/var/run/docker.sock"
 Port = Annotated[int, Field(ge=1, le=65_535)]
 _NO_NETWORKS = ("host", "none", "default")
 """Words of the engine that are no bridges: with the machine's network, a service could reach all of it."""
+
+
+_OURS = str(Path(__file__).with_name("seccomp.json"))
+
+
+@functools.cache
+def _profile(path: str) -> str:
+    try:
+        return json.dumps(json.loads(Path(path).read_bytes()))
+    except (OSError, ValueError) as error:
+        raise RuntimeFailure(f"seccomp {path}: {error}") from error
 
 
 class TlsOptions(Strict):
@@ -74,16 +89,33 @@ class DockerOptions(Strict):
     registry_auth: str | None = None
     """File with the credentials of private registries, as ``docker login`` writes it (config.json); mode 0600."""
     network: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")] = "skytether"
-    """The instances' network. It is made if it is not there, and closed off: robots reach instances, these reach
-    nobody. One that somebody else made is used as it is."""
+    """The instances' network. It is made if it is not there, and each instance in it closed off: robots reach it, it
+    reaches nobody but by ``egress``. One that somebody else made is used as it is."""
+    egress: tuple[Annotated[str, Field(min_length=1, max_length=300)], ...] = ()
+    """Patterns of what manifests may open (``needs.egress``), such as ``*.example.org:443/tcp``; ``*`` is everything,
+    this machine and its neighbours included."""
     guard_image: Annotated[str, Field(min_length=1)] = "skytether/guard:1"
-    """Runs once, as root with NET_ADMIN, to close the network off. Never pulled, unless it is named with its digest."""
+    """Runs once for each start, to close the instance's own network off, with no right to any other. Never pulled,
+    unless it is named with its digest."""
+    seccomp: str | None = None
+    """File with another profile of the calls that services may make, as ``docker run`` takes it; ``default``: the
+    engine's own; None: ours (``seccomp.json``), which lets through less."""
     environment: dict[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], str] = {}
     """More variables for the services. No secrets: whoever may ask the engine sees them."""
     owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
     """Under this name containers are found again; None: one is made up when the site is added."""
     timeout_s: Annotated[float, Field(gt=0, le=300)] = 10.0
     """An engine that has not answered for this long is unreachable."""
+
+    @property
+    def security(self) -> list[str]:
+        """The engine's options for each container.
+
+        Raises:
+            RuntimeFailure: The profile cannot be read.
+        """
+        own = ["no-new-privileges"]
+        return own if self.seccomp == "default" else [*own, f"seccomp={_profile(self.seccomp or _OURS)}"]
 
     @property
     def address(self) -> SplitResult:

@@ -30,6 +30,8 @@ from .volumes import Scales
 
 log = logging.getLogger(__name__)
 
+_HOLDS = {"userns": "user namespace", "rootless": "rootless engine", "seccomp": "seccomp", "apparmor": "AppArmor"}
+"""In words for people, what an engine says of its own security."""
 _AGAIN_S = 10.0
 """Seconds between two attempts to make the network of a site ready that could not be."""
 
@@ -53,6 +55,7 @@ class DockerRuntime(Runtime):
         for path in (options.tls.ca, options.tls.cert, options.tls.key) if options.tls else ():
             if not Path(path).is_file():
                 raise RuntimeFailure(f"tls: there is no file {path}")
+        options.security  # noqa: B018 (a profile that cannot be read is told now)
         if options.registry_auth is not None:
             check_credentials(options.registry_auth)
         self._site = site
@@ -110,6 +113,15 @@ class DockerRuntime(Runtime):
     def blocked(self) -> str:
         return self._blocked
 
+    @override
+    def isolation(self) -> tuple[str, ...]:
+        try:
+            told = self._follower.info(0).get("SecurityOptions") or ()
+        except RuntimeFailure:
+            return ()
+        names = {row.partition(",")[0].removeprefix("name=") for row in told}
+        return ("own user", "no capabilities", *(word for name, word in _HOLDS.items() if name in names))
+
     def refuses(self, spec: ServiceSpec) -> str | None:
         return refusal(spec, self._options)
 
@@ -154,7 +166,9 @@ class DockerRuntime(Runtime):
         with self._lock:
             jobs = dict(self._jobs)
         for instance, job in jobs.items():
-            if instance in found and found[instance].attempt >= job.attempt:
+            # One that a start ends again, for it could not be closed off, is no run that crashed.
+            told = found.get(instance)
+            if told and told.attempt >= job.attempt and (job.ended or told.phase is not Phase.EXITED):
                 continue
             if job.unanswered:
                 continue  # as if it had not been begun: it is, once the engine answers
