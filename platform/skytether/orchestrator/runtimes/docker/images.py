@@ -16,6 +16,7 @@ from skytether.api.pull import Pull
 from ..base import RuntimeFailure
 from .engine import Engine, explain
 from .options import DockerOptions
+from .signed import check
 
 _UNOWNED = "skytether/"
 """What the names of our own images begin with, as `make images` builds them."""
@@ -99,8 +100,17 @@ def ensure_image(
 
     Raises:
         EngineGoneError: The engine does not answer.
-        RuntimeFailure: The image is missing and cannot be pulled.
+        RuntimeFailure: The image is missing and cannot be pulled, or nobody has signed it who must have.
     """
+    found = _on_the_engine(engine, options, image, tell, by_digest=by_digest)
+    if options.signatures is not None:
+        check(image, found, options.signers, options.signatures)
+    return found
+
+
+def _on_the_engine(
+    engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None], *, by_digest: bool
+) -> str:
     may_pull = "@sha256:" in image if by_digest else is_pulled(image)
     if options.pull != "always" or not may_pull:
         found = _find(engine, image)

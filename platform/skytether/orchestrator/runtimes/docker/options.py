@@ -86,6 +86,11 @@ class DockerOptions(Strict):
     digest: these are built here (`make images`), and anybody may have the name elsewhere."""
     pinned: bool = False
     """Take only images that are named with their digest, NAME@sha256:..."""
+    signers: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]{43}=$")], ...] = ()
+    """Public keys (Ed25519, 32 bytes in base64) one of which must have signed each image, the guard's too; none: images
+    need no signature."""
+    signatures: str | None = None
+    """Folder with the signatures, on the orchestrator's machine."""
     registry_auth: str | None = None
     """File with the credentials of private registries, as ``docker login`` writes it (config.json); mode 0600."""
     network: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")] = "skytether"
@@ -157,6 +162,8 @@ class DockerOptions(Strict):
     @model_validator(mode="after")
     def _robots_can_connect(self) -> DockerOptions:
         check_advertised(self.advertised)
+        if bool(self.signers) != (self.signatures is not None):
+            raise ValueError("signers and signatures go together: the keys, and the folder with what they signed")
         if self.network in _NO_NETWORKS:
             raise ValueError(f"network: '{self.network}' has no published ports, by which robots reach instances")
         if self.ports is not None and self.ports[0] > self.ports[1]:
