@@ -32,7 +32,7 @@ unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile
 
 images: $(READY) ## the container images, on the Docker engine of this machine; prints build time and size of each
-	$(BIN)/python images/build.py
+	$(BIN)/python images/build.py --sbom build/images/sbom
 
 fuzz: $(READY) ## every byte that can arrive, with coverage, 30 s for each target (SECONDS=300 for more)
 	$(BIN)/python tests/fuzz/run.py --seconds $(or $(SECONDS),30)

@@ -20,6 +20,7 @@ import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import docker
 import pip
@@ -247,6 +248,43 @@ def _numerical(client: docker.DockerClient, image: str) -> int:
     return sum(int(line.split()[0]) for line in said.decode().splitlines())
 
 
+_LISTED = """
+dpkg-query -W -f 'deb\\t${Package}\\t${Version}\\t${Architecture}\\n'
+[ ! -x /app/bin/python ] || /app/bin/python -c '
+from importlib.metadata import distributions
+for one in distributions(): print("pypi", one.name, one.version, sep="\\t")'
+"""
+"""Says a row of an image's every package: its kind, name, version, architecture."""
+
+
+def bill(image: str, image_id: str, listed: str) -> dict[str, object]:
+    """What an image is made of, as CycloneDX 1.5 wants it (https://cyclonedx.org): the same text for the same image."""
+    components = []
+    for kind, name, version, *architecture in sorted({tuple(line.split("\t")) for line in listed.splitlines() if line}):
+        where = "deb/debian" if kind == "deb" else kind
+        known = name if kind == "deb" else canonicalize_name(name)
+        purl = f"pkg:{where}/{quote(known)}@{quote(version, safe='~')}"
+        purl += f"?arch={architecture[0]}" if architecture else ""
+        components.append({"type": "library", "name": name, "version": version, "purl": purl, "bom-ref": purl})
+    about = {"type": "container", "name": image, "version": image_id}
+    return {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": {"component": about},
+        "components": components,
+    }
+
+
+def write_bill(client: docker.DockerClient, image: str, folder: Path) -> None:
+    """List an image's packages, by its own package managers, into a file beside those of the other images."""
+    said = client.containers.run(image, ["-c", _LISTED], entrypoint="/bin/sh", remove=True, network_disabled=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = bill(image, client.api.inspect_image(image)["Id"], said.decode())
+    name = re.sub(r"[^A-Za-z0-9.-]", "_", image)
+    (folder / f"{name}.cdx.json").write_text(json.dumps(document, indent=1) + "\n")
+
+
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -254,6 +292,7 @@ def main() -> int:
     parser.add_argument("--prefix", default="skytether/", help="before each name, such as REGISTRY/skytether/")
     parser.add_argument("--tag", default=TAG)
     parser.add_argument("--debian", default="debian:bookworm-slim", help="what the base is built from")
+    parser.add_argument("--sbom", type=Path, help="write a list of each image's packages (CycloneDX) into this folder")
     parser.add_argument("--json", action="store_true", help="print rows `image, seconds, size_mb, numerical_mb`")
     asked = parser.parse_args()
     rows = []
@@ -268,6 +307,8 @@ def main() -> int:
             make_wheel()
         for name in names:
             rows.append(build(client, name, asked.prefix, asked.tag, asked.debian))
+            if asked.sbom:
+                write_bill(client, rows[-1].image, asked.sbom)
             if not asked.json:
                 print(_line(rows[-1]), flush=True)
     except (BuildError, subprocess.TimeoutExpired, DockerException) as error:

@@ -508,7 +508,7 @@ mypy==2.4 \\
 """
 
 
-def test_an_image_gets_what_the_lock_file_pins_for_it() -> None:
+def build_script() -> Any:
     found = importlib.util.spec_from_file_location("images_build", ROOT / "images" / "build.py")
     assert found is not None
     assert found.loader is not None
@@ -518,6 +518,22 @@ def test_an_image_gets_what_the_lock_file_pins_for_it() -> None:
         found.loader.exec_module(build)
     finally:
         del sys.modules["images_build"]
+    return build
+
+
+def test_what_is_in_an_image_is_listed_the_same_each_time() -> None:
+    rows = ["pypi\tPyYAML\t6.0.3", "deb\tg++\t4:12.2.0-3~x\tamd64", "deb\tg++\t4:12.2.0-3~x\tamd64", ""]
+    made = build_script().bill("skytether/x:1", "sha256:ab", "\n".join(rows))
+    assert made == build_script().bill("skytether/x:1", "sha256:ab", "\n".join(reversed(rows)))
+    assert made["metadata"]["component"] == {"type": "container", "name": "skytether/x:1", "version": "sha256:ab"}
+    assert [row["purl"] for row in made["components"]] == [
+        "pkg:deb/debian/g%2B%2B@4%3A12.2.0-3~x?arch=amd64",
+        "pkg:pypi/pyyaml@6.0.3",
+    ]
+
+
+def test_an_image_gets_what_the_lock_file_pins_for_it() -> None:
+    build = build_script()
     old = build.locked(LOCK, {"python_full_version": "3.11.2"})
     assert old["numpy"][0] == "numpy==2.4.6 \\\n    --hash=sha256:aa"
     assert "rosbags" in old["numpy"][1]
