@@ -185,7 +185,7 @@ def test_what_a_site_opens_is_open_and_no_more_and_no_reload_of_the_machines_fir
             assert udp.recv(10) == b"x"
         assert "localhost" in docker("exec", container, "cat", "/etc/hosts")
         # Nothing of it is in the machine's own firewall, which may be read anew at any time.
-        assert "skytether" not in docker_site.nft("host", "list ruleset")
+        assert "table inet skytether {" not in docker_site.nft("host", "list ruleset")
         assert "policy drop" in docker_site.nft(f"container:{container}", "list table inet skytether")
         runtime.remove("i1")
 
