@@ -34,12 +34,12 @@ class Knows:
 class Scene:
     """A reception before an app that answers when it is told to."""
 
-    def __init__(self, **limits: Any) -> None:
+    def __init__(self, pause_s: float = 0.0, **limits: Any) -> None:
         self.go = asyncio.Event()
         self.read: list[bytes] = []
         self.now = 0.0
         self.strain = Strain(lambda: self.now)
-        self.reception = Reception(self.app, Knows(), Limits(**limits), self.strain)
+        self.reception = Reception(self.app, Knows(), Limits(**limits), self.strain, pause_s)
 
     async def app(self, scope: Any, receive: Any, send: Any) -> None:
         self.read.append((await receive())["body"])
@@ -120,6 +120,25 @@ def test_nothing_is_read_of_a_body_before_its_sender_is_known_and_none_takes_a_p
             await asyncio.gather(*slow, again)
         assert (await at.ask(token="r0"))[0] == 200
         assert at.read == [b"whole", b""]
+
+    run(scene)
+
+
+def test_who_is_a_stranger_or_asks_too_often_waits_for_the_answer_and_nobody_else_does() -> None:
+    async def scene() -> None:
+        at = Scene(pause_s=1000.0, robot_requests_at_once=1)
+        under_way = asyncio.create_task(at.ask(token="r0", body=[]))
+        await settle()
+        refused = [
+            asyncio.create_task(one)
+            for one in (at.ask(token=""), at.ask(token="r0"), at.ask("/api/v1/instances/../x"), at.ask("/no"))
+        ]
+        at.go.set()
+        await settle()
+        assert [one.done() for one in refused] == [False, False, False, True], "the last is served"
+        assert (await at.ask(token="r1"))[0] == (await at.ask(RENEWAL, "r2"))[0] == 200
+        for one in (under_way, *refused):
+            one.cancel()
 
     run(scene)
 

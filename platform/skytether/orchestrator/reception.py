@@ -6,6 +6,7 @@ sender has shown a good token, and no place is taken before all of it is there.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
 from collections import Counter
@@ -20,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .access import Principal
 from .door import GUEST
-from .errors import TooManyError
+from .errors import TooManyError, UnauthenticatedError
 from .problems import answer, answer_to
 from .settings import Limits
 from .strain import Strain
@@ -32,6 +33,7 @@ RUN = "run"
 _FREE = "/healthz"
 """Costs nothing; and to take an orchestrator for dead because it has much to do would help nobody."""
 _API = "/api/"
+_NOT_FOUND = 404
 _RENEWAL = re.compile(r"/api/v1/instances/[^/]+/renew")
 _ASTRAY = re.compile(r"/(\.{0,2})(/|$)|[\x00-\x1f\x7f]")
 """What some proxies and clients take for another path than we would."""
@@ -42,6 +44,10 @@ _STRANGERS = 16
 """Requests under way of those who need no token: they must not take the places of those who have one."""
 _THREADS = 8
 """For what a renewal needs of the database: others' requests are not waited for."""
+_PAUSE_S = 0.25
+"""Before a stranger's question is refused, or one of somebody who asks too often: who waits does not ask further."""
+_MOST_PAUSES = 1024
+"""At a time; whoever comes on top is refused at once."""
 
 
 class Doorman(Protocol):
@@ -64,8 +70,18 @@ class Doorman(Protocol):
 class Reception:
     """ASGI middleware: authenticates, reads the body, and bounds the requests under way."""
 
-    def __init__(self, app: ASGIApp, doorman: Doorman, limits: Limits, strain: Strain) -> None:
-        """``strain`` is told when a robot that wants to renew is refused."""
+    def __init__(
+        self, app: ASGIApp, doorman: Doorman, limits: Limits, strain: Strain, pause_s: float = _PAUSE_S
+    ) -> None:
+        """Bounds are those of ``limits``.
+
+        Args:
+            app: Serves.
+            doorman: Knows tokens.
+            limits: How much and how many.
+            strain: Told when a robot that wants to renew is refused.
+            pause_s: Before some refusals [s].
+        """
         self._app = app
         self._doorman = doorman
         self._limits = limits
@@ -73,6 +89,8 @@ class Reception:
         self._places, self._strangers = _Places(), _Places()
         self._of: Counter[str] = Counter()
         self._held = 0
+        self._pause_s = pause_s
+        self._pausing = _Places()
         self._limiter: CapacityLimiter | None = None
         """Made where there is a loop."""
 
@@ -86,16 +104,20 @@ class Reception:
             return await self._place(scope, b"", send, renewal=False)
         if _ASTRAY.search(scope["path"]):
             text = "a path goes down, by names: none of them is empty or made of dots"
+            await self._pause()
             return await answer(Request(scope), 404, "Not found", text)(scope, receive, send)
         renewal = scope["method"] == "POST" and _RENEWAL.fullmatch(scope["path"]) is not None
         try:
             caller = await self._who(scope, renewal)
         except Exception as error:  # whatever it is, there is one place that knows what to say of it
+            if isinstance(error, UnauthenticatedError | TooManyError):
+                await self._pause()
             return await (await answer_to(Request(scope), error))(scope, receive, send)
         with contextlib.ExitStack() as until_answered:
             if not until_answered.enter_context(self._one_of(caller)):
                 most = self._limits.robot_requests_at_once
                 text = f"{most} requests of this robot are under way: wait for their answers"
+                await self._pause()
                 return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
             with _Body(
                 self, self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
@@ -186,9 +208,17 @@ class Reception:
             async def noting(message: Message) -> None:
                 if message["type"] == "http.response.start":
                     held.close()
+                    if receive is None and message["status"] == _NOT_FOUND:
+                        await self._pause()
                 await send(message)
 
             await self._app(scope, _replaying(body, receive), noting)
+
+    async def _pause(self) -> None:
+        """Let somebody wait who has nothing to ask for, or asks too often: it costs them time, and nobody work."""
+        if self._pausing.taken < _MOST_PAUSES:
+            with self._pausing.one():
+                await asyncio.sleep(self._pause_s)
 
     def _most(self, renewal: bool) -> int:
         limits = self._limits
