@@ -32,7 +32,7 @@ SESSION = Session(
     needs=ServiceNeeds(max_rtt_ms=600, max_loss=0.2),
 )
 CONFIG = AgentConfig(
-    robot="walker", url="http://nowhere", token="secret-token", service="virtual-trail", fallback="admittance"
+    robot="walker", url="https://nowhere", token="secret-token", service="virtual-trail", fallback="admittance"
 )
 
 

@@ -8,7 +8,7 @@ from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.task_manager import Mode, Policy
 from skytether.robot.tasks import TaskConfig
 
-CONFIG = AgentConfig(robot="walker", url="http://nowhere", token="old", service="guide", fallback="admittance")
+CONFIG = AgentConfig(robot="walker", url="https://nowhere", token="old", service="guide", fallback="admittance")
 
 
 def make(base, orchestrator, **changes):
