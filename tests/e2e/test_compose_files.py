@@ -38,6 +38,8 @@ def test_a_container_may_nothing_that_it_does_not_need(name: str) -> None:
     image = re.fullmatch(r"\$\{[A-Z]+_IMAGE:-(.+):(.+)}", service["image"])
     assert image is not None
     assert re.fullmatch(r"1|v?\d+\.\d+[.\w-]*", image[2])
+    if image[1].startswith("skytether/"):
+        assert service["pull_policy"] == "never", "in a public registry anybody may have that name"
     for port in service.get("ports", ()):
         assert re.match(r"127\.0\.0\.1:|\$\{SKYTETHER_INSECURE_HTTP_ADDRESS:-127\.0\.0\.1}:", port)
 

@@ -169,3 +169,17 @@ def test_who_needs_no_token_takes_no_place_of_those_who_have_one() -> None:
         await asyncio.gather(*waiting)
 
     run(scene)
+
+
+def test_a_renewal_for_which_there_is_no_room_is_felt_as_strain() -> None:
+    """As long as the orchestrator itself refuses, no lease runs out."""
+
+    async def scene() -> None:
+        at = Scene()
+        assert at.reception.hold(64 << 20)
+        assert (await at.ask(body=[b"whole"]))[0] == 503
+        assert not at.strain.felt()
+        assert (await at.ask(RENEWAL, "walker", body=[b"whole"]))[0] == 503
+        assert at.strain.felt()
+
+    run(scene)

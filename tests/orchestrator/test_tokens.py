@@ -242,7 +242,17 @@ def test_no_scope_makes_a_site_that_runs_as_the_orchestrator(served: Any, option
     served.operator.create_site(SiteCreate(name="here", tier="edge", runtime="process"))
 
 
-@pytest.mark.parametrize("option", [{"devices": ["/dev/sda"]}, {"groups": [6]}, {"guard_image": "evil:1"}])
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"devices": ["/dev/sda"]},
+        {"groups": [6]},
+        {"guard_image": "evil:1"},
+        {"network": "bridge"},
+        {"egress": ["*"]},
+        {"seccomp": "default"},
+    ],
+)
 def test_no_scope_gives_a_site_of_containers_what_opens_the_machine(served: Any, option: dict[str, Any]) -> None:
     every = served.operator.create_token(TokenCreate(name="every", scopes=SCOPES)).token
     asked = SiteCreate(name="edge", tier="edge", runtime="docker", options=option)

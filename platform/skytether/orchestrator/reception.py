@@ -33,7 +33,7 @@ RUN = "run"
 _FREE = "/healthz"
 """Costs nothing; and to take an orchestrator for dead because it has much to do would help nobody."""
 _API = "/api/"
-_NOT_FOUND = 404
+_NOT_FOUND, _BUSY = 404, 503
 _RENEWAL = re.compile(r"/api/v1/instances/[^/]+/renew")
 _ASTRAY = re.compile(r"/(\.{0,2})(/|$)|[\x00-\x1f\x7f]")
 """What some proxies and clients take for another path than we would."""
@@ -125,6 +125,8 @@ class Reception:
                 try:
                     await body.read(scope, receive)
                 except _RefusedError as why:
+                    if renewal and why.busy:
+                        self._strain.note()
                     return await why.answer(Request(scope))(scope, receive, send)
                 except _LeftError:
                     return None
@@ -249,10 +251,12 @@ class _RefusedError(Exception):
     def __init__(self, status: int, title: str, text: str) -> None:
         super().__init__(text)
         self._said = status, title, text
+        self.busy = status == _BUSY
+        """There was no room; its sender did nothing wrong."""
 
     def answer(self, request: Request) -> Response:
         status, title, text = self._said
-        return answer(request, status, title, text, headers={"Retry-After": "1"} if status == 503 else {})
+        return answer(request, status, title, text, headers={"Retry-After": "1"} if self.busy else {})
 
 
 class _Body:
@@ -285,7 +289,9 @@ class _Body:
             chunk = message.get("body", b"")
             self._check(len(self.data) + len(chunk))
             if not self._reception.hold(len(chunk)):
-                raise _RefusedError(503, "Too busy", "too many large requests are on their way: try again in a second")
+                raise _RefusedError(
+                    _BUSY, "Too busy", "too many large requests are on their way: try again in a second"
+                )
             self.data += chunk
             if not message.get("more_body", False):
                 return

@@ -82,7 +82,7 @@ def docker_run(service: ServiceImage) -> float:
         grant, ready = Path(folder) / "grant.json", Path(folder) / "ready.json"
         grant.touch(0o600)
         grant.write_text(_grant(service).model_dump_json())
-        command = ["run", "-d", "--init", "--user", f"{os.geteuid()}:{os.getegid()}"]
+        command = ["run", "-d", "--pull", "never", "--init", "--user", f"{os.geteuid()}:{os.getegid()}"]
         command += ["-v", f"{folder}:{_INSIDE}", "-e", f"{GRANT_VARIABLE}={_INSIDE}/grant.json"]
         command += ["-p", f"127.0.0.1::{_PORT}/udp", service.image]
         begun = time.monotonic()

@@ -46,7 +46,7 @@ class DockerRuntime(Runtime):
     Options = DockerOptions
     unique = "owner"
     runs_as_us = False
-    owner_options = frozenset({"devices", "groups", "guard_image"})
+    owner_options = frozenset({"devices", "groups", "guard_image", "network", "egress", "seccomp"})
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
