@@ -9,17 +9,18 @@ from skytether.lab.bench.hostile import bench_hostile, growth
 
 @pytest.mark.slow
 def test_the_others_notice_nothing_of_a_hostile_robot():
-    row = bench_hostile(4, 0.2)
+    row = bench_hostile(4, 0.2, lease_s=5)
     assert (row.robots, row.failed, row.ended_wrongly) == (4, 0, 0)
     assert row.renewals > 10
     assert 0 < row.renew_p50_ms <= row.renew_p99_ms <= row.renew_max_ms
     assert row.quiet_p99_ms > 0
     assert 0 < row.refused <= row.attacks
-    tried = {"names made up", "series made up", "instances", "another's name", "pattern", "deep JSON", "tokens guessed"}
+    assert row.memory_growth_mb < 50
+    tried = {"names made up", "series made up", "instances", "pattern", "deep JSON", "tokens guessed"}
+    tried |= {"another's name", "another's key", "renewals guessed", "another host"}
     assert tried <= row.answers.keys()
     for kind in tried:
         assert {status // 100 for status in row.answers[kind]} <= {0, 4}, kind
-    assert row.answers["rotation"].get(201, 0) <= 1, "a token has one successor"
 
 
 def test_memory_grows_from_the_second_quarter_on():

@@ -84,13 +84,16 @@ class HostileRow:
         return asdict(self)
 
 
-def bench_hostile(robots: int, minutes: float, on_progress: Callable[[str], None] = lambda _: None) -> HostileRow:
+def bench_hostile(
+    robots: int, minutes: float, on_progress: Callable[[str], None] = lambda _: None, lease_s: float = _LEASE_S
+) -> HostileRow:
     """Let one of the robots do its worst, and look after the others.
 
     Args:
         robots: At least two.
         minutes: Of attack.
         on_progress: Told what is done.
+        lease_s: Of the others' instances [s]; long enough for all of them to start.
 
     Raises:
         BenchError: Not all instances ran in time.
@@ -106,7 +109,7 @@ def bench_hostile(robots: int, minutes: float, on_progress: Callable[[str], None
         operator.delete_site("local")
         tokens = [operator.create_robot(RobotCreate(name=f"robot-{i}")).token for i in range(robots - 1)]
         hostile = operator.create_robot(RobotCreate(name="hostile")).token
-        held = start(operator, tokens, on_progress, _LEASE_S)
+        held = start(operator, tokens, on_progress, lease_s)
         with Client(orchestrator.url, hostile) as client:
             own = client.create_instance(InstanceCreate(robot="hostile", service=SERVICE, lease_s=3600)).id
             client.wait_running(own)
@@ -118,7 +121,7 @@ def bench_hostile(robots: int, minutes: float, on_progress: Callable[[str], None
         quiet = renew(min(_QUIET_S, 60 * minutes))
         on_progress(f"attack for {minutes:g} min")
         written = _size(orchestrator.state_dir)
-        target = Target(orchestrator.url, hostile, "hostile", own, "robot-0")
+        target = Target(orchestrator.url, hostile, "hostile", own, "robot-0", held[0].instance)
         with _watched(orchestrator.pid) as memory, _attacked(target) as answers:
             under_attack = renew(60 * minutes)
             ended = lost(operator, [one.instance for one in held])

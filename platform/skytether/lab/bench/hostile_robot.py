@@ -45,6 +45,7 @@ _SWEEP_S = 0.5
 """Between looks for those that were closed, to open them again."""
 _TIMEOUT_S = 20.0
 _API = "/api/v1"
+_UNKNOWN = {"Authorization": "Bearer sky-" + "0" * 64}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,7 @@ class Target:
         robot: Its name.
         instance: Its instance.
         victim: Name of another robot.
+        others: That robot's instance.
     """
 
     url: str
@@ -64,6 +66,7 @@ class Target:
     robot: str
     instance: str
     victim: str
+    others: str
 
 
 def attack(pipe: Connection, target: Target) -> None:
@@ -124,9 +127,12 @@ def _asks(target: Target) -> list[Iterator[Request]]:
         ),
         post("rotation", f"{_API}/tokens/self/rotate", lambda _: {}),
         post("deep JSON", instances, lambda _: json.loads("[" * 90 + "]" * 90)),
+        post("another's key", f"{instances}/{target.others}/session", lambda n: {"claim": f"{n:016}"}),
+        get("renewals guessed", lambda _: f"{instances}/{target.others}/renew", _UNKNOWN, "POST"),
+        get("another host", lambda _: instances, {**own, "Host": "evil.example"}),
         get("odd names", lambda _: f"{instances}/{quote(f'../robots/{target.victim}', safe='')}", own, "DELETE"),
         get("long paths", lambda n: f"/{n}" + "x" * 6000, {}),
-        get("tokens guessed", lambda _: instances, {"Authorization": "Bearer sky-" + "0" * 64}),
+        get("tokens guessed", lambda _: instances, _UNKNOWN),
         get("lists", lambda _: instances, own),
     ]
 
