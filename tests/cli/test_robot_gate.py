@@ -1,11 +1,13 @@
 """The gate of ``robot run``: one that was found, and ends; one of its own, and what becomes of it beside others."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from skytether.cli import robot_gate
 from skytether.cli.robot_gate import FoundGate, OwnGate
+from skytether.guard.latch import FIRST_ACT
 
 
 class Own:
@@ -73,13 +75,15 @@ def test_a_gate_that_is_started_anew_or_ended_later_is_left_alone(robot):
 class Started:
     """An own gate whose processes are played, in a folder that another guard may have."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self, monkeypatch, lost=""):
+        self.stopped, self.kept, self.lost = "", True, lost
         self.now, self.there, self.guard_pid, self.asked, self.processes = 100.0, False, 7, [], []
         monkeypatch.setattr(OwnGate, "_start", lambda _: self.start())
         monkeypatch.setattr(robot_gate, "listens", lambda folder: True)
         monkeypatch.setattr(robot_gate, "_there", lambda folder: self.there)
         monkeypatch.setattr(robot_gate, "ask", self.ask)
-        safety = SimpleNamespace(place=lambda: "run")
+        monkeypatch.setattr(robot_gate, "lost_at_reboot", lambda path: self.lost)
+        safety = SimpleNamespace(place=lambda: Path("run"), record_file=lambda: "record")
         self.gate = OwnGate("robot.yaml", safety, assumed=True, clock=lambda: self.now)
 
     def start(self):
@@ -90,7 +94,7 @@ class Started:
 
     def ask(self, folder, request, timeout):
         self.asked.append(request["do"])
-        return {"guard_pid": self.guard_pid, "stopped": ""}
+        return {"guard_pid": self.guard_pid, "stopped": self.stopped, "kept": self.kept}
 
     def look(self, seconds):
         for _ in range(round(seconds / 0.5)):
@@ -107,6 +111,25 @@ def test_the_own_gate_is_started_once_with_the_robot(started):
     started.gate.wait()
     started.look(5.0)
     assert started.asked == ["status", "status", "start"]
+
+
+def test_where_a_reboot_forgets_a_stop_the_start_of_the_robot_is_no_reset(monkeypatch):
+    started = Started(monkeypatch, lost="it is on a tmpfs")
+    started.stopped = FIRST_ACT
+    started.gate.wait()
+    assert "on a tmpfs" in started.gate.look()
+    started.look(50.0)
+    assert set(started.asked) == {"status"}
+
+
+def test_while_a_stop_cannot_be_kept_the_start_of_the_robot_is_no_reset(started):
+    started.stopped, started.kept = FIRST_ACT, False
+    started.gate.wait()
+    started.look(5.0)
+    assert set(started.asked) == {"status"}
+    started.kept = True
+    started.look(5.0)
+    assert started.asked[-3:] == ["status", "reset", "start"]
 
 
 def test_a_gate_of_somebody_else_is_neither_reset_nor_started(started):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.guard.latch import FIRST_ACT, SIZE, Keeper, Latch, clean, decode, encode
+from skytether.guard.latch import FIRST_ACT, SIZE, Keeper, Latch, clean, decode, encode, lasting_file
 
 BOOT = "7f0c"
 
@@ -169,6 +169,62 @@ def test_what_another_user_has_put_there_releases_nothing_and_keeps_nothing(tmp_
     keeper.keep(1, "somebody fell")
     wait(lambda: keeper.kept.done == 1)
     assert not path.exists()  # root may remove it; a file that is not there is a stop
+
+
+def test_a_stop_outlives_a_reboot_that_empties_the_folder(tmp_path):
+    path, lasting = tmp_path / "run" / "latch", lasting_file(str(tmp_path / "run"), str(tmp_path / "lib" / "record"))
+    path.parent.mkdir()
+
+    def boot(name):
+        return Latch(Keeper(str(path), name, pytest.fail, lasting))
+
+    def say(latch, act):
+        latch._keeper.start()
+        act(latch)
+        wait(lambda: latch.kept)
+        path.unlink()
+
+    first = boot("first")
+    assert first.reason == FIRST_ACT
+    say(first, lambda latch: latch.stop("somebody fell"))
+    second = boot("second")
+    assert second.reason == "somebody fell (before the guard was started again)"
+    say(second, lambda latch: latch.reset(latch.generation))
+    assert boot("third").reason == FIRST_ACT, "a machine that was started is reset by a person"
+
+
+def test_the_second_file_is_beside_the_record_and_stops_only(tmp_path):
+    assert lasting_file("/run/skytether", "/run/skytether/record") == ""
+    lasting = lasting_file("/run/skytether", "/var/lib/skytether/safety-record")
+    assert lasting == "/var/lib/skytether/safety-record-latch"
+    first, second = tmp_path / "latch", tmp_path / "record-latch"
+    for one, other, reason in [
+        (encode("", BOOT), None, ""),
+        (encode("", BOOT), encode(FIRST_ACT, "another"), ""),
+        (encode("", BOOT), encode("it fell", "another"), "it fell"),
+        (encode("it fell", BOOT), encode("", BOOT), "it fell"),
+        (None, encode("", BOOT), FIRST_ACT),
+        (None, b"nonsense", "cannot be read"),
+    ]:
+        for path, data in ((first, one), (second, other)):
+            path.unlink(missing_ok=True)
+            if data is not None:
+                path.write_bytes(data)
+        found = Keeper(str(first), BOOT, pytest.fail, str(second)).before()
+        assert reason in found
+        assert bool(reason) is bool(found)
+
+
+def test_a_stop_that_would_not_outlive_a_reboot_is_not_kept(tmp_path):
+    (tmp_path / "file").touch()
+    told = []
+    keeper = Keeper(str(tmp_path / "latch"), BOOT, told.append, str(tmp_path / "file" / "record-latch"))
+    keeper.start()
+    keeper.keep(1, "somebody fell")
+    wait(lambda: keeper.kept.done == 1)
+    assert "record-latch" in keeper.kept.error
+    wait(lambda: bool(told))
+    assert decode((tmp_path / "latch").read_bytes(), BOOT).startswith("somebody fell")
 
 
 def test_a_link_is_not_followed(tmp_path):

@@ -8,9 +8,17 @@ from typing import Any
 
 import pytest
 
+from skytether.guard.latch import lasting_file
 from skytether.robot.safety.client import GateError, ask
+from skytether.robot.safety.protocol import default_record
 
 PATIENCE_S = 30.0
+
+
+def forget_stops(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of tests may be called as one of days ago; what that was stopped for is kept outside of it."""
+    monkeypatch.setenv("SKYTETHER_GATE_FOLDER", str(folder))
+    Path(lasting_file(str(folder), str(default_record()))).unlink(missing_ok=True)
 
 
 def insist(folder: Path, request: dict[str, Any]) -> dict[str, Any]:

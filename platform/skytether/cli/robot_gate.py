@@ -18,7 +18,8 @@ from pathlib import Path
 
 from skytether.guard.claim import guarded
 from skytether.guard.folder import objection
-from skytether.guard.latch import FIRST_ACT
+from skytether.guard.latch import FIRST_ACT, LATCH_FILE
+from skytether.guard.record import lost_at_reboot
 from skytether.robot.safety.client import GateError, ask, listens
 from skytether.robot.safety.config import SafetyConfig
 
@@ -52,6 +53,18 @@ ASSUMED = (
     "button; docs/safety.md says what to write"
 )
 
+NOT_RESET = (
+    "this start is no reset, and the robot stands: a stop that a person asked for may have been forgotten ({why}); "
+    "look at the robot, then say `skytether robot reset` and `skytether robot start`"
+)
+
+
+def _forgets(safety: SafetyConfig) -> str:
+    """Why a stop that was kept may be gone after a reboot; empty: it is not, as far as known."""
+    if not lost_at_reboot(str(safety.place() / LATCH_FILE)):
+        return ""
+    return lost_at_reboot(str(safety.record_file()))
+
 
 def _there(folder: Path) -> bool:
     """Whether a guard has a folder that can be relied upon; its gate may be on its way."""
@@ -76,6 +89,8 @@ class OwnGate:
         self._clock = clock
         self._started_at, self._again_s = clock(), _AGAIN_S
         self._assumed_until = self._started_at + _ASSUMED_S if assumed else -inf
+        self._forgets = _forgets(safety)
+        self._unsaid = ""
         self._process = self._start()
 
     def wait(self) -> None:
@@ -101,7 +116,8 @@ class OwnGate:
         if status is None:
             if now < self._assumed_until and listens(self._folder) and self._let_go(start=True):
                 self._assumed_until = -inf  # that was for this start; from now on a person is asked
-            return ""
+            unsaid, self._unsaid = self._unsaid, ""
+            return unsaid
         ran = now - self._started_at
         if ran < self._again_s or _there(self._folder):
             return ""
@@ -125,14 +141,20 @@ class OwnGate:
     def _let_go(self, *, start: bool) -> bool:
         """Do what a person who starts the robot does; a stop that somebody asked for stays.
 
+        Where a stop is not kept, that nobody has reset the robot may stand for one that somebody asked for.
+
         Returns:
-            Whether the gate that listens is the one that was started here: of another nothing is asked.
+            Whether it is done. Of a gate that was not started here nothing is asked.
         """
         with contextlib.suppress(GateError):
             status = ask(self._folder, {"do": "status"}, _ASK_S)
             if status.get("guard_pid") != self._process.pid:  # what is started becomes the guard
                 return False
             stopped = status["stopped"]
+            if stopped == FIRST_ACT and (self._forgets or not status["kept"]):
+                if self._forgets:
+                    self._unsaid = NOT_RESET.format(why=self._forgets)
+                return bool(self._forgets)  # what is not kept yet may be at the next look
             if stopped == FIRST_ACT:
                 ask(self._folder, {"do": "reset", "only": FIRST_ACT}, _ASK_S)
             if start and stopped in ("", FIRST_ACT):

@@ -3,6 +3,9 @@
 The file says ``stopped`` or ``released`` on its first line, then the boot that this was said in, then the reason. Only
 a whole file of this boot that says ``released`` releases: whatever else is found, the robot starts stopped. A machine
 that was started is therefore stopped until a person resets it.
+
+Where the folder of the sockets is emptied by a reboot, a second such file lies on a disk, beside the event record: a
+stop that a person asked for is then still told from the first act of a machine that was started.
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ _STOPPED, _RELEASED, _END = "stopped", "released", b"\nend\n"
 _BOOT_BYTES = 64
 FIRST_ACT = "nobody has reset the robot since the machine was started"
 _AGAIN = " (before the guard was started again)"
+LATCH_FILE = "latch"
+"""In the folder of the sockets."""
 
 
 def boot_id() -> str:
@@ -88,6 +93,11 @@ def _open(path: str, flags: int) -> int:
     return file
 
 
+def lasting_file(folder: str, record: str) -> str:
+    """The second file, beside the event record; empty: that is in the folder itself, and the first one is enough."""
+    return "" if os.path.dirname(record) == folder.rstrip("/") else f"{record}-latch"
+
+
 class Kept(NamedTuple):
     """How far the keeping is."""
 
@@ -104,11 +114,13 @@ class Keeper:
         path: Of the file.
         boot: Of now.
         trouble: Told, in that thread, what could not be written.
+        lasting: The second file, see `lasting_file`; empty: there is none.
     """
 
-    def __init__(self, path: str, boot: str, trouble: Callable[[str], object]) -> None:
+    def __init__(self, path: str, boot: str, trouble: Callable[[str], object], lasting: str = "") -> None:
         self.kept = Kept(0, "")
         self._path = path
+        self._lasting = lasting
         self._boot = boot
         self._trouble = trouble
         self._wanted = (0, "")
@@ -116,8 +128,15 @@ class Keeper:
 
     def before(self) -> str:
         """Why the robot is to stand from the start; empty: it is not."""
+        found = self._read(self._path)
+        if found not in ("", FIRST_ACT) or not self._lasting:
+            return found
+        before = self._read(self._lasting)  # that there is none, or one of another boot, tells nothing more
+        return found if before in ("", FIRST_ACT) else before
+
+    def _read(self, path: str) -> str:
         try:
-            file = _open(self._path, os.O_RDONLY)
+            file = _open(path, os.O_RDONLY)
             try:
                 return decode(os.read(file, 2 * SIZE), self._boot)
             finally:
@@ -141,15 +160,26 @@ class Keeper:
             self._changed.wait()
             self._changed.clear()
             number, reason = self._wanted
-            error = self._write(reason)
+            error = self._keep(reason)
             self.kept = Kept(number, error)
             if error:
                 with suppress(Exception):  # whoever is told has a bug: the next change is to be kept all the same
-                    self._trouble(f"cannot write {self._path}: {error}")
+                    self._trouble(error)
 
-    def _write(self, reason: str) -> str:
+    def _keep(self, reason: str) -> str:
+        """Why not; empty: it is."""
+        wrong = []
+        for path in filter(None, (self._path, self._lasting)):
+            error = self._write(path, reason)
+            if error:
+                wrong.append(f"cannot write {path}: {error}")
+        return "; ".join(wrong)
+
+    def _write(self, path: str, reason: str) -> str:
         try:
-            file = _open(self._path, os.O_WRONLY | os.O_CREAT)
+            if path == self._lasting:
+                os.makedirs(os.path.dirname(path), mode=0o750, exist_ok=True)
+            file = _open(path, os.O_WRONLY | os.O_CREAT)
             try:
                 written = os.pwrite(file, encode(reason, self._boot), 0)
                 os.fsync(file)
@@ -158,8 +188,8 @@ class Keeper:
         except Exception as error:  # whatever it is, the next change is to be kept
             if reason:  # a file that says released is worse than none, and to remove it needs no room
                 with suppress(OSError):
-                    os.unlink(self._path)
-                    return ""
+                    os.unlink(path)
+                    return "" if path == self._path else str(error)  # after a reboot that would be nobody's stop
             return str(error)
         return "" if written == SIZE else "the disk is full"
 

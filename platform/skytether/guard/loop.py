@@ -19,7 +19,7 @@ from .claim import Claim, ClaimError
 from .clock import now as boottime
 from .descriptors import receive
 from .enable import Enable, Power, WriterLine, open_line
-from .latch import Keeper, Latch, boot_id, clean
+from .latch import LATCH_FILE, Keeper, Latch, boot_id, clean, lasting_file
 from .log import Log
 from .mailbox import bind
 from .onlooker import Onlooker
@@ -33,7 +33,6 @@ from .velocity import STANDSTILL
 from .watch import Watch
 from .wheels import SocketWheels, WriterWheels
 
-LATCH_FILE = "latch"
 _AGAIN_S = 1.0
 """Between starts of a child."""
 _DEATHS, _DEATHS_S = 3, 60.0
@@ -82,7 +81,8 @@ class Guard:
             raise GuardError(str(error)) from error
         boot = boot_id()
         self._record = Record(settings.record, boot)
-        keeper = Keeper(os.path.join(settings.folder, LATCH_FILE), boot, self._not_kept)
+        latch = os.path.join(settings.folder, LATCH_FILE)
+        keeper = Keeper(latch, boot, self._not_kept, lasting_file(settings.folder, settings.record))
         self._latch = Latch(keeper)
         keeper.start()
         try:

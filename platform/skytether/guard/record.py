@@ -67,7 +67,8 @@ def lost_at_reboot(path: str, mounts: str = "/proc/self/mountinfo") -> str:
             kind = fields[fields.index("-") + 1]
             if kind in _IN_MEMORY:
                 return (
-                    f"the event record {path} is on a {kind}: a reboot empties it; name a file on a disk: safety.record"
+                    f"the event record {path} is on a {kind}: a reboot empties it, and a stop that is kept "
+                    "beside it; name a file on a disk: safety.record"
                 )
     return ""
 

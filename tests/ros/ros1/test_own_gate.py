@@ -11,6 +11,7 @@ import urllib.request
 import psutil
 import pytest
 import yaml
+from gate_robot import forget_stops
 from ros1_graph import wait_for
 
 from skytether.robot.safety.client import GateError, ask, listens
@@ -25,7 +26,7 @@ pytestmark = [pytest.mark.ros1, pytest.mark.slow]
 
 
 @pytest.fixture
-def start(graph, config, tmp_path):
+def start(graph, config, tmp_path, monkeypatch):
     """Writes robot.yaml and starts something with it; its gate's folder is `start.folder`."""
 
     def start(*arguments, **more):
@@ -39,6 +40,7 @@ def start(graph, config, tmp_path):
             return graph.skytether("robot", *arguments, str(config), stdout=log, stderr=log, env=environment)
 
     start.folder, start.log = tmp_path / "gate", tmp_path / "log"
+    forget_stops(start.folder, monkeypatch)
     return start
 
 
@@ -185,12 +187,13 @@ def test_the_check_says_what_the_gate_is_or_will_be(graph, walker, start, config
     assert "there is no gate" in said
 
 
-def test_a_stop_that_a_person_asked_for_outlives_the_gate_without_a_section(walker, start, graph):
+def test_a_stop_that_a_person_asked_for_outlives_gate_and_reboot_without_a_section(walker, start, graph):
     agent = start("run")
     drives(walker)
     ask(start.folder, {"do": "stop", "reason": "somebody fell"}, 30)
     wait_for(lambda: walker.speed == 0.0, "the standstill")
     graph.end(agent)
+    (start.folder / "latch").unlink()  # what a reboot does to a tmpfs
     agent = start("run")
     wait_for(lambda: listens(start.folder), "the gate")
     time.sleep(3.0)

@@ -9,6 +9,7 @@ import threading
 import psutil
 import pytest
 import yaml
+from gate_robot import forget_stops
 
 from skytether.messages import Header, Time, Twist, Vector3, Wrench, WrenchStamped, decode, encode, type_hash
 from skytether.robot.safety.client import listens
@@ -19,7 +20,7 @@ DDS_TWIST = "geometry_msgs::msg::dds_::Twist_"
 
 
 @pytest.fixture
-def start(stage, tmp_path):
+def start(stage, tmp_path, monkeypatch):
     """Starts ``robot run`` with the robot's own controller, which follows a push; there is no orchestrator."""
     started = []
     token = tmp_path / "walker.token"
@@ -53,6 +54,7 @@ def start(stage, tmp_path):
         return started[-1]
 
     start.folder, start.log = tmp_path / "gate", tmp_path / "log"
+    forget_stops(start.folder, monkeypatch)
     yield start
     for process in started:
         process.kill()

@@ -23,8 +23,7 @@ from skytether.guard import privileges
 from skytether.guard.board import Board
 from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
-from skytether.guard.latch import Keeper, boot_id
-from skytether.guard.loop import LATCH_FILE
+from skytether.guard.latch import LATCH_FILE, Keeper, boot_id, lasting_file
 from skytether.guard.mailbox import bind
 from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
@@ -92,7 +91,8 @@ class GateLoop:
         self._heartbeat = Heartbeat(
             guard, wheels, config.bounds(), self._period, config.guard_s, board, self._trouble, clock
         )
-        self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error)
+        also = lasting_file(str(folder), str(config.record_file()))
+        self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error, also)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
         self._heir = Heir(str(folder), guard)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)

@@ -13,8 +13,7 @@ from typing import IO
 from skytether.guard.claim import LOCK_FILE
 from skytether.guard.clock import now as boottime
 from skytether.guard.enable import Line, open_line
-from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
-from skytether.guard.loop import LATCH_FILE
+from skytether.guard.latch import FIRST_ACT, LATCH_FILE, Keeper, boot_id, lasting_file
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool
 
@@ -114,7 +113,9 @@ class HardwareRig:
 
     def _refuse_a_stopped_robot(self) -> None:
         """An emergency stop holds without a gate, too; that nobody has reset the machine yet is none."""
-        keeper = Keeper(os.path.join(self._config.place(), LATCH_FILE), boot_id(), lambda _: None)
+        folder = str(self._config.place())
+        also = lasting_file(folder, str(self._config.record_file()))
+        keeper = Keeper(os.path.join(folder, LATCH_FILE), boot_id(), lambda _: None, also)
         stopped = keeper.before()
         if stopped and stopped != FIRST_ACT:
             self._lock.close()
