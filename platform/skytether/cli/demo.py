@@ -99,6 +99,7 @@ def _told(change: Transition, s: float) -> str:
         "loss": "more is lost than the service bears",
         "late": "more comes too late than the service bears",
         "clock": "the age of commands is not known well enough",
+        "neutral": "it has not wanted a standstill since the robot was reset",
         "recovered": "its commands come in time",
     }
     return f"At {s:.1f} m {drives[change.source]}: {why.get(change.reason, change.reason)}."

@@ -37,6 +37,8 @@ class Reason(StrEnum):
     """More messages of a topic are too old before they are through than the service bears."""
     CLOCK = "clock"
     """The peer's clock is not known well enough to judge the age of commands."""
+    NEUTRAL = "neutral"
+    """The robot was reset, and the service has not wanted a standstill since."""
     RECOVERED = "recovered"
     """The link has been good for long enough."""
 
@@ -129,11 +131,14 @@ def start(needs: Needs, now: float) -> Choice:
 def choose(needs: Needs, choice: Choice, link: Link, now: float) -> Choice:
     """Decide who drives. The result has another ``source`` only when it changed; then ``reason`` says why."""
     trouble = _trouble(needs, link, now)
+    if trouble is None and link.owes:
+        owing = choice if choice.source is needs.local else Choice(needs.local, Reason.NEUTRAL, now)
+        return replace(owing, good_since=_begin(choice.good_since, now), bad_since=None)
     if trouble is None:
         good_since = _begin(choice.good_since, now)
         if choice.source is Source.CLOUD:
             return replace(choice, good_since=good_since, bad_since=None)
-        if now - good_since >= needs.good_s and not link.owes:
+        if now - good_since >= needs.good_s:
             return Choice(Source.CLOUD, Reason.RECOVERED, now, good_since=good_since)
         return replace(choice, source=needs.local, good_since=good_since, bad_since=None)
     bad_since = _begin(choice.bad_since, now)

@@ -47,6 +47,8 @@ _OWES = (
     "the link is good, but the service wants to move since before the reset, and nothing moves by itself: it takes over"
     " once it wanted a standstill; or end its work and begin it again, or stop the robot, reset and start it"
 )
+_ONE_VOICE_S = neutral.NEUTRAL_S + 0.1
+"""For how long the service must have been the agent's voice, for what the gate heard to be all its own [s]."""
 _LOOKED_TICKS = 2.0
 """Periods of the loop that one tick counts for at most, when the cloud's silence is measured."""
 _TICK_S = 0.5
@@ -166,9 +168,11 @@ class Driver:
         self._asks_why = base if isinstance(base, AsksWhy) else None
         self._told: Told | None = None
         self._spoke = False
-        """A service has sent commands, in a session that there is or one before it without a break."""
+        """A service has sent commands, ever."""
         self._owed = Neutral()
         """Whether it must have wanted a standstill before it takes over from the fallback."""
+        self._waited = False
+        """Nobody was allowed to drive, when the gate told of it last."""
         self._watching = fallback if isinstance(fallback, Watching) else None
         self._own_limits = self._limits = limits
         """As configured, and with what was learned of the commands' gaps."""
@@ -309,11 +313,15 @@ class Driver:
             return
         self._supervised = rebase(self._limits, self._supervised, self._told)
         # The gate takes the agent for one. The fallback's standstill lets the fallback drive; a service that wanted to
-        # drive all the time must have wanted one itself.
-        if self._told.nobody and self._spoke and not self._owed.why:
-            self._owed = neutral.require("nobody was allowed to drive")
-        elif self._told.agent and self._choice.source is Source.CLOUD:
-            self._owed = Neutral()
+        # drive all the time must have wanted one itself, also where it was let go and asked for again meanwhile.
+        if self._told.nobody:
+            self._waited = True
+            if self._spoke and not self._owed.why:
+                self._owed = neutral.require("nobody was allowed to drive")
+        elif self._told.agent:
+            if self._waited and self._choice.source is Source.CLOUD and now - self._choice.since > _ONE_VOICE_S:
+                self._owed = Neutral()  # so it was the service that was neutral, or that a person let go on
+            self._waited = False
 
     def _change_over(self) -> list[LiveSession]:
         """Make before break: while the cloud drives, another session takes over with its first command.
@@ -338,8 +346,6 @@ class Driver:
         for session in self._change_over():
             for epoch, message in session.take():
                 self._take(epoch, message, session.encoding, now)
-        if self.session is None:  # the next service is somebody's new decision
-            self._spoke, self._owed = False, Neutral()
 
     def _take(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:
         try:

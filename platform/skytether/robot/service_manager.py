@@ -145,6 +145,8 @@ def explain(reason: Reason, needs: Needs, link: Link, quality: Quality, now: flo
         case Reason.CLOCK:
             known = f"known to {link.clock_error * 1000:.0f} ms" if link.clock_error < inf else "not known"
             return f"the service's clock is {known}, needed is {needs.max_clock_error_s * 1000:.0f} ms"
+        case Reason.NEUTRAL:
+            return "the service wanted no standstill since the robot was reset"
         case Reason.RECOVERED:
             return f"all has been well for {needs.good_s:g} s"
         case Reason.START:
