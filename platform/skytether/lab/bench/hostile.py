@@ -28,6 +28,7 @@ from .api import lost, start
 from .hostile_robot import EVIL, EVIL_MANIFEST, Target, attack
 from .observe import Spread
 from .open_loop import Answered, Request, ask_openly
+from .pair import BenchError
 from .requests import MANIFEST, SERVICE, Held, renewal
 
 _EVERY_S = 2.0
@@ -96,7 +97,7 @@ def bench_hostile(
         lease_s: Of the others' instances [s]; long enough for all of them to start.
 
     Raises:
-        BenchError: Not all instances ran in time.
+        BenchError: Not all instances ran in time, or nothing is known of the attack.
     """
     rng = np.random.default_rng(_SEED)
     with (
@@ -171,10 +172,11 @@ def _attacked(target: Target) -> Iterator[Counter[tuple[str, int]]]:
     end.close()
     try:
         yield answers
-    finally:
         pipe.send(None)
-        if pipe.poll(_END_S):
-            answers.update(pipe.recv())
+        if not pipe.poll(_END_S):
+            raise BenchError("the hostile robot did not say how it was answered")
+        answers.update(pipe.recv())
+    finally:
         pipe.close()
         process.join(_END_S)
 

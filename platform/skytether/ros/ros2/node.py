@@ -240,7 +240,8 @@ class Ros2Node:
         token = live.declare_token(self.dialect.node_token(ours, self._name))
         watch = live.declare_subscriber(self.dialect.watched, self._on_token, history=True)
         try:
-            self._look_at_all(session)
+            patience = chain(_LOOK_S, repeat(_LOOK_S[-1]))
+            whole = self._look_at_all(session, next(patience))
             while not self._closing.is_set():
                 self._look_at_router(session)
                 changed = self._take_changes(graph)
@@ -256,6 +257,9 @@ class Ros2Node:
                     if handle not in declared:
                         number = numbers.setdefault(handle, len(numbers) + 1)
                         declared[handle] = self._declare(session, ours, number, handle)
+                if not whole:
+                    whole = self._look_at_all(session, next(patience))
+                    continue
                 self._joined.set()
                 self._wake.wait(_POLL_S)
                 self._wake.clear()
@@ -265,16 +269,16 @@ class Ros2Node:
             watch.undeclare()  # type: ignore[no-untyped-call]
             token.undeclare()  # type: ignore[no-untyped-call]
 
-    def _look_at_all(self, session: zenoh.Session) -> None:
-        """Ask for what the subscription tells too, until an answer is whole: who has joined knows the whole graph."""
-        for patience in chain(_LOOK_S, repeat(_LOOK_S[-1])):
-            if self._closing.is_set():
-                return
-            self._look_at_router(session)
-            replies = list(session.liveliness().get(self.dialect.watched, timeout=patience))
-            self._changes.extend((str(reply.ok.key_expr), True) for reply in replies if reply.ok is not None)
-            if all(reply.ok is not None for reply in replies):  # else one says that the router took too long
-                return
+    def _look_at_all(self, session: zenoh.Session, patience_s: float) -> bool:
+        """Ask for what the subscription tells too; whether the answer is whole: who has joined knows all the graph."""
+        replies = list(session.liveliness().get(self.dialect.watched, timeout=patience_s))
+        self._changes.extend((str(reply.ok.key_expr), True) for reply in replies if reply.ok is not None)
+        if all(reply.ok is not None for reply in replies):
+            self.settle("graph")
+            return True
+        text = f"the ROS 2 graph's router ({self._router}) does not tell of all the graph within {patience_s:g} s"
+        self._trouble("graph", f"{text}; it is asked again")
+        return False
 
     def _declare(self, session: zenoh.Session, ours: str, number: int, handle: Handle) -> list[Any]:
         token = self.dialect.token(ours, number, self._name, handle.endpoint)
