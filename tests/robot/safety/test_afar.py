@@ -39,6 +39,7 @@ class Gate:
         self.error = None
         self.stopped = ""
         self.disk = True
+        self.pid = 1
 
     def stop(self, folder, reason):
         if self.error is not None:
@@ -50,7 +51,7 @@ class Gate:
     def status(self, folder):
         if self.error is not None:
             raise self.error
-        return {"stopped": self.stopped, "guard": {"stopped": self.stopped, "kept": self.disk}}
+        return {"stopped": self.stopped, "guard": {"stopped": self.stopped, "kept": self.disk, "pid": self.pid}}
 
 
 def order(id_="a", **changes):
@@ -178,6 +179,18 @@ def test_what_could_not_be_kept_does_not_stop_again_after_a_reset(agent, orchest
     afar.step()
     assert len(gate.stops) == 1
     assert orchestrator.acknowledged == [("walker", "a")]
+
+
+def test_a_guard_that_was_started_anew_and_knows_of_no_stop_is_no_reset(agent, orchestrator, gate):
+    """Its disk took nothing, so it comes up as if nobody had stopped the robot."""
+    orchestrator.order = order()
+    gate.disk = False
+    afar = agent()
+    afar.step()
+    gate.stopped, gate.pid = "", 2
+    afar.step()
+    assert gate.stopped
+    assert orchestrator.acknowledged == []
 
 
 def test_orders_to_others_and_what_was_acknowledged_is_left_alone(agent, orchestrator, gate):

@@ -80,6 +80,8 @@ class StopFromAfar:
         self._obeyed = self._read()
         self._unkept = ""
         """An order that was obeyed, but is on no disk yet."""
+        self._guard: object = None
+        """Process of the guard that obeyed it: what another one says is no reset."""
 
     def step(self) -> None:
         """Look once."""
@@ -112,6 +114,8 @@ class StopFromAfar:
             return False
         _log.warning("%s", _reason(order))
         self._unkept = order.id if "note" in answer else ""
+        if self._unkept:
+            self._guard = self._of_guard().get("pid")
         return not self._unkept
 
     def _remember(self, order: StopOrder) -> None:
@@ -122,18 +126,23 @@ class StopFromAfar:
 
     def _kept(self, order: StopOrder) -> bool:
         """Whether the stop is on a disk by now, or over: a person has reset the robot. Else it is asked for again."""
+        guard = self._of_guard()
+        same = bool(guard) and guard.get("pid") == self._guard
+        if same and (guard.get("kept") or not guard.get("stopped")):
+            return True
+        kept = self._obey(order)
+        if self._unkept:
+            sentence = "a stop from afar is in effect, but could not be kept: it is not acknowledged yet"
+            self._notices.say("kept", sentence, self._clock())
+        return kept
+
+    def _of_guard(self) -> dict[str, Any]:
+        """What the guard says of itself, for the gate would only say what it heard of it last; empty: nothing."""
         try:
-            status = self._status(self._folder)
-            guard = status.get("guard") or {}  # the gate would only say what it heard from the guard last
-            stopped = guard.get("stopped", status.get("stopped"))
-            if stopped and not guard.get("kept") and "note" in self._stop(self._folder, _reason(order)):
-                sentence = "a stop from afar is in effect, but could not be kept: it is not acknowledged yet"
-                self._notices.say("kept", sentence, self._clock())
-                return False
+            return self._status(self._folder).get("guard") or {}
         except GateError as error:
             self._notices.say("gate", f"whether an order to stop was kept is not known: {error}", self._clock())
-            return False
-        return True
+            return {}
 
     def _read(self) -> list[str]:
         """Nothing, if it is not a file of this user: a pipe would never end, and another user's ids are not ours."""
