@@ -2,6 +2,8 @@
 
 import os
 import socket
+import time
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +12,7 @@ from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
 from skytether.guard.loop import Guard
 from skytether.guard.protocol import Beat, pack_answer, pack_beat
+from skytether.guard.record import decode
 from skytether.guard.settings import Settings
 from skytether.guard.velocity import STANDSTILL
 
@@ -75,3 +78,27 @@ def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, unread, before,
         guard.turn()
         guard.turn()
     assert guard._latch.reason == "somebody fell"
+
+
+def test_each_stop_reset_and_death_is_in_the_event_record(guard):
+    (gate,) = Played.made
+    now = guard._clock()
+    guard._clock = lambda: now  # a reset that waited for too long would not count
+    gate.theirs.send(pack_beat(Beat(now, STANDSTILL, guard._latch.generation, stopped="somebody fell")))
+    guard.turn()
+    gate.theirs.send(pack_beat(Beat(now, STANDSTILL, guard._latch.generation, reset=True)))
+    guard.turn()
+    guard._answer({"do": "stop", "reason": "a fire"})
+    gate.why = "ended with status -9"
+    guard._look_after(now)
+    end = time.monotonic() + 30
+    while not guard._record.written:
+        assert time.monotonic() < end
+        time.sleep(0.001)
+    found = [(e["who"], e["what"], e["detail"]) for e in decode(Path(guard._settings.record).read_bytes())]
+    assert [event for event in found if event[1] in ("stop", "reset", "death")] == [
+        ("gate", "stop", "somebody fell"),
+        ("person", "reset", "the emergency stop was reset"),
+        ("person", "stop", "a fire"),
+        ("gate", "death", "ended with status -9"),
+    ]

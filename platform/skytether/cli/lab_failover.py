@@ -22,7 +22,10 @@ def failover(
 ) -> None:
     """Cut the link under a driven robot, and time it until its own controller drives.
 
-    Ends with exit status 1 if a bound was missed: three command periods and 1.25 times the jitter of the commands.
+    The bound is three periods of the commands and 1.25 times their jitter,
+    two periods and 30 ms at least, 0.4 s or four periods at most,
+    and 20 ms for two turns of the control loop.
+    Ends with exit status 1 if it was missed.
     """
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""``skytether lab bench safety``: the promises of docs/safety.md, attacked on real processes."""
+"""``skytether lab bench safety``: the promises of docs/safety.md, attacked on real processes, suspend rehearsed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def safety(
 ) -> None:
     """Attack the robot's gate on real processes, and hold what the wheels received against what is promised.
 
-    Guard, gate and agent are real; sensors and wheels are played. Ends with exit status 1 if a promise was broken.
+    Guard, gate and agent are real; sensors and wheels are played.
+    Only 'suspend' is rehearsed without processes, with a made-up clock.
+    Ends with exit status 1 if a promise was broken.
     """
     from skytether.lab.bench.safety import HEADING, bench_safety, estimate, select
     from skytether.lab.safety.ros1_hardware import available

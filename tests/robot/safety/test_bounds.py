@@ -150,5 +150,5 @@ def test_the_numbers_that_would_hold_do(load):
 
 
 def test_the_documentation_has_the_table():
-    text = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "safety-numbers.md").read_text()
     assert bounds.table() in text

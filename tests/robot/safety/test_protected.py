@@ -13,9 +13,12 @@ EVERYTHING = {
     "sources": {"keyboard": {"topic": "teleop/cmd_vel", "priority": 20}},
     "locks": {"docked": {"topic": "/docked", "priority": 30}},
     "odometry": {"topic": "odom"},
+    "contacts": {"bumper": {}},
+    "modes": {"loaded": {"limits": {"linear_max": 0.1}}},
+    "mode": {"topic": "/mode"},
 }
 NAMED = {"/walker/scan", "/back/scan", "/walker/sonar", "/walker/joy", "/estop"}
-NAMED |= {"/walker/teleop/cmd_vel", "/docked", "/walker/odom"}
+NAMED |= {"/walker/teleop/cmd_vel", "/docked", "/walker/odom", "/walker/bumper", "/mode"}
 
 
 def protect(home="/walker", bridge_namespace="/", **more):

@@ -67,8 +67,8 @@ class FailoverRow:
         cut_to_local_p99_ms: 99th percentile (the largest, when there are fewer than 100).
         cut_to_local_max_ms: The largest.
         jitter_ms: The longest gap between two commands while nothing was cut, less their period.
-        bound_ms: What it should stay under: three periods of the commands, 1.25 times the jitter, and two ticks of the
-            control loop.
+        bound_ms: What it should stay under: three periods of the commands and 1.25 times the jitter, at least what is
+            waited for a sender like clockwork (`least_s`), at most `most_s`; and two ticks of the control loop.
         velocity_jump_max_m_s: Largest change from one velocity that the wheels were told to the next, around the cuts.
     """
 

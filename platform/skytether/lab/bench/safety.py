@@ -1,7 +1,7 @@
 """The promises of docs/safety.md, attacked on real processes: what the wheels received, held against them.
 
 Guard, gate and agent are the real programs; sensors and wheels are played here, on the gate's own sockets. Each attack
-begins with a robot that drives, and ends with one that drives again.
+begins with a robot that drives, and ends with one that drives again. Only a suspend is rehearsed, without processes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The machine is suspended and goes on: the parts of gate and guard that decide, with a made-up clock.
+"""The machine is suspended and goes on: the parts of gate and guard that decide, with a made-up clock. No processes.
 
 Nothing runs meanwhile. Then the clock is ahead by the time that the machine slept, and the first turns find what
 waited in the sockets: the agent's last command, and the last scan. Neither may move the robot.
@@ -37,7 +37,7 @@ def enter(attacks: Attacks) -> None:
     for seconds in _SLEEPS_S:
         attacks.add_rehearsal(
             f"suspend-{seconds:g}",
-            f"the machine sleeps for {seconds:g} s, with a made-up clock",
+            f"rehearsed with a made-up clock: the machine sleeps for {seconds:g} s",
             _suspend(seconds),
         )
 

@@ -160,6 +160,6 @@ def _numbers(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...
 
 
 def table() -> str:
-    """All rows as a table in Markdown; docs/safety.md has it."""
+    """All rows as a table in Markdown; docs/safety-numbers.md has it."""
     rows = [f"| `{b.key}` | {b.low:g} to {b.high:g} {b.unit} | {b.why} |" for b in BOUNDS]
     return "\n".join(("| key | plausible | because |", "| --- | --- | --- |", *rows))
