@@ -142,6 +142,36 @@ def test_a_folder_that_holds_the_state_is_not_for_services(tmp_path: Path) -> No
         ProcessRuntime("lab", tmp_path / "sites/lab", ProcessOptions(writable=(tmp_path,)))
 
 
+def test_a_launch_file_opens_neither_folders_nor_secrets(tmp_path: Path) -> None:
+    state, kept = tmp_path / "sites/lab", tmp_path / "nav.launch"
+    runtime = ProcessRuntime("lab", state, ProcessOptions(readable=(tmp_path / "maps",)))
+    for name in ("nav.launch", "key", "maps/private", "sites/lab/data/other"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+        (tmp_path / name).chmod(0o600 if name in ("key", "maps/private") else 0o644)
+    (tmp_path / "link").symlink_to(tmp_path / "key")
+
+    def start(path: str) -> Launch:
+        asked = launch(entrypoint="this")
+        return replace(asked, spec=ServiceSpec(graph="ros1", entrypoint="this", launch=path))
+
+    for wrong, why in (
+        ("/", "is no file that every user may read"),
+        (f"{tmp_path}", "is no file"),
+        (f"{tmp_path}/key", "is no file"),
+        (f"{tmp_path}/link", "is no file"),
+        (f"{state}/data/other", "is in the orchestrator's state"),
+        (f"{tmp_path}/none", "No such file"),
+        ("/a\0b", "cannot be read"),
+    ):
+        with pytest.raises(RuntimeFailure, match=why):
+            runtime.start(start(wrong))
+    for right in (str(kept), f"{tmp_path}/maps/private", "package/nav.launch"):
+        runtime.start(start(right))
+        until(runtime, Phase.EXITED)
+        runtime.remove("i1")
+
+
 def test_where_the_orchestrator_was_started_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     assert str(tmp_path) in readable([], Path("/var/lib/skytether"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -280,3 +281,24 @@ def test_scope_catalog_has_only_run_what_the_operator_allows(served_with: Any, m
         served.operator.delete_service("mine")
     cook.put_service("mine", manifest("mine", entrypoint="ours.walk", image="registry.example/walk:1"))
     cook.put_service("mine", manifest("mine", entrypoint="skytether_services.virtual_trail"))
+
+
+def test_a_graph_of_the_operators_gives_scope_catalog_no_other_launch_file(
+    served_with: Any, manifest: Any, tmp_path: Any
+) -> None:
+    (tmp_path / "ours").mkdir()
+
+    def graph(name: str, launch: str) -> dict[str, Any]:
+        document: dict[str, Any] = manifest(name, graph="ros1", launch=launch)
+        del document["spec"]["entrypoint"]
+        return document
+
+    (tmp_path / "ours/nav.yaml").write_text(json.dumps(graph("nav", "/srv/nav.launch")))
+    served = served_with(catalogue_dir=tmp_path / "ours")
+    token = served.operator.create_token(TokenCreate(name="cook", scopes=("catalog", "read"))).token
+    cook = served.client(token)
+    cook.put_service("mine", graph("mine", "/srv/nav.launch"))
+    with pytest.raises(
+        ApiError, match=r"module 'skytether\.service\.ros1' run with the launch file '/tmp/any\.launch'"
+    ):
+        cook.put_service("mine", graph("mine", "/tmp/any.launch"))

@@ -184,11 +184,13 @@ class Catalogue:
 
     def _check_allowed(self, manifest: Manifest) -> None:
         module, image = manifest.spec.entrypoint, manifest.spec.image
-        known_modules = {known.spec.entrypoint for known in self._fixed.values()} | set(self._allowed.modules)
-        if module is not None and module not in known_modules:
+        # With its launch file: that says what a graph's module starts.
+        runs = {(known.spec.entrypoint, known.spec.launch) for known in self._fixed.values()}
+        if module is not None and module not in self._allowed.modules and (module, manifest.spec.launch) not in runs:
+            launching = f" with the launch file '{manifest.spec.launch}'" if manifest.spec.launch else ""
             raise ForbiddenError(
-                f"this token may not have the module '{module}' run: name one of an installed service, add it to the "
-                "orchestrator's catalog.modules, or use the token in its state folder"
+                f"this token may not have the module '{module}' run{launching}: name one of an installed service, add "
+                "the module to the orchestrator's catalog.modules, or use the token in its state folder"
             )
         if image is not None and not any(fnmatchcase(image, pattern) for pattern in self._allowed.images):
             raise ForbiddenError(

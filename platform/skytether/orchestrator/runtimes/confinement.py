@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import confine
+from .base import RuntimeFailure
 
 _READ = (
     *("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/opt/ros", "/proc", "/sys"),
@@ -91,6 +92,31 @@ def opened(secret: Path, read: Sequence[str]) -> str | None:
     """Which of these paths holds a folder with secrets; None: none."""
     real = secret.resolve()
     return next((path for path in read if real.is_relative_to(Path(path).resolve())), None)
+
+
+def launch_file(path: str, reachable: Sequence[str], closed: Sequence[Path]) -> str | None:
+    """What a service must be allowed to read to read its launch file; None: nothing more, it is ``reachable``.
+
+    A manifest names it, so it opens neither folders nor what others on this machine may not read.
+
+    Raises:
+        RuntimeFailure: It is no such file, or is in one of the folders that are ``closed``.
+    """
+    try:
+        real = os.path.realpath(path)
+        if any(Path(real).is_relative_to(os.path.realpath(held)) for held in reachable):
+            return None
+        mode = os.stat(real).st_mode
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in it
+        raise RuntimeFailure(f"launch: {path} cannot be read: {error}") from None
+    if not stat.S_ISREG(mode) or not mode & stat.S_IROTH:
+        raise RuntimeFailure(
+            f"launch: {path} is no file that every user may read: let them (chmod o+r), or add it to the site's "
+            "'readable'"
+        )
+    if any(Path(real).is_relative_to(folder.resolve()) for folder in closed):
+        raise RuntimeFailure(f"launch: {path} is in the orchestrator's state: keep launch files elsewhere")
+    return real
 
 
 def covers(paths: Sequence[str]) -> list[str]:

@@ -25,7 +25,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +38,7 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
 from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
-from .confinement import confined, free_user, opened, readable, this_machine
+from .confinement import confined, free_user, launch_file, opened, readable, this_machine
 from .disk import MOST_FILES, size_of
 from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
@@ -159,8 +159,9 @@ class ProcessRuntime(Runtime):
         self._options = options
         self._machine = this_machine() if self._options.confined else None
         self._readable = readable((*self._options.readable, *map(Path, self._options.python_path)), folder)
-        for path in (folder, self._options.folder) if self._machine else ():
-            if path and (by := opened(path, (*self._readable, *map(str, self._options.writable)))):
+        self._closed = [path for path in (folder, self._options.folder) if path]
+        for path in self._closed if self._machine else ():
+            if by := opened(path, (*self._readable, *map(str, self._options.writable))):
                 raise RuntimeFailure(
                     f"services may reach {by}, which holds {path}: keep the orchestrator's state elsewhere"
                 )
@@ -225,6 +226,7 @@ class ProcessRuntime(Runtime):
         data = self._data / launch.grant.robot / launch.grant.service / launch.instance
         if full := self._full(launch.grant.robot):
             raise RuntimeFailure(f"robot '{launch.grant.robot}' {full}")
+        read = self._read_by(launch.spec)
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -235,12 +237,18 @@ class ProcessRuntime(Runtime):
             note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port, "ready": ready}
             note["user"] = user
             _write_private(folder / "run.json", json.dumps(note))
-            child = self._spawn(launch.spec, folder, data, user)
+            child = self._spawn(str(launch.spec.entrypoint), read, folder, data, user)
             process = ProcessId(child.pid, _start_time(child.pid))
             _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
         self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), ready, user, child)
+
+    def _read_by(self, spec: ServiceSpec) -> list[str]:
+        if not (self._machine and spec.launch and spec.launch.startswith("/")):
+            return self._readable
+        more = launch_file(spec.launch, [*self._readable, *map(str, self._options.writable)], self._closed)
+        return [*self._readable, more] if more else self._readable
 
     def _user_for(self, noted: Mapping[str, Any]) -> int | None:
         """An instance's own, the same in all its runs, so that it can go on with its data; None: there are none."""
@@ -269,7 +277,9 @@ class ProcessRuntime(Runtime):
                 os.chown(path, user, user, follow_symlinks=False)
         return ready
 
-    def _spawn(self, spec: ServiceSpec, folder: Path, data: Path, user: int | None) -> subprocess.Popen[bytes]:
+    def _spawn(
+        self, entrypoint: str, read: Sequence[str], folder: Path, data: Path, user: int | None
+    ) -> subprocess.Popen[bytes]:
         own = str(folder / _OWN)
         environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
         environment |= {"PYTHONUNBUFFERED": "1", "HOME": own, "TMPDIR": own, **self._options.environment}
@@ -277,9 +287,8 @@ class ProcessRuntime(Runtime):
             environment["PYTHONPATH"] = os.pathsep.join(self._options.python_path)
         environment[GRANT_VARIABLE] = f"{own}/grant.json"
         # -P: what a service writes into its data folder must not be importable.
-        command = [sys.executable, "-P", "-m", str(spec.entrypoint)]
+        command = [sys.executable, "-P", "-m", entrypoint]
         if self._machine:
-            read = [*self._readable, spec.launch] if spec.launch and spec.launch.startswith("/") else self._readable
             write = [*map(str, self._options.writable), own, str(data)]
             command = confined(command, self._machine, read, write, user, self._options.groups)
         with open(os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab") as output:
