@@ -10,6 +10,7 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 import struct
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -53,12 +54,15 @@ class ValueFile:
 
     Args:
         path: Of the file.
+        on_disk: It may be a regular file, for whose disk the guard's loop then waits.
 
     Raises:
-        OSError: It cannot be opened.
+        OSError: It cannot be opened, or is a regular file.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, *, on_disk: bool = False) -> None:
+        if not on_disk and waits_for_a_disk(path):  # one that came after the start
+            raise OSError(f"{path} is a regular file, and no value of a line in /sys")
         self._file = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def write(self, high: bool) -> None:
@@ -74,6 +78,15 @@ class ValueFile:
     def close(self) -> None:
         """Close the file."""
         os.close(self._file)
+
+
+def waits_for_a_disk(path: str) -> bool:
+    """Whether it is a regular file outside of /sys; one that is not there yet is none."""
+    try:
+        regular = stat.S_ISREG(os.stat(path).st_mode)
+    except OSError:
+        return False
+    return regular and not os.path.realpath(path).startswith("/sys/")
 
 
 class GpioLine:
@@ -243,7 +256,7 @@ class Enable:
 
 
 def open_line(words: Sequence[str]) -> Line:
-    """A line by its words: ``file PATH``, ``gpio CHIP OFFSET``, ``unix PATH`` or ``udp HOST PORT``.
+    """A line by its words: ``file PATH`` (or ``file-on-disk``), ``gpio CHIP OFFSET``, ``unix PATH``, ``udp HOST PORT``.
 
     Raises:
         OSError: It cannot be had.
@@ -255,6 +268,6 @@ def open_line(words: Sequence[str]) -> Line:
         return DatagramLine(rest[0])
     if kind == "udp":
         return DatagramLine((rest[0], int(rest[1])))
-    if kind == "file":
-        return ValueFile(rest[0])
+    if kind in ("file", "file-on-disk"):
+        return ValueFile(rest[0], on_disk=kind == "file-on-disk")
     raise OSError(f"there is no line '{' '.join(words)}'")

@@ -81,6 +81,7 @@ def test_what_is_not_written_is_plausible():
             "footprint.polygon must be 0.05 to 5 m, not 90.0056",
         ),
         ({"footprint": {"polygon": [[2, 1], [2, -1], [1, 0]]}}, "the origin of the base frame (0, 0) must be inside"),
+        ({"sensors": {"scan": {"range_min": 0.5, "range_max": 0.4}}}, "range_min 0.5 must be below range_max 0.4"),
         ({"joystick": {"linear": 4.5}}, "joystick.linear must be -3 to 3 m/s, not 4.5"),
         ({"joystick": {"linear_axis": 2, "angular_axis": 2}}, "linear_axis and angular_axis must be two axes"),
         ({"estop": {"max_age_s": 59}}, "estop.max_age_s must be 0.05 to 2 s, not 59"),
@@ -106,6 +107,19 @@ def test_a_file_that_means_it_says_why_and_it_is_named(load):
     )
     # As the gate gets it.
     assert SafetyConfig.model_validate_json(config.model_dump_json()).notes() == config.notes()
+
+
+@pytest.mark.parametrize(
+    ("section", "says"),
+    [
+        ({"joystick": {"linear": -0.3}}, "joystick.linear 0.3 is above limits.linear_max 0.25"),
+        ({"joystick": {"angular": 0.9}}, "joystick.angular 0.9 is above limits.angular_max 0.5"),
+        ({"zones": {"slow_speed": 0.3, "slow_m": 1}}, "zones.slow_speed 0.3 is above limits.linear_max 0.25"),
+    ],
+)
+def test_what_the_limits_cut_is_named(load, section, says):
+    (note,) = load(section).notes()
+    assert note.startswith(says)
 
 
 def test_reasons_beside_the_robots_own_limits_hold_for_the_gate_that_takes_them(load):

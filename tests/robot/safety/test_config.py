@@ -307,7 +307,22 @@ def test_two_gates_of_one_user_have_a_record_each(monkeypatch):
     ],
 )
 def test_an_enable_signal_has_one_line(load, enable, words):
-    assert load({"footprint": {"radius": 0.3}, "sensors": {}, "enable": enable}).enable.words() == words
+    assert load({"footprint": {"radius": 0.3}, "sensors": {}, "enable": enable}).enable_words() == words
+
+
+def test_an_enable_signal_that_would_wait_for_a_disk_is_refused_unless_it_is_meant(load, tmp_path):
+    value, link = tmp_path / "value", tmp_path / "link"
+    value.touch()
+    link.symlink_to(value)
+    section = {"footprint": {"radius": 0.3}, "sensors": {}}
+    for path in (value, link):
+        with pytest.raises(OSError, match=rf"enable.file: {path} is a regular file.*safety.beyond"):
+            load({**section, "enable": {"file": str(path)}}).enable_words()
+    config = load({**section, "enable": {"file": str(value)}, "beyond": {"enable.file": "a RAM disk"}})
+    assert config.enable_words() == ("file-on-disk", str(value))
+    assert "a RAM disk" in config.notes()[0]
+    with pytest.raises(ConfigError, match=r"beyond.enable.file: no number"):
+        load({**section, "beyond": {"enable.file": "a RAM disk"}})
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from .bounds import LONGEST_REASON, check_plausible
 from .config_base import Numbers, Topic, no_switches
 from .contact import ContactParams, feels
 from .display_config import DisplayConfig
-from .enable_config import EnableConfig
+from .enable_config import ON_DISK, EnableConfig
 from .inbox import IsStop, Topics
 from .mode_config import Modes, ModeSource, mode_rules
 from .modes import Envelope
@@ -227,8 +227,41 @@ class SafetyConfig(SourcesConfig):
         )
 
     def notes(self) -> tuple[str, ...]:
-        """What a person should know of this configuration: a sentence for each number beyond its bounds."""
-        return check_plausible(self.model_dump(exclude={"beyond", "ros1", "ros2", "sockets"}), self.beyond)
+        """What a person should know of this configuration.
+
+        A sentence for each number that is beyond its bounds, or above a limit that cuts it down.
+        """
+        reasons = dict(self.beyond)
+        found = []
+        if self.enable is not None and self.enable.file is not None and reasons.get(ON_DISK, "").strip():
+            found.append(f"{ON_DISK} may be a regular file, whose disk the guard waits for: {reasons.pop(ON_DISK)}")
+        numbers = self.model_dump(exclude={"beyond", "ros1", "ros2", "sockets"})
+        return (*check_plausible(numbers, reasons), *found, *self._cut())
+
+    def _cut(self) -> list[str]:
+        """What the limits take away from other numbers: people look for it in vain at the wheels."""
+        limits, pad, found = self.limits or Limits(), self.joystick, []
+        if self.zones.slow_speed > limits.linear_max:
+            found.append(
+                f"zones.slow_speed {self.zones.slow_speed:g} is above limits.linear_max {limits.linear_max:g}: "
+                "straight ahead the slow zone slows nothing"
+            )
+        for name, most in (("linear", limits.linear_max), ("angular", limits.angular_max)):
+            wanted = abs(getattr(pad, name)) if pad is not None else 0.0
+            if wanted > most:
+                found.append(
+                    f"joystick.{name} {wanted:g} is above limits.{name}_max {most:g}: the rest of the stick's way "
+                    "does nothing"
+                )
+        return found
+
+    def enable_words(self) -> tuple[str, ...]:
+        """The line of the enable signal, for `skytether.guard.enable.open_line`; empty: there is none.
+
+        Raises:
+            OSError: See `EnableConfig.words`.
+        """
+        return () if self.enable is None else self.enable.words(on_disk=ON_DISK in self.beyond)
 
     def stages(self) -> Stages:
         """The latencies from the light to the brakes."""

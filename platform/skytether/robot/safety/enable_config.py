@@ -7,8 +7,13 @@ from typing import Annotated
 
 from pydantic import Field, field_validator, model_validator
 
+from skytether.guard.enable import waits_for_a_disk
+
 from .address import address, numeric
 from .config_base import Numbers, Topic
+
+ON_DISK = "enable.file"
+"""The key of ``beyond`` for a regular file."""
 
 
 class EnableConfig(Numbers):
@@ -43,14 +48,24 @@ class EnableConfig(Numbers):
             raise ValueError("chip and line go together")
         return self
 
-    def words(self) -> tuple[str, ...]:
+    def words(self, *, on_disk: bool = False) -> tuple[str, ...]:
         """The line as the guard takes it.
 
+        Args:
+            on_disk: ``file`` may be a regular file.
+
         Raises:
-            OSError: A host's name is not known.
+            OSError: A host's name is not known, or ``file`` is a regular file.
         """
         if self.file is not None:
-            return "file", str(self.file.absolute())
+            path = str(self.file.absolute())
+            if not on_disk and waits_for_a_disk(path):
+                raise OSError(
+                    f"enable.file: {path} is a regular file, and the guard would wait for its disk at every turn; name "
+                    "`value` of a line in /sys or a named pipe; if this robot needs it, say why in "
+                    f'safety.beyond: {{{ON_DISK}: "reason"}}'
+                )
+            return "file-on-disk" if on_disk else "file", path
         if self.chip is not None:
             return "gpio", str(self.chip), str(self.line)
         if self.topic is not None:

@@ -55,7 +55,7 @@ class HardwareRig:
             self._wheels = open_wheels(config, "guard")
             self._sensors = open_sensors(config, lambda *_: None)
             if config.enable is not None and config.enable.topic is None:
-                self._line = open_line(config.enable.words())
+                self._line = open_line(config.enable_words())
             self._hear_all()
         except OSError as error:
             self.close()

@@ -68,7 +68,7 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
         writer=(*_PYTHON, "-m", "skytether.robot.safety.writer") if on_graph else (),
         config=file,
         display=(*_PYTHON, "-m", "skytether.robot.safety.display.process") if config.display is not None else (),
-        enable=() if config.enable is None else config.enable.words(),
+        enable=config.enable_words(),
         enable_after_s=0.0 if config.enable is None else config.enable.after_s,
         say=tuple(say),
     )
