@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import socket
+import threading
+import time
 import xmlrpc.client
 from typing import Any
 
 import pytest
 
+from skytether.ros.ros1 import slave
 from skytether.ros.ros1.slave import MasterHost, SlaveServer
 
 
@@ -63,6 +66,45 @@ def test_only_the_masters_machine_ends_a_node_or_changes_its_publishers() -> Non
                 assert master.publisherUpdate("/master", "/scan", ["http://a:1"]) == [1, "", 0]
                 assert master.shutdown("/master", "twice")[0] == 1  # type: ignore[index]
         assert node.told == [("/scan", ["http://a:1"]), "twice"] * 2
+    finally:
+        server.close()
+
+
+def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out() -> None:
+    server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
+    threads = threading.active_count()
+    held = []
+    try:
+        held += [socket.create_connection(("127.0.0.1", server.port), 10, ("127.0.0.2", 0)) for _ in range(40)]
+        with asked(server, "127.0.0.3") as master:  # accepted after the 40, so these are dealt with
+            assert master.getName("/master") == [1, "", "/walker"]
+            assert threading.active_count() <= threads + 17
+        kept, closed = held[:16], held[16:]
+        assert [link.recv(1) for link in closed] == [b""] * 24
+        for link in kept:
+            link.close()
+        end = time.monotonic() + 30
+        while threading.active_count() > threads:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        with asked(server, "127.0.0.2") as stranger:
+            assert stranger.getName("/stranger") == [1, "", "/walker"]
+    finally:
+        for link in held:
+            link.close()
+        server.close()
+
+
+def test_all_together_have_no_more_than_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slave, "_MOST", 3)
+    server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
+    try:
+        held = [
+            socket.create_connection(("127.0.0.1", server.port), 10, (f"127.0.0.{number}", 0)) for number in range(2, 6)
+        ]
+        assert held[-1].recv(1) == b""
+        for link in held:
+            link.close()
     finally:
         server.close()
 

@@ -7,6 +7,7 @@ import os
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from socketserver import ThreadingMixIn
 from typing import Any, Protocol, cast
@@ -19,6 +20,9 @@ FROM_MASTER = ("shutdown", "publisherUpdate")
 """What ends the node, or takes its topics to other publishers: only the machine of the master may, and this one."""
 _RESOLVED_S = 10.0
 """So long a name's addresses are good: others may make us look it up."""
+_MOST, _MOST_OF_ONE = 64, 16
+"""Connections at a time, each of which has a thread: in all, and from one address, so that a stranger's do not keep the
+master out. A graph's other nodes ask a few times in their life, and a person's tools one after the other."""
 _IDLE_S = 30.0
 """A connection that says nothing for so long is closed."""
 
@@ -105,6 +109,40 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     daemon_threads = True
     block_on_close = False
     trusts: Callable[[str], bool]
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._open: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """In a thread of its own; who comes on top of those that there may be is closed."""
+        asker = client_address[0]
+        with self._lock:
+            full = self._open.total() >= _MOST or self._open[asker] >= _MOST_OF_ONE
+            if not full:
+                self._open[asker] += 1
+        if full:
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # no more threads are to be had
+            self._closed(asker)
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """To the end of a connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._closed(client_address[0])
+
+    def _closed(self, asker: str) -> None:
+        with self._lock:
+            self._open[asker] -= 1
+            if self._open[asker] <= 0:
+                del self._open[asker]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that broke off, or a request that is none: the asker's matter."""
