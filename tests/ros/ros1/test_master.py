@@ -98,6 +98,8 @@ def test_an_answer_of_another_shape_is_an_error_of_the_master(said, ask):
 
 def test_publishers_that_are_no_list_do_not_end_the_thread_that_registers():
     class Entry:
+        name = "/t"
+
         def register(self, found):
             found.register_subscriber("/t", "std_msgs/Bool", "http://me/")
 

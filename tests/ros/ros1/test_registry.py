@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from skytether.ros.ros1.master import MasterError, RefusedError
+from skytether.ros.ros1.master import MasterError, NonsenseError, RefusedError
 from skytether.ros.ros1.node import own_host
 from skytether.ros.ros1.registry import Registry
 
@@ -31,16 +31,22 @@ class Entry:
     def __init__(self, name, refused=False):
         self.name = name
         self.refused = refused
+        self.nonsense = False
+
+    def check(self, master):
+        master.check()
+        if self.nonsense:
+            raise NonsenseError("http://master:11311 does not speak as ROS does")
 
     def register(self, master):
-        master.check()
+        self.check(master)
         master.told.append(f"+{self.name}")
         if self.refused:
             raise RefusedError(f"{self.name} is not legal")
         master.known.add(self.name)
 
     def unregister(self, master):
-        master.check()
+        self.check(master)
         master.told.append(f"-{self.name}")
         master.known.discard(self.name)
 
@@ -100,6 +106,32 @@ def test_what_the_master_refuses_is_named_once_and_the_others_are_told(master, r
     registry.step()
     assert master.told == ["+bad", "+good"]
     assert caplog.text.count("bad is not legal") == 1
+
+
+def test_what_the_master_answers_nonsense_for_is_named_and_the_others_are_told(master, registry, caplog):
+    scan, odom, joy = Entry("/scan"), Entry("/odom"), Entry("/joy")
+    scan.nonsense = odom.nonsense = True
+    for entry in (scan, odom, joy):
+        registry.want(entry)
+    for _ in range(100):
+        registry.step()
+    assert master.told == ["+/joy"]
+    assert registry.present is False
+    assert [record.message for record in caplog.records] == [
+        f"the ROS master answers nonsense for {name}: http://master:11311 does not speak as ROS does; it is asked again"
+        for name in ("/scan", "/odom")
+    ]
+    scan.nonsense = odom.nonsense = False
+    registry.step()
+    assert master.told == ["+/joy", "+/scan", "+/odom"]
+    assert registry.present
+    assert "answers" in caplog.records[-1].message
+    scan.nonsense = True
+    registry.drop(scan)
+    registry.drop(joy)
+    registry.step()
+    assert master.told[3:] == ["-/joy"]
+    assert caplog.records[-1].message.startswith("the ROS master answers nonsense for /scan")
 
 
 def test_the_own_address_is_what_ros_says_or_the_way_to_the_master():

@@ -25,6 +25,10 @@ class RefusedError(MasterError):
     """It answers, and says no."""
 
 
+class NonsenseError(MasterError):
+    """It answers, and not as ROS does."""
+
+
 class _Bounded(socket.socket):
     """All that comes is there in time, and not too much: a timeout of `socket` is for each read alone."""
 
@@ -85,7 +89,8 @@ def call(uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> 
 
     Raises:
         RefusedError: The answer is no.
-        MasterError: There is no answer, it does not end in time or is too large, or it is none of ROS.
+        NonsenseError: The answer is none of ROS.
+        MasterError: There is no answer, it does not end in time or is too large.
     """
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Transport(timeout), allow_none=True) as proxy:
@@ -94,7 +99,7 @@ def call(uri: str, method: str, *arguments: Any, timeout: float = TIMEOUT_S) -> 
     except (OSError, http.client.HTTPException) as error:
         raise MasterError(f"nobody answers at {uri}: {error}") from error
     except Exception as error:  # bytes of somebody else, and the library raises whatever its parts do
-        raise MasterError(f"{uri} does not speak as ROS does ({method}): {str(error)[:_SAID]}") from error
+        raise NonsenseError(f"{uri} does not speak as ROS does ({method}): {str(error)[:_SAID]}") from error
     if code != 1:
         raise RefusedError(f"{uri}: {str(status)[:_SAID]}")
     return value
@@ -122,7 +127,7 @@ class Master:
         found = self._call(method, *arguments)
         if _is_list(found) and (not of or all(_is_list(one, of) for one in found)):
             return found  # type: ignore[no-any-return]
-        raise MasterError(f"{self.uri} does not speak as ROS does ({method}): it answers no such list")
+        raise NonsenseError(f"{self.uri} does not speak as ROS does ({method}): it answers no such list")
 
     def knows(self, node: str) -> str:
         """Address of a node; empty if the master knows no such node."""
@@ -179,7 +184,7 @@ class Master:
         """Names of the nodes that offer a topic now."""
         offered: Any = next(iter(self._list("getSystemState")), None)
         if not _is_list(offered) or not all(_is_list(row, 2) and _is_list(row[1]) for row in offered):
-            raise MasterError(f"{self.uri} does not speak as ROS does (getSystemState): it answers no such list")
+            raise NonsenseError(f"{self.uri} does not speak as ROS does (getSystemState): it answers no such list")
         return [str(node) for name, nodes in offered if name == topic for node in nodes]
 
     def get_param(self, name: str) -> Any:

@@ -50,6 +50,10 @@ class _Subscribed:
     subscription: Subscription
     node: Node
 
+    @property
+    def name(self) -> str:
+        return self.subscription.topic
+
     def register(self, master: Master) -> None:
         topic = self.subscription.topic
         found = master.register_subscriber(topic, self.subscription.type, self.node.uri)
@@ -64,6 +68,10 @@ class _Published:
     publication: Publication
     node: Node
 
+    @property
+    def name(self) -> str:
+        return self.publication.topic
+
     def register(self, master: Master) -> None:
         master.register_publisher(self.publication.topic, self.publication.type, self.node.uri)
 
@@ -75,6 +83,10 @@ class _Published:
 class _Served:
     server: ServiceServer
     node: Node
+
+    @property
+    def name(self) -> str:
+        return self.server.name
 
     def register(self, master: Master) -> None:
         master.register_service(self.server.name, self.node.rosrpc, self.node.uri)

@@ -1,7 +1,8 @@
 """Keeps a node registered, whatever becomes of the master: level-triggered, in a thread of its own.
 
 Each round asks whether the master knows this node. A restarted master does not: everything is registered again. A
-master that is away is waited for; that is said once, and so is its return.
+master that is away is waited for; that is said once, and so is its return. What it answers nonsense for is named once
+and asked again each round, and does not keep the rest from being registered.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
-from .master import Master, MasterError, RefusedError
+from .master import Master, MasterError, NonsenseError, RefusedError
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +24,11 @@ _CLOSE_S = 5.0
 
 class Entry(Protocol):
     """One registration."""
+
+    @property
+    def name(self) -> str:
+        """Of its topic or service."""
+        ...
 
     def register(self, master: Master) -> None:
         """Tell the master; raises MasterError."""
@@ -57,7 +63,7 @@ class Registry:
         self._closing = False
         self._wanted: list[Entry] = []
         self._done: list[Entry] = []
-        self._said = ""
+        self._said: set[str] = set()
         self._thread = threading.Thread(target=self._run, name="ros1-master", daemon=True)
 
     def start(self) -> None:
@@ -91,30 +97,44 @@ class Registry:
             if self._done and self._master.knows(self._node) != self._uri():
                 _log.warning("the ROS master at %s was restarted; registering again", self._master.uri)
                 self._done.clear()
-            self._settle()
+            wrong = self._settle()
         except MasterError as error:
             self.present = False
-            self._say(f"no ROS master answers: {error}; waiting for it")
+            self._say("", f"no ROS master answers: {error}; waiting for it")
             return
-        if self._said:
+        for name, nonsense in wrong.items():
+            self._say(name, f"the ROS master answers nonsense for {name}: {nonsense}; it is asked again")
+        if self._said and not wrong:
             _log.warning("the ROS master at %s answers", self._master.uri)
-        self.present, self._said = True, ""
+            self._said.clear()
+        self.present = not wrong
 
-    def _settle(self) -> None:
+    def _settle(self) -> dict[str, NonsenseError]:
+        """Tell the master what it does not know yet. Returns what it answers nonsense for, by name."""
         with self._changed:
             missing = [entry for entry in self._wanted if entry not in self._done]
             surplus = [entry for entry in self._done if entry not in self._wanted]
         if not missing and not surplus and not self._done:
             self._master.knows(self._node)  # whether it is there at all
+        wrong: dict[str, NonsenseError] = {}
         for entry in surplus:
-            entry.unregister(self._master)
-            self._done.remove(entry)
+            if self._tell(entry.unregister, entry.name, wrong):
+                self._done.remove(entry)
         for entry in missing:
-            try:
-                entry.register(self._master)
-            except RefusedError as error:
-                _log.error("the ROS master refuses: %s", error)
-            self._done.append(entry)
+            if self._tell(entry.register, entry.name, wrong):
+                self._done.append(entry)
+        return wrong
+
+    def _tell(self, tell: Callable[[Master], None], name: str, wrong: dict[str, NonsenseError]) -> bool:
+        """Whether the master has heard it, be it that it refuses."""
+        try:
+            tell(self._master)
+        except RefusedError as error:
+            _log.error("the ROS master refuses: %s", error)
+        except NonsenseError as error:
+            wrong[name] = error
+            return False
+        return True
 
     def _run(self) -> None:
         while True:
@@ -131,7 +151,8 @@ class Registry:
         self._dirty = True
         self._changed.notify_all()
 
-    def _say(self, sentence: str) -> None:
-        if not self._said:
+    def _say(self, about: str, sentence: str) -> None:
+        """Once for each name, and for the master, until all is well again."""
+        if about not in self._said:
             _log.warning("%s", sentence)
-        self._said = sentence
+        self._said.add(about)
