@@ -14,7 +14,7 @@ from skytether.api.rest import InstanceCreate, RobotCreate, State
 from skytether.cli.app import app
 from skytether.orchestrator.backup import backup, restore
 from skytether.orchestrator.rotation import Rotation, rotate_key, rotate_operator
-from skytether.orchestrator.security import SecretFileError, Secrets
+from skytether.orchestrator.security import SecretFileError, Secrets, fingerprint_of
 
 ID = "0011223344556677"
 CLAIM = "c" * 43
@@ -61,7 +61,29 @@ def test_what_cannot_be_used_changes_nothing(tmp_path: Path, caplog: pytest.LogC
     assert [path.name for path in tmp_path.iterdir() if "old" in path.name or "draft" in path.name] == []
 
 
-def test_an_old_key_is_forgotten_when_no_session_has_it(tmp_path: Path, store: Any, new_record: Any) -> None:
+def test_a_key_that_could_not_be_used_is_once_it_is_mended(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, store: Any
+) -> None:
+    """Somebody copies a key from another orchestrator, and chmods it only when told so."""
+    secrets = Secrets(tmp_path)
+    rotation = Rotation(tmp_path, secrets, store, time.time)
+    before = secrets.fingerprint
+    (tmp_path / "copy").write_bytes(b"k" * 32)
+    (tmp_path / "copy").chmod(0o644)
+    (tmp_path / "copy").replace(tmp_path / "secret.key")
+    for _ in range(3):
+        rotation.look()
+    assert secrets.fingerprint == before
+    assert caplog.text.count("can be read by others: chmod 600") == 1
+    (tmp_path / "secret.key").chmod(0o600)
+    assert secrets.look()
+    assert secrets.fingerprint == fingerprint_of(b"k" * 32)
+
+
+def test_an_old_key_is_forgotten_when_no_session_has_it(
+    tmp_path: Path, store: Any, new_record: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     (tmp_path / "secrets").mkdir()
     folder = tmp_path / "secrets"
     secrets, ahead = Secrets(folder), [0.0]
@@ -88,6 +110,7 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(tmp_path: Path, store: A
     assert not old.exists()
     rotation.look()
     assert secrets.old_fingerprints == ()
+    assert caplog.text.count("were changed") == 1, "at the rotation, and not where a key was forgotten"
 
 
 def test_nothing_ends_where_secrets_are_rotated(served: Any, tmp_path: Path) -> None:

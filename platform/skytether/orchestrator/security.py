@@ -148,17 +148,18 @@ class Secrets:
         self._held = self._read()
 
     def look(self) -> bool:
-        """Whether the files are others than before; what is in them is used from now on.
+        """Whether a secret is used from now on that was not before; one that is gone is used no more.
 
         Raises:
-            SecretFileError: One of them cannot be used; what was used before still is.
+            SecretFileError: One of them cannot be used; what was used before still is, until they are mended.
         """
         seen = self._signature()
         if seen == self._seen:
             return False
-        self._seen = seen
-        self._held = self._read()
-        return True
+        before, held = self._held, self._read()
+        self._seen, self._held = seen, held  # only now: files that could not be used are looked at again
+        put_back = set(held.old) - set(before.old)
+        return held.current != before.current or held.operator != before.operator or bool(put_back)
 
     def _read(self) -> _Held:
         current = _kept_secret(self._folder / KEY)  # first: a rotation keeps the old one before it puts the new one
@@ -169,13 +170,13 @@ class Secrets:
         keys = tuple(key for key in map(_kept_secret, old) if key != current)
         return _Held(current, keys, _operator(self._folder / OPERATOR))
 
-    def _signature(self) -> tuple[tuple[str, int, int], ...]:
+    def _signature(self) -> tuple[tuple[str, int, int, int], ...]:
         files = [self._folder / KEY, self._folder / OPERATOR, *sorted(self._folder.glob(f"{OLD_KEY}*"))]
         found = []
         for path in files:
             with contextlib.suppress(OSError):
                 now = path.stat()
-                found.append((path.name, now.st_ino, now.st_mtime_ns))
+                found.append((path.name, now.st_ino, now.st_mtime_ns, now.st_ctime_ns))  # the last: of chmod too
         return tuple(found)
 
     def is_operator(self, token: str) -> bool:
@@ -202,7 +203,8 @@ class Secrets:
             SecretFileError: That key is not here.
         """
         key = self._key(of)
-        if key is None and self.look():  # another orchestrator was quicker to see a rotation
+        if key is None:  # another orchestrator was quicker to see a rotation
+            self.look()
             key = self._key(of)
         if key is None:
             raise SecretFileError(f"the secret key {of} that session {session_id} began with is not in {self._folder}")
