@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 import time
 from pathlib import Path
 from typing import Any
@@ -78,6 +80,25 @@ def test_a_key_that_could_not_be_used_is_once_it_is_mended(
     (tmp_path / "secret.key").chmod(0o600)
     assert secrets.look()
     assert secrets.fingerprint == fingerprint_of(b"k" * 32)
+
+
+def test_an_old_key_is_on_the_disk_before_another_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not only what is in the files: their names too, or a power cut takes the only key that sessions have."""
+    kept: list[dict[str, bytes]] = []
+
+    def note(file: int) -> None:
+        if stat.S_ISDIR(os.fstat(file).st_mode):
+            kept.append({path.name: path.read_bytes() for path in tmp_path.iterdir()})
+
+    monkeypatch.setattr(os, "fsync", note)
+    Secrets(tmp_path)
+    old = (tmp_path / "secret.key").read_bytes()
+    assert kept.pop()["secret.key"] == old, "a new one is there for good too"
+    kept.clear()
+    name = rotate_key(tmp_path).name
+    assert [(names["secret.key"] == old, names[name] == old) for names in kept] == [(True, True), (False, True)]
 
 
 def test_an_old_key_is_forgotten_when_no_session_has_it(

@@ -82,10 +82,11 @@ def close_folder(folder: Path, *, with_database: bool) -> None:
 
 
 def replace_secret(path: Path, content: bytes) -> None:
-    """Put a secret into a file, mode 0600, complete or not at all, whatever is there."""
+    """Put a secret into a file, mode 0600, complete or not at all, whatever is there; on the disk when it returns."""
     draft = path.with_name(f"draft-{path.name}.{secrets.token_hex(4)}")
     _write(draft, content)
     draft.replace(path)
+    _keep_names(path.parent)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -93,6 +94,15 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _keep_names(folder: Path) -> None:
+    """Put the names in a folder on the disk: a file that is there under no name is gone with the power."""
+    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
 def secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
@@ -114,6 +124,7 @@ def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
         with contextlib.suppress(FileExistsError):
             os.link(draft, path)
         draft.unlink()
+        _keep_names(path.parent)
     if path.is_file() and stat.S_IMODE(path.stat().st_mode) & 0o077:
         raise SecretFileError(f"{path} can be read by others: chmod 600 {path}")
     content = path.read_bytes()
