@@ -120,6 +120,25 @@ def test_a_site_that_cannot_start_it_fails_it_in_words(bench: Any, new_record: N
     assert "could not be started: no space left on the site" in b.record().reason
 
 
+def test_whose_secret_key_is_gone_holds_up_no_other(bench: Any, new_record: NewRecord) -> None:
+    b = bench()
+    b.store.key_id = lambda: "00" * 16
+    add(b, new_record("i1", lease_expires_at=b.clock() + 100))
+    b.store.key_id = lambda: ""
+    b.clock.forward(0.1)
+    add(b, new_record("i2", lease_expires_at=b.clock() + 100))
+    b.step(3)
+    assert b.record("i2").state is State.RUNNING
+    assert "is not in" in b.record("i1").reason
+    for _ in range(40):
+        b.step()
+        b.clock.forward(0.25)
+    assert b.record("i1").state is State.FAILED
+    assert "the secret key 0000" in b.record("i1").reason
+    assert "i1" not in b.runtime.world
+    assert b.record("i1").refused == [], "no site is blamed"
+
+
 NO_SPACE = "could not be started: no space left on the site"
 
 

@@ -155,6 +155,17 @@ def test_nothing_ends_where_secrets_are_rotated(served: Any, tmp_path: Path) -> 
     assert records[new.id].key_id == Secrets(tmp_path).fingerprint
 
 
+def test_a_session_whose_key_is_gone_is_told_so(served: Any, tmp_path: Path) -> None:
+    served.site()
+    asks = served.operator
+    one = asks.wait_running(asks.create_instance(InstanceCreate(service="toy", robot="walker")).id, timeout=10)
+    rotate_key(tmp_path).unlink()
+    served.core.rotation.look()
+    with pytest.raises(ApiError, match="put it back, or delete instance") as told:
+        asks.claim_session(one.id, CLAIM)
+    assert told.value.problem.status == 409
+
+
 def test_a_copy_holds_the_keys_of_sessions_that_run(tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir()

@@ -37,7 +37,7 @@ from .reconcile import Reconciler, told
 from .records import Record, new_record
 from .reports import Reports
 from .runtimes.base import LogStream, RuntimeFailure
-from .security import Secrets
+from .security import SecretFileError, Secrets
 from .sites import Sites
 from .store import KeyReusedError, Store
 from .validation import check_params
@@ -230,7 +230,7 @@ class Instances:
 
         Raises:
             NotFoundError: As for ``get``.
-            ConflictError: Somebody else with the robot's token has it.
+            ConflictError: Somebody else with the robot's token has it, or the secret key that it is made from is gone.
         """
         record = self.get(principal, instance)
         if principal.robot is not None:
@@ -240,7 +240,13 @@ class Instances:
                     f"the key of instance '{instance}' was handed out already, and not to you: delete it, and ask for "
                     "another one; if nobody of yours has it, the robot's token leaked"
                 )
-        return SessionKey(key=base64.b64encode(self._secrets.session_key(record.session_id, record.key_id)).decode())
+        try:
+            key = self._secrets.session_key(record.session_id, record.key_id)
+        except SecretFileError as error:
+            raise ConflictError(
+                f"{error}: put it back, or delete instance '{instance}' and ask for another one"
+            ) from error
+        return SessionKey(key=base64.b64encode(key).decode())
 
     def delete(self, principal: Principal, instance: str) -> None:
         """End an instance; one that has ended, or is ending, stays as it is.

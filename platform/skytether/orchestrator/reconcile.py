@@ -25,7 +25,7 @@ from .placement import NOTHING, UNSTARTED, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
 from .runtimes.base import Capacity, Launch, Observation, Phase, RuntimeFailure, SiteSilentError
-from .security import Secrets
+from .security import SecretFileError, Secrets
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
 from .store import Store
@@ -387,6 +387,8 @@ class Reconciler:
             raise  # no fault of the service: it is started when the site answers again
         except RuntimeFailure as error:
             self._crash(site, Crash(noted, f"could not be started: {error}", unstarted=True))
+        except SecretFileError as error:  # nothing of the site's: another one has the same secrets
+            self._crash(site, Crash(noted, f"could not be started: {error}"))
 
     def _launch(self, record: Record) -> Launch:
         spec = record.spec
