@@ -6,7 +6,6 @@ import base64
 import importlib.util
 import io
 import json
-import socket
 import sys
 import tarfile
 from contextlib import closing, nullcontext
@@ -20,7 +19,7 @@ from docker.errors import ImageNotFound
 from pydantic import ValidationError
 
 from skytether.api.grant import Grant
-from skytether.api.manifest import Opening, ServiceSpec
+from skytether.api.manifest import ServiceSpec
 from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
@@ -29,7 +28,7 @@ from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials, ensure_image
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
-from skytether.orchestrator.runtimes.docker.network import bridge_of, resolve, rules
+from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
     Seen,
     advised,
@@ -422,55 +421,9 @@ def test_the_bridge_is_of_one_network() -> None:
     assert bridge_of("a") != bridge_of("b")
 
 
-def test_the_filter_lets_out_what_is_opened_and_answers() -> None:
-    assert "policy drop" in rules({})
-    assert rules({}).count(" accept") == 3  # loopback, answers, neighbours
-    names = ("192.0.2.7:443", "192.0.2.0/24:53/udp", "[2001:db8::7]:8883", "[2001:db8::/32]:123/udp")
-    made = rules(resolve(map(Opening.of, names)))
-    for wanted in (
-        "ip daddr 192.0.2.7/32 tcp dport 443 accept",
-        "ip daddr 192.0.2.0/24 udp dport 53 accept",
-        "ip6 daddr 2001:db8::7/128 tcp dport 8883 accept",
-        "ip6 daddr 2001:db8::/32 udp dport 123 accept",
-    ):
-        assert wanted in made
-
-
-def test_a_name_is_looked_up_once_and_known_within(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look_up(host: str, port: int, **_: Any) -> list[Any]:
-        if host == "nowhere.example":
-            raise socket.gaierror("unknown")
-        return [(0, 0, 0, "", (f"192.0.2.{n}", port)) for n in (1, 2, 1)]
-
-    monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    found = resolve([Opening.of("API.example:443")])
-    assert found == {Opening("api.example", 443): ("192.0.2.1", "192.0.2.2")}
+def test_names_are_known_within() -> None:
     made = body(hosts={"api.example": ("192.0.2.1", "192.0.2.2")})
     assert made["HostConfig"]["ExtraHosts"] == ["api.example:192.0.2.1", "api.example:192.0.2.2"]
-    with pytest.raises(RuntimeFailure, match=r"needs\.egress: nowhere\.example has no address"):
-        resolve([Opening.of("nowhere.example:443")])
-
-
-def test_a_site_opens_what_its_operator_says() -> None:
-    wants = spec(needs={"egress": ["api.example.org:443", "192.0.2.7:123/udp"]})
-    assert refusal(wants, options()) == (
-        "the site lets nobody connect to api.example.org:443/tcp, 192.0.2.7:123/udp: "
-        "add it to the site's option 'egress'"
-    )
-    assert refusal(wants, options(egress=["*.example.org:443/tcp", "192.0.2.*:123/udp"])) is None
-    assert refusal(wants, options(egress=["*"])) is None
-    for wrong in (
-        "api.example.org",
-        "api:0",
-        "api:70000",
-        "http://api:1",
-        "192.0.2.300/24:1",
-        "a b:1",
-        "-x:1",
-        "x:1/sctp",
-    ):
-        with pytest.raises(ValidationError):
-            spec(needs={"egress": [wrong]})
 
 
 def test_the_ssh_client_asks_nobody() -> None:

@@ -9,7 +9,6 @@ has any right to the machine's own network, and an instance whose filter could n
 from __future__ import annotations
 
 import hashlib
-import ipaddress
 import logging
 import socket
 from collections.abc import Iterable, Mapping
@@ -21,6 +20,7 @@ from docker.errors import APIError, NotFound
 from skytether.api.manifest import Opening
 
 from ..base import RuntimeFailure
+from .egress import network_of
 from .engine import Engine, explain, status_of
 from .images import ensure_image
 from .options import DockerOptions
@@ -68,12 +68,16 @@ def resolve(openings: Iterable[Opening]) -> dict[Opening, tuple[str, ...]]:
     Those of a network, or of an address, are written with their prefix; those of a name are not.
 
     Raises:
-        RuntimeFailure: A name has none.
+        RuntimeFailure: A name has none, or it is neither name nor address.
     """
     found: dict[Opening, tuple[str, ...]] = {}
     for opening in openings:
-        with suppress(ValueError):
-            found[opening] = (str(ipaddress.ip_network(opening.host, strict=False)),)
+        try:
+            network = network_of(opening)
+        except ValueError as error:
+            raise RuntimeFailure(f"needs.egress: {opening}: {error}") from error
+        if network is not None:
+            found[opening] = (str(network),)
             continue
         try:
             rows = socket.getaddrinfo(opening.host, opening.port, type=socket.SOCK_STREAM)

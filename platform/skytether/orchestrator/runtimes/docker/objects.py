@@ -6,13 +6,13 @@ import io
 import tarfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec
 
 from ..base import Launch, Observation, Phase
+from .egress import refusal_of
 from .meter import Usage
 from .options import DockerOptions
 
@@ -102,10 +102,7 @@ def refusal(spec: ServiceSpec, options: DockerOptions) -> str | None:
     missing = [device for device in spec.needs.devices if device not in options.devices]
     if missing:
         return f"the site does not offer {', '.join(missing)}: add it to the site's option 'devices'"
-    closed = [str(to) for to in spec.needs.openings if not any(fnmatchcase(str(to), p) for p in options.egress)]
-    if closed:
-        return f"the site lets nobody connect to {', '.join(closed)}: add it to the site's option 'egress'"
-    return None
+    return refusal_of(spec.needs.openings, options.egress)
 
 
 def free_gpus(wanted: int, total: int, taken: Iterable[int]) -> tuple[int, ...] | None:

@@ -1,0 +1,136 @@
+"""What containers may connect to, as patterns and rules: no engine needed."""
+
+from __future__ import annotations
+
+import socket
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from skytether.api.manifest import Opening, ServiceSpec
+from skytether.orchestrator.runtimes.base import RuntimeFailure
+from skytether.orchestrator.runtimes.docker.network import resolve, rules
+from skytether.orchestrator.runtimes.docker.objects import refusal
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
+
+
+def options(**given: Any) -> DockerOptions:
+    return DockerOptions.model_validate(given)
+
+
+def spec(**given: Any) -> ServiceSpec:
+    return ServiceSpec.model_validate({"image": "toy", **given})
+
+
+def opens(pattern: str, wanted: str) -> bool:
+    return refusal(spec(needs={"egress": [wanted]}), options(egress=[pattern])) is None
+
+
+@pytest.mark.parametrize(
+    ("pattern", "wanted"),
+    [
+        ("192.0.2.*", "192.0.2.0/0:25"),
+        ("192.0.2.*", "192.0.2.0/0:25/tcp"),
+        ("192.0.2.*", "192.0.2.evil.com:443"),
+        ("192.0.2.*", "192.0.2.0/23:25"),
+        ("192.0.2.*:443/tcp", "192.0.2.7:443/udp"),
+        ("192.0.2.0/24:*", "192.0.3.7:443"),
+        ("192.0.2.?", "192.0.2.0/31:1"),
+        ("192.0.2.?", "192.0.2.17:1"),
+        ("192.0.2.7*", "192.0.2.7/0:1"),
+        ("*.0.2.7", "10.0.2.7.evil.com:1"),
+        ("127.*", "127.1:80"),
+        ("*.*", "127.1:80"),
+        ("*x*", "0x7f000001:80"),
+        ("*", "2130706433:80"),
+        ("*", "192.0.2.7/24:80"),
+        ("*", "[2001:db8::7/32]:80"),
+        ("*.example.org:443", "10.0.0.1:443"),
+        ("[2001:db8::/32]:123/udp", "[2001:db9::7]:123/udp"),
+        ("[2001:db8::*]:123/udp", "[2001:db8::/16]:123/udp"),
+        ("[2001:db8::*]", "192.0.2.7:1"),
+        ("192.0.2.*", "[2001:db8::7]:1"),
+        ("[2001:db8::7]:123/udp", "2:123/udp"),
+        ("*.example.org:443/tcp", "api.example.org.evil.com:443"),
+        ("api.example.org:443/tcp", "api.example.org:4430"),
+        ("*:443/tcp", "192.0.2.7:80"),
+    ],
+)
+def test_a_pattern_opens_nothing_else(pattern: str, wanted: str) -> None:
+    assert not opens(pattern, wanted)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "wanted"),
+    [
+        ("192.0.2.*", "192.0.2.7:25"),
+        ("192.0.2.*", "192.0.2.0/25:25/udp"),
+        ("192.0.2.*/udp", "192.0.2.7:25/udp"),
+        ("10.*:1883", "10.1.0.0/16:1883"),
+        ("10.*.*:1883/*", "10.1.2.3:1883"),
+        ("10.0.?.7", "10.0.3.7:1"),
+        ("192.0.2.0/24:44*/tcp", "192.0.2.128/25:443"),
+        ("192.0.2.7:*", "192.0.2.7:1/udp"),
+        ("0.0.0.0/0", "192.0.2.7:1"),
+        ("*", "0.0.0.0/0:1"),
+        ("*:443/tcp", "[::/0]:443"),
+        ("[2001:DB8::/32]:123/udp", "[2001:db8:1::/48]:123/udp"),
+        ("[2001:db8::*]", "[2001:db8:0::7]:1"),
+        ("*.Example.org:443/tcp", "API.example.org:443"),
+        ("*.example.org", "a.b.example.org:1/udp"),
+        ("localhost:1/tcp", "localhost:1"),
+        ("[ab].example.org:1", "b.example.org:1"),
+    ],
+)
+def test_a_pattern_opens_what_it_says(pattern: str, wanted: str) -> None:
+    assert opens(pattern, wanted)
+
+
+def test_the_filter_lets_out_what_is_opened_and_answers() -> None:
+    assert "policy drop" in rules({})
+    assert rules({}).count(" accept") == 3  # loopback, answers, neighbours
+    names = ("192.0.2.7:443", "192.0.2.0/24:53/udp", "[2001:db8::7]:8883", "[2001:db8::/32]:123/udp")
+    made = rules(resolve(map(Opening.of, names)))
+    for wanted in (
+        "ip daddr 192.0.2.7/32 tcp dport 443 accept",
+        "ip daddr 192.0.2.0/24 udp dport 53 accept",
+        "ip6 daddr 2001:db8::7/128 tcp dport 8883 accept",
+        "ip6 daddr 2001:db8::/32 udp dport 123 accept",
+    ):
+        assert wanted in made
+
+
+def test_a_name_is_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(host: str, port: int, **_: Any) -> list[Any]:
+        if host == "nowhere.example":
+            raise socket.gaierror("unknown")
+        return [(0, 0, 0, "", (f"192.0.2.{n}", port)) for n in (1, 2, 1)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    found = resolve([Opening.of("API.example:443")])
+    assert found == {Opening("api.example", 443): ("192.0.2.1", "192.0.2.2")}
+    with pytest.raises(RuntimeFailure, match=r"needs\.egress: nowhere\.example has no address"):
+        resolve([Opening.of("nowhere.example:443")])
+
+
+def test_a_site_opens_what_its_operator_says() -> None:
+    wants = spec(needs={"egress": ["api.example.org:443", "192.0.2.7:123/udp"]})
+    assert refusal(wants, options()) == (
+        "the site lets nobody connect to api.example.org:443/tcp, 192.0.2.7:123/udp: "
+        "add it to the site's option 'egress'"
+    )
+    assert refusal(wants, options(egress=["*.example.org:443/tcp", "192.0.2.*:123/udp"])) is None
+    assert refusal(wants, options(egress=["*"])) is None
+    for wrong in (
+        "api.example.org",
+        "api:0",
+        "api:70000",
+        "http://api:1",
+        "192.0.2.300/24:1",
+        "a b:1",
+        "-x:1",
+        "x:1/sctp",
+    ):
+        with pytest.raises(ValidationError):
+            spec(needs={"egress": [wrong]})
