@@ -1,8 +1,11 @@
 """The folder of a guard: whoever has it, whether it still leads to the guard, and what is left of one that died."""
 
+import errno
+import fcntl
 import os
 import socket
 import threading
+from unittest.mock import Mock
 
 import pytest
 
@@ -44,6 +47,16 @@ def test_a_folder_has_one_guard(claim, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ClaimError, match="cannot use the folder"):
         Claim(str(tmp_path / "file"))
+
+
+@pytest.mark.parametrize("lockless", [False, True])
+def test_a_folder_that_cannot_be_had_leaves_nothing_open(claim, tmp_path, monkeypatch, lockless):
+    if lockless:
+        monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
+    with pytest.raises(ClaimError):
+        Claim(str(tmp_path / "run"), 0.0)
+    lock, files = str(tmp_path / "run" / LOCK_FILE), os.listdir("/proc/self/fd")
+    assert [os.path.realpath(f"/proc/self/fd/{file}") for file in files].count(lock) == 1, "that of who has it"
 
 
 def test_a_guard_that_listens_is_not_waited_for(claim, tmp_path):

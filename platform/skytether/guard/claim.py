@@ -50,7 +50,14 @@ class Claim:
             raise ClaimError(f"cannot use the folder {folder} for the gate's sockets: {error.strerror}") from error
         finally:
             os.umask(before)
-        end = time.monotonic() + patience_s
+        try:
+            self._take(folder, time.monotonic() + patience_s)
+        except ClaimError:
+            os.close(self._lock)  # else the number stays taken for as long as whoever asked lives
+            raise
+        self._files = {path: _identity(os.fstat(self._lock))}
+
+    def _take(self, folder: str, end: float) -> None:
         try:
             while not _locked(self._lock, fcntl.LOCK_EX):
                 if guarded(folder) or time.monotonic() > end:
@@ -58,7 +65,6 @@ class Claim:
                 time.sleep(_AGAIN_S)
         except OSError as error:
             raise ClaimError(f"cannot lock the folder {folder}: {error.strerror}") from error
-        self._files = {path: _identity(os.fstat(self._lock))}
 
     def add(self, path: str) -> None:
         """One of this guard's sockets, which has to stay where it is."""
