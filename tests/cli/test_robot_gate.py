@@ -8,6 +8,7 @@ import pytest
 from skytether.cli import robot_gate
 from skytether.cli.robot_gate import FoundGate, OwnGate
 from skytether.guard.latch import FIRST_ACT
+from skytether.robot.safety.client import GateError
 
 
 class Own:
@@ -77,6 +78,7 @@ class Started:
 
     def __init__(self, monkeypatch, lost=""):
         self.stopped, self.kept, self.lost = "", True, lost
+        self.silent: set[str] = set()
         self.now, self.there, self.guard_pid, self.asked, self.processes = 100.0, False, 7, [], []
         monkeypatch.setattr(OwnGate, "_start", lambda _: self.start())
         monkeypatch.setattr(robot_gate, "listens", lambda folder: True)
@@ -94,6 +96,8 @@ class Started:
 
     def ask(self, folder, request, timeout):
         self.asked.append(request["do"])
+        if request["do"] in self.silent:
+            raise GateError("it does not answer")
         return {"guard_pid": self.guard_pid, "stopped": self.stopped, "kept": self.kept}
 
     def look(self, seconds):
@@ -111,6 +115,27 @@ def test_the_own_gate_is_started_once_with_the_robot(started):
     started.gate.wait()
     started.look(5.0)
     assert started.asked == ["status", "status", "start"]
+
+
+@pytest.mark.parametrize("silent", ["status", "reset", "start"])
+def test_a_gate_that_did_not_answer_is_asked_again(started, silent):
+    """A busy machine, at the robot's start: else the robot stands, and nobody says why."""
+    started.stopped, started.silent = FIRST_ACT, {silent}
+    started.gate.wait()
+    started.look(1.0)
+    started.silent = set()
+    started.asked.clear()
+    started.look(5.0)
+    assert started.asked == ["status", "reset", "start"], "once"
+
+
+def test_a_gate_that_did_not_answer_in_the_time_of_the_start_is_left_to_a_person(started):
+    started.silent = {"status"}
+    started.gate.wait()
+    started.look(50.0)
+    started.silent = set()
+    started.look(5.0)
+    assert set(started.asked) == {"status"}
 
 
 def test_where_a_reboot_forgets_a_stop_the_start_of_the_robot_is_no_reset(monkeypatch):

@@ -159,7 +159,8 @@ class OwnGate:
                 ask(self._folder, {"do": "reset", "only": FIRST_ACT}, _ASK_S)
             if start and stopped in ("", FIRST_ACT):
                 ask(self._folder, {"do": "start"}, _ASK_S)
-        return True
+            return True
+        return False  # it did not answer, or not yet with yes: at the next look again
 
 
 class FoundGate:
