@@ -539,9 +539,10 @@ def test_an_engine_behind_ssh(sshd: str, docker_site: DockerSite, tmp_path: Path
             assert "toy service" in runtime.logs("i1", 10)
             tunnel = runtime._engine._tunnel
             assert tunnel is not None
-            assert tunnel._process is not None
-            tunnel._process.kill()  # the network is gone for a moment
-            tunnel._process.wait()
+            process = tunnel._process
+            assert process is not None
+            process.kill()  # the network is gone for a moment
+            process.wait()
             until(lambda: is_seen(runtime, Phase.RUNNING))
             until(lambda: stopped(runtime))
             until(lambda: is_seen(runtime, Phase.EXITED))

@@ -58,7 +58,12 @@ def orchestrator(tmp_path):
         EmbeddedOrchestrator(tmp_path / "orchestrator") as orchestrator,
         Client(orchestrator.url, orchestrator.operator_token) as client,
     ):
-        options = {"python_path": folders, "environment": debian_packages(tmp_path / "packages")}
+        packages = tmp_path / "packages"
+        options = {
+            "python_path": folders,
+            "environment": debian_packages(packages),
+            "readable": [str(packages)],
+        }
         client.create_site(SiteCreate(name="here", tier="edge", runtime="process", options=options))
         client.delete_site("local")
         orchestrator.client = client

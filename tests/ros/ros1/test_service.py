@@ -84,7 +84,8 @@ def manifest(launch):
 
 @pytest.fixture
 def launch(tmp_path):
-    path = tmp_path / "tools.launch"
+    path = tmp_path / "packages" / "tools.launch"
+    path.parent.mkdir(exist_ok=True)
     path.write_text(LAUNCH)
     return path
 
