@@ -11,6 +11,7 @@ from played_wheels import Wheels, odometry
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Time, Twist, TwistStamped, Vector3
 from skytether.robot.safety.motion import Fault, Motion, MotionParams, Seen
+from skytether.robot.safety.stamps import StampRule
 from skytether.robot.supervisor import Limits
 
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
@@ -198,6 +199,35 @@ def test_readings_that_are_not_newer_are_silence_and_hide_no_runaway(stamps, wro
         if turn > 1:
             assert wrong in said or "same reading" in said
     assert "is silent" in motion.look(now).unknown
+
+
+def test_readings_that_begin_to_come_late_are_as_old_as_they_are():
+    for stamps, known in [(StampRule.AUTO, False), (StampRule.ORDER, True)]:
+        motion, now = Motion(replace(PARAMS, stamps=stamps), LIMITS, 0.1), 100.0
+        for turn in range(100):
+            now += READING
+            late = min(2.0, READING / 2 * max(0, turn - 20))
+            assert motion.measure(odometry(0.2, 0.0, 5000 + now - late), now) == ""
+            if turn == 25:
+                assert motion.look(now).measured, "what is a little late is known"
+        seen = motion.look(now)
+        assert (not seen.unknown) is known
+        if not known:
+            assert "s late by its stamp" in seen.unknown
+            motion.relearn()
+            motion.measure(odometry(0.2, 0.0, 5000 + now), now + 2.0)
+            assert motion.look(now + 2.0).measured, "a person has looked at the robot"
+
+
+def test_a_reading_that_is_stale_is_no_fault_of_the_wheels():
+    motion, now = Motion(PARAMS, LIMITS, 0.1), 100.0
+    for turn in range(400):
+        now += READING
+        motion.told(Velocity(0.2, 0.0) if turn < 100 else STANDSTILL, now)
+        late = 3.0 if turn > 100 else 0.0
+        if turn != 101 and (turn <= 100 or turn > 101 + 3.0 / READING):
+            motion.measure(odometry(0.2, 0.0, now - late), now)
+        assert motion.look(now).fault is None
 
 
 def test_a_clock_of_the_readings_that_is_set_back_is_believed_again_after_a_second():

@@ -59,7 +59,8 @@ class MotionParams:
         share: The same, of the velocity told.
         confirm_s: How long a reading must be outside the envelope [s].
         blocked_s: How long the wheels may stand when they are told to move [s].
-        max_age_s: Silence after which the real motion is not known [s].
+        max_age_s: Age, and silence, after which the real motion is not known [s].
+        stamps: What is asked of the stamps of the readings.
     """
 
     latency_s: float = 0.1
@@ -71,6 +72,7 @@ class MotionParams:
     confirm_s: float = 0.2
     blocked_s: float = 1.0
     max_age_s: float = 0.3
+    stamps: StampRule = StampRule.AUTO
 
     @property
     def window_s(self) -> float:
@@ -122,6 +124,7 @@ class Motion:
         self._told: deque[_Piece] = deque(maxlen=_PIECES)
         self._measured = STANDSTILL
         self._measured_at = nan
+        self._delay = 0.0
         self._stamps = Stamps()
         self._nonsense = ""
         self._since: dict[bool, float] = {}  # of what is outside: whether it is a wheel that stands -> since when
@@ -148,23 +151,30 @@ class Motion:
     def measure(self, message: Message, now: float) -> str:
         """Take a reading in: Odometry, TwistStamped or Twist in the robot's base frame.
 
+        One that comes later than the quickest so far is that much older; one that is stale by that is no fault of the
+        wheels, which were told something else when it was made.
+
         Returns:
             What is wrong with it; empty: nothing.
         """
         twist, stamp = twist_of(message), _stamp(message)
         if twist is None:
             return f"a {message.TYPE} is no odometry"
-        dated = date(StampRule.ORDER, self._stamps, stamp, now, self._params.max_age_s)
+        dated = date(self._params.stamps, self._stamps, stamp, now, self._params.max_age_s)
         self._stamps = dated.stamps
         if dated.wrong:
             return f"{_NOT_NEWER[dated.wrong]}, which counts as silence"
-        self._measured_at = now
+        self._measured_at, self._delay = now - dated.delay, dated.delay
         self._measured = Velocity(float(twist.linear.x), float(twist.angular.z))
         finite = isfinite(self._measured.linear) and isfinite(self._measured.angular)
         self._nonsense = "" if finite else "reports a velocity that is no number"
-        if finite:
+        if finite and dated.delay <= self._params.max_age_s:
             self._judge(now)
         return ""
+
+    def relearn(self) -> None:
+        """Forget how quick readings were, because a person looked at the robot."""
+        self._stamps = Stamps()
 
     def look(self, now: float) -> Seen:
         """What is known now. A fault is told once, in the look after the reading that showed it."""
@@ -172,7 +182,9 @@ class Motion:
         age = now - self._measured_at
         unknown = self._nonsense
         if not -_TOLERANCE_S <= age <= self._params.max_age_s:
-            unknown = f"is silent for {age:.1f} s" if isfinite(age) else "nothing has come yet"
+            late = f", and came {self._delay:.1f} s late by its stamp" if self._delay > _TOLERANCE_S else ""
+            silent = f"is silent for {age - self._delay:.1f} s{late}"
+            unknown = silent if isfinite(age) else "nothing has come yet"
             self._since.clear()
         measured = None if unknown else self._measured
         return Seen(measured, unknown, *fault) if fault else Seen(measured, unknown)

@@ -12,6 +12,7 @@ from .config_base import Numbers, Topic
 from .coverage import Action
 from .motion import MotionParams
 from .real_motion import OdometryRules
+from .stamps import StampRule
 from .stopping import Stages
 
 _KINDS: dict[str, type[Message]] = {kind.TYPE: kind for kind in (Odometry, TwistStamped, Twist)}
@@ -40,8 +41,10 @@ class OdometryConfig(Numbers):
     """How long the wheels may stand when they are told to move."""
     max_age_s: Annotated[float, Field(ge=0.02, le=5)] = 0.3
     """Silence after which the real motion is not known."""
+    stamps: Literal["auto", "required", "order"] = "auto"
+    """What is asked of its stamps: used if the first has one; needed; only their order (simulators)."""
     on_unknown: Literal["stop", "slow", "free"] = "stop"
-    """When it is silent, or reports what is no number."""
+    """When it is silent, late, or reports what is no number."""
     on_fault: Literal["latch", "name"] = "latch"
     """An emergency stop until a reset, or a sentence in log and status only."""
     start_from: Literal["told", "measured"] = "told"
@@ -63,6 +66,7 @@ class OdometryConfig(Numbers):
             confirm_s=self.confirm_s,
             blocked_s=self.blocked_s,
             max_age_s=self.max_age_s,
+            stamps=StampRule(self.stamps),
         )
         return OdometryRules(
             self.topic, params, Action(self.on_unknown), self.on_fault == "latch", self.start_from == "measured"

@@ -118,6 +118,10 @@ class RealMotion:
         """Take a reading in; what is wrong with it (empty: nothing)."""
         return self._motion.measure(message, now)
 
+    def relearn(self) -> None:
+        """See `Motion.relearn`."""
+        self._motion.relearn()
+
     def look(self, now: float, troubles: dict[str, str]) -> str:
         """What is known now.
 

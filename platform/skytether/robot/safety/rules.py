@@ -179,6 +179,8 @@ class Gate:
         refused = self._contacts.refuses_reset(now) or self._sources.reset(now)
         if not refused:
             self._sensing.relearn()
+            if self._motion is not None:
+                self._motion.relearn()
             self._supervised = replace(
                 self._supervised, held={k: replace(v, received_at=-inf) for k, v in self._supervised.held.items()}
             )
