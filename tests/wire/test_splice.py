@@ -213,6 +213,29 @@ def test_hellos_that_no_service_heard_keep_no_robot_out(world, restarted):
     assert kinds(link, SERVICE) == [Connected]
 
 
+def test_hellos_of_four_lives_that_no_service_heard_cost_a_robot_half_a_second_once(world):
+    """Each of another life of the robot, all while it is answered: none of them has more than it."""
+    cut, kept = LinkConditions(cut=True), []
+    link = world.link(connect=False, record=True, up=cut, down=cut)
+    for _ in range(4):
+        link.run(1.0)
+        kept.append([p for _, p in link.sent[ROBOT] if p[0] == packet.HELLO][-1])
+        link.replace(ROBOT, world.session(ROBOT, now=link.now))
+    link.roads[0].set(LinkConditions(delay=0.05))
+    while not any(p[0] == packet.WELCOME for _, p in link.sent[SERVICE]):
+        link.run(0.01)
+    for one in kept:
+        link.inject(SERVICE, one, "elsewhere")
+    link.run(0.12)
+    assert kinds(link, SERVICE) == []
+    link.run(0.4)
+    assert kinds(link, SERVICE) == [Connected]
+    counts = refused(link, SERVICE)
+    for one in kept:
+        link.inject(SERVICE, one, "elsewhere")
+    assert refused(link, SERVICE) - counts == {"hello_replayed": 4}
+
+
 def test_an_old_welcome_answers_no_new_hello(world):
     """While the robot asks for new keys, all answers that it ever got come again, before the right one."""
     link = world.link(record=True, robot={"config": Config(rekey_after=0.5)}, up=DELAY, down=DELAY)

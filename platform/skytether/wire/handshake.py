@@ -311,7 +311,10 @@ class Doorkeeper:
             self._newest.popitem(last=False)
 
     def _make_room(self) -> None:
-        """The life that has most gives way: HELLOs of long ago that somebody repeats do not push out that of now."""
+        """The life that has most gives way: HELLOs of long ago that somebody repeats do not push out that of now.
+
+        Those of `MAX_PENDING` other lives do, each of them once: nothing tells which life is that of now.
+        """
         while len(self._pending) >= self.MAX_PENDING:
             lives = Counter(pending.life for pending in self._pending.values())
             most = max(lives.values())
