@@ -43,6 +43,12 @@ tries = {
     "programs": lambda: open("/usr/local/bin/skytether-intruder", "w"),
     "devices": lambda: os.mknod(f"{state}/data/walker/toy/i1/disk", 0o060600, os.makedev(254, 0)),
     "root": lambda: os.setuid(0) if os.getuid() else os.chown(state, 1, 1),
+    "empty": lambda: os.truncate(f"{state}/operator.token", 0),
+    "empty by opening": lambda: os.open(f"{state}/operator.token", os.O_ACCMODE | os.O_TRUNC),
+    "empty code": lambda: os.open(sys.argv[0], os.O_RDONLY | os.O_TRUNC),
+    "modes": lambda: os.chmod(state, 0o777),
+    "modes by another call": lambda: call("syscall", 452, -100, state.encode(), 0o777, 0),
+    "attributes": lambda: os.setxattr(f"{state}/operator.token", "user.a", b"1"),
     "mounts": lambda: call("unshare", 0x00020000),
     "users": lambda: call("unshare", 0x10000000),
     "own data": lambda: open(f"{grant['data_dir']}/recording", "w"),
@@ -53,8 +59,8 @@ tries = {
 def find(folder, name):
     if name not in os.listdir(folder):
         raise OSError("there is another folder over it")
-def call(name, argument):
-    if getattr(ctypes.CDLL(None), name)(argument):
+def call(name, *arguments):
+    if getattr(ctypes.CDLL(None), name)(*arguments):
         raise OSError(name)
 for name, attempt in tries.items():
     try:
@@ -98,16 +104,18 @@ def state(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own_user", [True, False])
+@pytest.mark.parametrize(("own_user", "newest"), [(True, 99), (False, 99), (False, 2)])
 def test_an_instance_reaches_its_own_folders_and_nothing_of_the_orchestrator(
-    state: Path, own_user: bool, monkeypatch: pytest.MonkeyPatch
+    state: Path, own_user: bool, newest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = this_machine()
     if not machine.landlock or not machine.seccomp:
         pytest.skip("the kernel has no Landlock or no seccomp")
     if own_user and not machine.user:
         pytest.skip(f"no users of their own: {machine.why or 'not root'}")
-    monkeypatch.setattr(process, "this_machine", lambda: replace(machine, user=own_user))
+    machine = replace(machine, user=own_user, landlock=min(machine.landlock, newest))
+    monkeypatch.setattr(process, "this_machine", lambda: machine)
+    allowed = ["signal", *ALLOWED] if not own_user and machine.landlock < 6 else ALLOWED
     runtime = ProcessRuntime("lab", state, ProcessOptions(python_path=(str(state.parent / "code"),)))
     assert runtime.isolation()[-2:] == (f"Landlock {machine.landlock}", "seccomp")
     runtime.start(launch(entrypoint="intruder", say=str(state), parent=os.getpid()))
@@ -115,8 +123,9 @@ def test_an_instance_reaches_its_own_folders_and_nothing_of_the_orchestrator(
     log = runtime.logs("i1", 100)
     runtime.remove("i1")
     assert seen.exit_status == 0, log
-    assert [line.removeprefix("did ") for line in log.splitlines() if line.startswith("did ")] == ALLOWED
-    assert log.count("refused ") == INTRUDER.count("lambda") - len(ALLOWED), log
+    assert [line.removeprefix("did ") for line in log.splitlines() if line.startswith("did ")] == allowed
+    assert log.count("refused ") == INTRUDER.count("lambda") - len(allowed), log
+    assert (state / "operator.token").read_text() == "secret"
 
 
 @pytest.mark.slow
@@ -200,6 +209,13 @@ def test_what_a_machine_lacks_is_said() -> None:
         "their own (not permitted)"
     )
     assert Machine(7, seccomp=True, user=False).lacks() == ""
+    assert Machine(2, seccomp=True, user=False).lacks() == ""
+    assert Machine(7, seccomp=False, user=True).lacks() == ""
+    assert (
+        "can change the modes of the orchestrator's files, and reach sockets"
+        in Machine(7, seccomp=False, user=False).lacks()
+    )
+    assert "can empty the orchestrator's files, change" in Machine(2, seccomp=False, user=False).lacks()
     assert Machine(2, seccomp=False, user=True).holds() == ("own user", "own mounts", "Landlock 2")
 
 

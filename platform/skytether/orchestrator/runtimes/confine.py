@@ -35,11 +35,13 @@ _FIRST = (1 << 13) - 1
 """All rights of its first version."""
 _READ = _EXECUTE | _READ_FILE | _READ_DIR
 _OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _IOCTL_DEV
+HOLDS_TRUNCATE = 3
+"""The first version of Landlock that does."""
 _BIND_TCP, _CONNECT_TCP = 1, 2
 _SCOPE_ABSTRACT_UNIX, _SCOPE_SIGNAL = 1, 2
 
 # Classic BPF, linux/filter.h and linux/seccomp.h.
-_LOAD, _EQUAL, _SET, _AT_LEAST, _RETURN = 0x20, 0x15, 0x45, 0x35, 0x06
+_LOAD, _EQUAL, _SET, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x45, 0x35, 0x54, 0x06
 _NR, _ARCH, _ARG0 = 0, 4, 16
 _ALLOW, _FAIL, _KILL = 0x7FFF_0000, 0x0005_0000, 0x8000_0000
 _EPERM, _ENOSYS, _EACCES = 1, 38, 13
@@ -100,6 +102,31 @@ _FORBIDDEN = {
     "personality": (135, 92),
 }
 """By name, the numbers on x86_64 and aarch64."""
+_OF_OWNERS = {
+    "chmod": (90, None),
+    "fchmod": (91, 52),
+    "fchmodat": (268, 53),
+    "fchmodat2": (452, 452),
+    "chown": (92, None),
+    "lchown": (94, None),
+    "fchown": (93, 55),
+    "fchownat": (260, 54),
+    "setxattr": (188, 5),
+    "lsetxattr": (189, 6),
+    "fsetxattr": (190, 7),
+    "setxattrat": (463, 463),
+    "removexattr": (197, 14),
+    "lremovexattr": (198, 15),
+    "fremovexattr": (199, 16),
+    "removexattrat": (466, 466),
+    "file_setattr": (469, 469),
+}
+"""What a file's owner may do to it wherever it is: no version of Landlock holds that."""
+_TRUNCATE_CALL, _OPENAT2 = (76, 45), (437, 437)
+_OPENS = (((2, None), 1), ((257, 56), 2))
+"""open and openat, and which of their arguments has the flags."""
+_ACCESS, _TO_NOTHING = 3, 0o1000
+"""O_ACCMODE, O_TRUNC."""
 
 
 def _checked(result: int, what: str) -> int:
@@ -175,9 +202,8 @@ def become(user: int, groups: list[int]) -> None:
     os.setresuid(user, user, user)
 
 
-def landlock(read: list[str], write: list[str], connect: list[int] | None) -> None:
+def landlock(version: int, read: list[str], write: list[str], connect: list[int] | None) -> None:
     """Let only these folders and files be reached, and only these TCP ports; None: all."""
-    version = landlock_version()
     files = _FIRST | (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
     files |= _IOCTL_DEV if version >= 5 else 0
     ports = _CONNECT_TCP if version >= 4 and connect is not None else 0
@@ -203,13 +229,22 @@ def landlock(read: list[str], write: list[str], connect: list[int] | None) -> No
     os.close(rules)
 
 
-def seccomp(families: list[str]) -> None:
-    """Take away calls of the kernel, and sockets of all other families; inherited by all that it starts."""
+def seccomp(families: list[str], *, owner: bool = False, empties: bool = False) -> None:
+    """Take away calls of the kernel, and sockets of all other families; inherited by all that it starts.
+
+    Args:
+        families: Of sockets.
+        owner: It is the user whose files it must not change.
+        empties: Landlock is too old to keep it from making files empty that it may not write.
+    """
     architecture, column = _ARCHITECTURES[platform.machine()]
     program = [(_LOAD, 0, 0, _ARCH), (_EQUAL, 1, 0, architecture), (_RETURN, 0, 0, _KILL), (_LOAD, 0, 0, _NR)]
     program += [(_AT_LEAST, 0, 1, _X32), (_RETURN, 0, 0, _FAIL | _ENOSYS)]
-    for number in sorted(numbers[column] for numbers in _FORBIDDEN.values()):
+    forbidden = [*_FORBIDDEN.values(), *(_OF_OWNERS.values() if owner else ()), *([_TRUNCATE_CALL] if empties else ())]
+    for number in sorted(number for numbers in forbidden if (number := numbers[column]) is not None):
         program += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, _FAIL | _EPERM)]
+    if empties:
+        program += _no_emptying_open(column)
     # The C library asks clone3 first, whose flags are out of a filter's sight, and then clone.
     program += [(_EQUAL, 0, 1, _CLONE3[column]), (_RETURN, 0, 0, _FAIL | _ENOSYS)]
     program += [(_EQUAL, 0, 4, _CLONE[column]), (_LOAD, 0, 0, _ARG0)]
@@ -222,6 +257,20 @@ def seccomp(families: list[str]) -> None:
     buffer = ctypes.create_string_buffer(packed, len(packed))
     head = struct.pack("@HP", len(program), ctypes.addressof(buffer))
     _checked(_LIBC.prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.c_char_p(head), 0, 0), "seccomp")
+
+
+def _no_emptying_open(column: int) -> list[tuple[int, int, int, int]]:
+    """Refuses O_TRUNC without a right to write: the kernel makes the file empty all the same.
+
+    The fourth way to open, that is neither reading nor writing (3), even asks Landlock for no right at all.
+    """
+    program = [(_EQUAL, 0, 1, _OPENAT2[column]), (_RETURN, 0, 0, _FAIL | _ENOSYS)]  # its flags are out of sight
+    for numbers, at in _OPENS:
+        if (number := numbers[column]) is not None:
+            program += [(_EQUAL, 0, 6, number), (_LOAD, 0, 0, _ARG0 + 8 * at), (_AND, 0, 0, _ACCESS | _TO_NOTHING)]
+            program += [(_EQUAL, 1, 0, _TO_NOTHING), (_EQUAL, 0, 1, _ACCESS | _TO_NOTHING)]
+            program += [(_RETURN, 0, 0, _FAIL | _EACCES), (_RETURN, 0, 0, _ALLOW)]
+    return program
 
 
 def probe() -> dict[str, Any]:
@@ -263,9 +312,9 @@ def main() -> None:
         become(user, asked["groups"])
     _checked(_LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "no new privileges")
     if asked["landlock"]:
-        landlock(read, write, asked["connect"])
+        landlock(asked["landlock"], read, write, asked["connect"])
     if asked["seccomp"]:
-        seccomp(asked["families"])
+        seccomp(asked["families"], owner=user is None, empties=user is None and asked["landlock"] < HOLDS_TRUNCATE)
     os.execv(asked["command"][0], asked["command"])  # noqa: S606 (no shell is wanted)
 
 

@@ -57,10 +57,17 @@ class Machine:
         return tuple(name for name, there in found if there)
 
     def lacks(self) -> str:
-        """What a file of the orchestrator is not protected from, and why; empty: nothing."""
+        """What the orchestrator's files and other programs' sockets are not protected from, and why; empty: nothing."""
         if not self.landlock and not self.user:
             return "instances can read all of the orchestrator's secrets: the kernel has no Landlock" + (
                 f", and there are no users of their own ({self.why})" if self.why else ""
+            )
+        if not self.seccomp and not self.user:
+            empty = "" if self.landlock >= confine.HOLDS_TRUNCATE else "empty the orchestrator's files, "
+            return (
+                f"instances can {empty}change the modes of the orchestrator's files, and reach sockets of other "
+                "programs such as a Docker engine's: the kernel has no seccomp, or the processor is another one than "
+                "x86_64 and aarch64"
             )
         return ""
 
@@ -175,7 +182,7 @@ def confined(
         "cover": covers([*read, *write]) if user is not None else [],
         "user": user,
         "groups": list(groups),
-        "landlock": bool(machine.landlock),
+        "landlock": machine.landlock,
         "connect": None,
         "seccomp": machine.seccomp,
         # Without mounts of its own, every socket in the file system that the orchestrator's user may use is in its
