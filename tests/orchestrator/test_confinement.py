@@ -144,6 +144,25 @@ def test_two_instances_are_two_users_and_one_keeps_its_own(tmp_path: Path) -> No
     runtime.remove("i1")
 
 
+@pytest.mark.slow
+def test_an_orchestrator_with_a_close_umask_starts_them_too(tmp_path: Path) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    runtime = ProcessRuntime("lab", tmp_path, ProcessOptions())
+    before = os.umask(0o077)
+    try:
+        runtime.start(launch())
+    finally:
+        os.umask(before)
+    deadline = time.monotonic() + 60
+    while (seen := runtime.observe()["i1"]).phase is Phase.STARTING:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert seen.phase is Phase.RUNNING, runtime.logs("i1", 9)
+    assert (tmp_path / "instances/i1/own/ready.json").stat().st_mode & 0o777 == 0o600  # what it writes is its own, too
+    runtime.remove("i1")
+
+
 def test_a_folder_that_holds_the_state_is_not_for_services(tmp_path: Path) -> None:
     with pytest.raises(RuntimeFailure, match=rf"services may reach {tmp_path}, which holds {tmp_path}/sites/lab"):
         ProcessRuntime("lab", tmp_path / "sites/lab", ProcessOptions(readable=(tmp_path,)))

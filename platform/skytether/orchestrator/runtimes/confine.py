@@ -304,7 +304,9 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a dump of its memory would hold the session's key
     if user is not None:
         own_mounts()
+        ours = os.umask(0o022)  # under the covers, the service passes through folders that are made now, and root's
         cover(asked["cover"], read, write)
+        os.umask(ours)
         os.chdir(asked["folder"])
         write += [folder for folder in asked["cover"] if folder in _SCRATCH]
     drop_capabilities()
