@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 from typing import Any
 
 import pytest
@@ -112,6 +113,14 @@ def test_a_name_is_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found == {Opening("api.example", 443): ("192.0.2.1", "192.0.2.2")}
     with pytest.raises(RuntimeFailure, match=r"needs\.egress: nowhere\.example has no address"):
         resolve([Opening.of("nowhere.example:443")])
+
+
+def test_a_name_server_that_is_silent_holds_a_start_up_for_so_long_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    awake = threading.Event()
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: awake.wait(20) and [])
+    with pytest.raises(RuntimeFailure, match=r"needs\.egress: the name server does not answer in time"):
+        resolve([Opening.of("slow.example:443"), Opening.of("192.0.2.7:1")], within_s=0.02)
+    awake.set()
 
 
 def test_a_site_opens_what_its_operator_says() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from docker.errors import APIError, NotFound
@@ -29,8 +29,15 @@ _END_S = 10.0
 """Seconds that a killed container gets to be gone."""
 _TAKEN = ("port is already allocated", "address already in use")
 """What an engine says when a port is."""
-_ONE_AT_A_TIME = threading.Lock()
-"""From the choice of a port or a GPU until its container is seen: two starts must not choose the same."""
+_CHOOSING = threading.Lock()
+"""Never held while anybody is waited for: it is of all sites."""
+_CHOSEN: set[tuple[str, str, int]] = set()
+"""Engine, kind and number of the ports and GPUs of starts under way, which their containers are not seen to have yet:
+two starts must not choose the same."""
+
+
+Openings = Mapping[Opening, Iterable[str]]
+"""What it may connect to, with the addresses of each."""
 
 
 class Prepare(Protocol):
@@ -129,14 +136,13 @@ class Job:
         self.detail = ""
         self._go_on()
         self._prepare()
-        chooses = self._options.ports is not None or self.launch.spec.needs.gpu > 0
-        with _ONE_AT_A_TIME if chooses else nullcontext():
-            self._go_on()
-            try:
-                made = self._create(image)
-            except _NetworkGoneError:
-                self._prepare(anew=True)
-                made = self._create(image)
+        openings = resolve(self.launch.spec.needs.openings)
+        self._go_on()
+        try:
+            made = self._create(image, openings)
+        except _NetworkGoneError:
+            self._prepare(anew=True)
+            made = self._create(image, openings)
         if self._cancelled.is_set():
             with suppress(RuntimeFailure):
                 kill(self._engine, made.id, "KILL")
@@ -158,33 +164,55 @@ class Job:
                 raise RuntimeFailure("what is left of the run before cannot be ended: see the engine's log")
             time.sleep(0.02)
 
-    def _create(self, image: str) -> Seen:
-        instance = self.launch.instance
-        before = self._follower.of(instance)
+    def _create(self, image: str, openings: Openings) -> Seen:
+        refused: set[int] = set()
+        while True:
+            with self._chosen(refused) as (port, gpus):
+                try:
+                    return self._begin(image, port, gpus, openings)
+                except _PortTakenError as error:
+                    if port is None:
+                        raise RuntimeFailure(str(error)) from error
+                    log.warning("UDP port %d of the engine's machine is taken by another program", port)
+                    refused.add(port)
+
+    @contextmanager
+    def _chosen(self, refused: Iterable[int]) -> Iterator[tuple[int | None, tuple[int, ...]]]:
+        """A port, none of ``refused``, and GPUs that no other start chooses meanwhile; None: the engine's choice."""
+        engine = self._options.engine
+        with _CHOOSING:
+            port, gpus = self._choose(engine, refused)
+            mine = {(engine, "gpu", number) for number in gpus}
+            if port is not None:
+                mine.add((engine, "port", port))
+            _CHOSEN.update(mine)
+        try:
+            yield port, gpus
+        finally:
+            with _CHOOSING:
+                _CHOSEN.difference_update(mine)
+
+    def _choose(self, engine: str, refused: Iterable[int]) -> tuple[int | None, tuple[int, ...]]:
         others = [s for s in self._follower.seen(self._options.timeout_s) if s.runs]
-        gpus = free_gpus(self.launch.spec.needs.gpu, self._options.gpu, {gpu for s in others for gpu in s.gpus})
+        taken_gpus = {gpu for s in others for gpu in s.gpus} | {
+            n for e, kind, n in _CHOSEN if (e, kind) == (engine, "gpu")
+        }
+        gpus = free_gpus(self.launch.spec.needs.gpu, self._options.gpu, taken_gpus)
         if gpus is None:
             raise RuntimeFailure("every GPU of the site is taken")
-        taken = {s.host_port for s in others if s.host_port is not None}
-        preferred = before[-1].host_port if before else None
-        while True:
-            try:
-                port = free_port(self._options.ports, preferred, taken)
-            except StopIteration:
-                first, last = self._options.ports or (0, 0)
-                raise RuntimeFailure(f"every UDP port from {first} to {last} is taken (option 'ports')") from None
-            try:
-                return self._begin(image, port, gpus)
-            except _PortTakenError as error:
-                if port is None:
-                    raise RuntimeFailure(str(error)) from error
-                log.warning("UDP port %d of the engine's machine is taken by another program", port)
-                taken.add(port)
+        taken = {s.host_port for s in others if s.host_port is not None} | set(refused)
+        taken |= {n for e, kind, n in _CHOSEN if (e, kind) == (engine, "port")}
+        before = self._follower.of(self.launch.instance)
+        try:
+            return free_port(self._options.ports, before[-1].host_port if before else None, taken), gpus
+        except StopIteration:
+            first, last = self._options.ports or (0, 0)
+            raise RuntimeFailure(f"every UDP port from {first} to {last} is taken (option 'ports')") from None
 
-    def _begin(self, image: str, port: int | None, gpus: tuple[int, ...]) -> Seen:
+    def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], openings: Openings) -> Seen:
         cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
-        network, openings = self._options.network, resolve(self.launch.spec.needs.openings)
-        hosts = {opening.host: found for opening, found in openings.items() if "/" not in found[0]}
+        network = self._options.network
+        hosts = {to.host: found for to, found in openings.items() if not any("/" in address for address in found)}
         body = container(self.launch, self._options, self._owner, image, port, gpus, cores, hosts)
         name = name_of(self._owner, self.launch.instance, self.attempt)
         guard = guard_image(self._engine, self._options) if is_ours(self._engine, network) else None
@@ -211,7 +239,7 @@ class Job:
             raise RuntimeFailure("its container was removed by somebody else")
         return seen
 
-    def _connect(self, guard: str, made: str, openings: Mapping[Opening, Iterable[str]]) -> None:
+    def _connect(self, guard: str, made: str, openings: Openings) -> None:
         """Let it have the network, closed off; one that has ended meanwhile needs none."""
         try:
             close_off(self._engine, self._options, guard, made, openings)

@@ -11,6 +11,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import socket
+import threading
+import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
@@ -35,6 +37,8 @@ _GUARD_TIMEOUT_S = 30
 _LEFT_S = 2 * _GUARD_TIMEOUT_S
 """A container of a guard that is older than another one by so much was left behind: its orchestrator was killed."""
 _TABLE = "inet skytether"
+_LOOK_UP_S = 15.0
+"""For all names of one start; what is asked for again is in the name server's memory then."""
 
 
 def bridge_of(network: str) -> str:
@@ -62,15 +66,20 @@ def rules(openings: Mapping[Opening, Iterable[str]]) -> str:
     return f"add table {_TABLE}; {chain}; {added}"
 
 
-def resolve(openings: Iterable[Opening]) -> dict[Opening, tuple[str, ...]]:
+def resolve(openings: Iterable[Opening], within_s: float = _LOOK_UP_S) -> dict[Opening, tuple[str, ...]]:
     """The addresses of what is opened, as they are now: an instance keeps these, and has nobody to ask for others.
 
     Those of a network, or of an address, are written with their prefix; those of a name are not.
 
+    Args:
+        openings: What is opened.
+        within_s: How long the names in it may take, all together [s].
+
     Raises:
-        RuntimeFailure: A name has none, or it is neither name nor address.
+        RuntimeFailure: A name has none, or nobody said so in time, or it is neither name nor address.
     """
     found: dict[Opening, tuple[str, ...]] = {}
+    names: list[Opening] = []
     for opening in openings:
         try:
             network = network_of(opening)
@@ -79,11 +88,33 @@ def resolve(openings: Iterable[Opening]) -> dict[Opening, tuple[str, ...]]:
         if network is not None:
             found[opening] = (str(network),)
             continue
-        try:
-            rows = socket.getaddrinfo(opening.host, opening.port, type=socket.SOCK_STREAM)
-        except OSError as error:
-            raise RuntimeFailure(f"needs.egress: {opening.host} has no address: {error}") from error
-        found[opening] = tuple(dict.fromkeys(str(row[4][0]) for row in rows))
+        names.append(opening)
+    return found | _look_up(names, within_s) if names else found
+
+
+def _look_up(openings: Iterable[Opening], within_s: float) -> dict[Opening, tuple[str, ...]]:
+    """The same of names, in a thread: a name server that is silent takes half a minute for each."""
+    deadline = time.monotonic() + within_s
+    found: dict[Opening, tuple[str, ...]] = {}
+    trouble: list[str] = []
+
+    def ask() -> None:
+        for opening in openings:
+            if time.monotonic() > deadline:
+                return
+            try:
+                rows = socket.getaddrinfo(opening.host, opening.port, type=socket.SOCK_STREAM)
+            except (OSError, UnicodeError) as error:
+                trouble.append(f"{opening.host} has no address: {error}")
+                return
+            found[opening] = tuple(dict.fromkeys(str(row[4][0]) for row in rows))
+
+    thread = threading.Thread(target=ask, name="docker-names", daemon=True)
+    thread.start()
+    thread.join(within_s)
+    late = thread.is_alive() or time.monotonic() > deadline
+    if trouble or late:
+        raise RuntimeFailure(f"needs.egress: {trouble[0] if trouble else 'the name server does not answer in time'}")
     return found
 
 
