@@ -115,6 +115,23 @@ def test_a_name_is_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
         resolve([Opening.of("nowhere.example:443")])
 
 
+def test_two_ports_of_a_name_have_the_same_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns = iter(range(1, 9))  # a server that tells each who asks another address
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [(0, 0, 0, "", (f"192.0.2.{next(turns)}", 0))])
+    found = resolve(map(Opening.of, ("api.example:443", "api.example:8883", "b.example:1", "api.example:53/udp")))
+    assert [found[Opening.of(f"api.example:{port}")] for port in ("443", "8883", "53/udp")] == [("192.0.2.1",)] * 3
+    assert found[Opening.of("b.example:1")] == ("192.0.2.2",)
+
+
+def test_an_address_of_this_machines_own_links_is_none_within(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = ["fe80::1%eth0", "2001:db8::7"]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [(0, 0, 0, "", (a, 0, 0, 2)) for a in told])
+    assert resolve([Opening.of("near.example:1")]) == {Opening.of("near.example:1"): ("2001:db8::7",)}
+    told.pop()
+    with pytest.raises(RuntimeFailure, match="no address but of this machine's own links"):
+        resolve([Opening.of("near.example:1")])
+
+
 def test_a_name_server_that_is_silent_holds_a_start_up_for_so_long_only(monkeypatch: pytest.MonkeyPatch) -> None:
     awake = threading.Event()
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: awake.wait(20) and [])

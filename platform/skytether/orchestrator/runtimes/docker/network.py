@@ -89,25 +89,34 @@ def resolve(openings: Iterable[Opening], within_s: float = _LOOK_UP_S) -> dict[O
             found[opening] = (str(network),)
             continue
         names.append(opening)
-    return found | _look_up(names, within_s) if names else found
+    known = _look_up(dict.fromkeys(opening.host for opening in names), within_s) if names else {}
+    return found | {opening: known[opening.host] for opening in names}
 
 
-def _look_up(openings: Iterable[Opening], within_s: float) -> dict[Opening, tuple[str, ...]]:
-    """The same of names, in a thread: a name server that is silent takes half a minute for each."""
+def _look_up(names: Iterable[str], within_s: float) -> dict[str, tuple[str, ...]]:
+    """The addresses of names, in a thread: a name server that is silent takes half a minute for each.
+
+    Each is asked for once: of many addresses a server may give others each time, and there is one file of hosts within.
+    """
     deadline = time.monotonic() + within_s
-    found: dict[Opening, tuple[str, ...]] = {}
+    found: dict[str, tuple[str, ...]] = {}
     trouble: list[str] = []
 
     def ask() -> None:
-        for opening in openings:
+        for name in names:
             if time.monotonic() > deadline:
                 return
             try:
-                rows = socket.getaddrinfo(opening.host, opening.port, type=socket.SOCK_STREAM)
+                rows = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
             except (OSError, UnicodeError) as error:
-                trouble.append(f"{opening.host} has no address: {error}")
+                trouble.append(f"{name} has no address: {error}")
                 return
-            found[opening] = tuple(dict.fromkeys(str(row[4][0]) for row in rows))
+            # fe80::1%eth0 is of an interface of this machine, which means nothing within.
+            addresses = dict.fromkeys(str(row[4][0]) for row in rows if "%" not in str(row[4][0]))
+            if not addresses:
+                trouble.append(f"{name} has no address but of this machine's own links")
+                return
+            found[name] = tuple(addresses)
 
     thread = threading.Thread(target=ask, name="docker-names", daemon=True)
     thread.start()
