@@ -70,7 +70,8 @@ def test_only_the_masters_machine_ends_a_node_or_changes_its_publishers() -> Non
         server.close()
 
 
-def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out() -> None:
+def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slave, "_MOST_OF_ONE", 16)
     server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
     threads = threading.active_count()
     held = []

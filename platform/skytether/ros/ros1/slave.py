@@ -20,9 +20,9 @@ FROM_MASTER = ("shutdown", "publisherUpdate")
 """What ends the node, or takes its topics to other publishers: only the machine of the master may, and this one."""
 _RESOLVED_S = 10.0
 """So long a name's addresses are good: others may make us look it up."""
-_MOST, _MOST_OF_ONE = 64, 16
+_MOST, _MOST_OF_ONE = 256, 128
 """Connections at a time, each of which has a thread: in all, and from one address, so that a stranger's do not keep the
-master out. A graph's other nodes ask a few times in their life, and a person's tools one after the other."""
+master out. All nodes of a machine may ask at once, when a topic that they want comes; each is answered and closed."""
 _IDLE_S = 30.0
 """A connection that says nothing for so long is closed."""
 
