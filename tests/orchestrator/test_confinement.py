@@ -17,7 +17,7 @@ import pytest
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes import confinement, process
+from skytether.orchestrator.runtimes import confinement, process, users
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.confinement import Machine, covers, free_user, opened, readable, this_machine
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
@@ -136,7 +136,7 @@ def test_two_instances_are_two_users_and_one_keeps_its_own(tmp_path: Path) -> No
     runtime.start(launch())
     until(runtime, Phase.RUNNING)
     owner = (tmp_path / "data/walker/toy/i1").stat().st_uid
-    assert confinement._USERS[0] <= owner <= confinement._USERS[1]
+    assert confinement.USERS[0] <= owner <= confinement.USERS[1]
     assert (tmp_path / "instances/i1").stat().st_uid == 0  # what it cannot write, it cannot make a trap of
     runtime.start(launch(attempt=2))
     until(runtime, Phase.RUNNING)
@@ -161,6 +161,45 @@ def test_an_orchestrator_with_a_close_umask_starts_them_too(tmp_path: Path) -> N
     assert seen.phase is Phase.RUNNING, runtime.logs("i1", 9)
     assert (tmp_path / "instances/i1/own/ready.json").stat().st_mode & 0o777 == 0o600  # what it writes is its own, too
     runtime.remove("i1")
+
+
+RUNNER = """
+import json, os, time
+grant = json.load(open(os.environ["SKYTETHER_GRANT"]))
+beat = os.open(grant["data_dir"] + "/beat", os.O_CREAT | os.O_WRONLY)
+end = time.monotonic() + 30  # whatever becomes of the test
+while time.monotonic() < end:
+    if os.fork():
+        os._exit(0)
+    os.setsid()
+    os.pwrite(beat, b"%20d" % time.monotonic_ns(), 0)
+"""
+
+
+@pytest.mark.slow
+def test_who_leaves_its_session_and_forks_all_the_time_ends(tmp_path: Path) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code/runner.py").write_text(RUNNER)
+    runtime = ProcessRuntime("lab", tmp_path / "state", ProcessOptions(python_path=(str(tmp_path / "code"),)))
+    runtime.start(launch(entrypoint="runner"))
+    beat = tmp_path / "state/data/walker/toy/i1/beat"
+    deadline = time.monotonic() + 60
+    while not (beat.exists() and beat.read_bytes()):
+        assert time.monotonic() < deadline, runtime.logs("i1", 9)
+        time.sleep(0.01)
+    runtime.remove("i1")
+    last = beat.read_bytes()
+    time.sleep(0.2)
+    assert beat.read_bytes() == last
+
+
+def test_nobody_else_is_ended() -> None:
+    for user in (-1, 0, 1000, users.USERS[1] + 1):
+        with pytest.raises(ValueError, match="no instance's own user"):
+            users.end_all_of(user)
+        assert users.noted_user(user) is None
 
 
 def test_a_folder_that_holds_the_state_is_not_for_services(tmp_path: Path) -> None:
@@ -218,7 +257,7 @@ def test_the_outermost_folder_that_others_may_not_pass_is_covered(monkeypatch: p
 
 
 def test_a_user_that_has_a_name_or_an_instance_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(confinement, "_USERS", (61_184, 61_186))
+    monkeypatch.setattr(confinement, "USERS", (61_184, 61_186))
     assert free_user({61_184, 61_186}) == 61_185
 
 

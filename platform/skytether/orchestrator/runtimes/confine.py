@@ -3,7 +3,8 @@
 Run as a file, with the standard library alone, so that it costs a start some 20 ms. What is given up, as far as the
 orchestrator asks for it (``confinement.py`` says what and why): another user, mounts of its own in which folders are
 covered, Landlock, seccomp. It only ever takes away, and what was asked for and cannot be done ends it: the service is
-not run with more. With ``"probe": true`` it says, as JSON, what this machine has, and runs nothing.
+not run with more. With ``"probe": true`` it says, as JSON, what this machine has, and runs nothing; with ``"end"`` it
+ends all processes of a user.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import os
 import platform
 import resource
+import signal
 import struct
 import sys
 from typing import Any
@@ -22,6 +24,8 @@ _CLONE_NEWNS, _CLONE_NEWIPC = 0x0002_0000, 0x0800_0000
 _MS_RDONLY, _MS_NOSUID, _MS_NODEV, _MS_REMOUNT, _MS_BIND, _MS_REC, _MS_PRIVATE = 1, 2, 4, 32, 4096, 16384, 1 << 18
 _PR_CAPBSET_DROP, _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 24, 38, 22, 2
 _CAPABILITIES = 64
+_ENDER = 65_520
+"""A user that no instance is, nor anybody else."""
 _SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")  # noqa: S108 (covered, so these are its own)
 """Covered folders that the service may write into."""
 _SCRATCH_SIZE = "64m"
@@ -202,6 +206,17 @@ def become(user: int, groups: list[int]) -> None:
     os.setresuid(user, user, user)
 
 
+def end_all(user: int) -> None:
+    """Kill all processes of a user. None of them can kill this one first: it asks as that user, and is another."""
+    os.setgroups([])
+    os.setresgid(_ENDER, _ENDER, _ENDER)
+    os.setresuid(_ENDER, user, _ENDER)
+    try:
+        os.kill(-1, signal.SIGKILL)  # never this one
+    except ProcessLookupError:
+        return  # there is none
+
+
 def landlock(version: int, read: list[str], write: list[str], connect: list[int] | None) -> None:
     """Let only these folders and files be reached, and only these TCP ports; None: all."""
     files = _FIRST | (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
@@ -295,10 +310,13 @@ def probe() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Do it; returns only after a probe."""
+    """Do it; returns only where no service is to be run."""
     asked = json.loads(sys.argv[1])
     if asked.get("probe"):
         sys.stdout.write(json.dumps(probe()))
+        return
+    if "end" in asked:
+        end_all(asked["end"])
         return
     read, write, user = asked["read"], asked["write"], asked["user"]
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a dump of its memory would hold the session's key

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from . import confine
 from .base import RuntimeFailure
+from .users import USERS
 
 _READ = (
     *("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/opt/ros", "/proc", "/sys"),
@@ -33,8 +34,6 @@ _READ = (
 _WRITE = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 _COVER = ("/tmp", "/var/tmp", "/dev/shm", "/run")  # noqa: S108
 """Where other programs leave files and sockets for everybody; the engine's socket is in /run."""
-_USERS = (61_184, 65_519)
-"""Numbers of users without a name, as systemd takes them for its dynamic users (systemd.exec(5))."""
 _PROBE_S = 30
 
 
@@ -145,7 +144,7 @@ def covers(paths: Sequence[str]) -> list[str]:
 
 def free_user(taken: Collection[int]) -> int:
     """The number of a user that nobody is."""
-    first, last = _USERS
+    first, last = USERS
     while True:
         number = first + secrets.randbelow(last - first + 1)
         if number in taken:

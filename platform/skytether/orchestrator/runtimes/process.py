@@ -42,7 +42,8 @@ from .confinement import confined, free_user, launch_file, opened, readable, thi
 from .disk import MOST_FILES, size_of
 from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
-from .procfs import BOOT_ID, ProcessId, ProcessStat, find_by_environment, processes_of, session_members, stat_of
+from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, find_by_environment, session_members, stat_of
+from .users import end_all_of, noted_user
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,8 @@ _OWN_MB = 64
 """MiB that a run may have in its own folder, which is also its home and has its temporary files."""
 _NOTE_BYTES = 64 << 10
 """Of a ready file or note that are read; they have some hundred."""
+_PASSES = 20
+"""Looks at a session that is being ended: whoever forks meanwhile is in the next one."""
 _WEIGH = 2.0
 """Seconds between two looks at how much robots' services have written."""
 _MEASURE = 2.0
@@ -194,7 +197,7 @@ class ProcessRuntime(Runtime):
                 process = find_by_environment(GRANT_VARIABLE, str(folder / _OWN / "grant.json"))
                 if process is not None:
                     _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-        ready, user = str(noted.get("ready", folder / "ready.json")), noted.get("user")
+        ready, user = str(noted.get("ready", folder / "ready.json")), noted_user(noted.get("user"))
         return _Run(int(noted.get("attempt", 0)), process, str(folder), str(noted.get("data", "")), ready, user)
 
     @override
@@ -254,8 +257,7 @@ class ProcessRuntime(Runtime):
         """An instance's own, the same in all its runs, so that it can go on with its data; None: there are none."""
         if not (self._machine and self._machine.user):
             return None
-        known = noted.get("user")
-        return known if type(known) is int else free_user({run.user for run in self._runs.values() if run.user})
+        return noted_user(noted.get("user")) or free_user({run.user for run in self._runs.values() if run.user})
 
     def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None, user: int | None) -> str:
         """Make the run's own folder, with the grant in it; returns the path of the ready file."""
@@ -306,7 +308,7 @@ class ProcessRuntime(Runtime):
         now = time.monotonic()
         if measure := now - self._measured_at >= _MEASURE:
             self._measured_at = now
-        all_run = _all_children_run()
+        all_run = all_children_run()
         runs = self._runs.items()
         return {i: seen for i, run in runs if (seen := self._seen(run, measure=measure, all_run=all_run))}
 
@@ -418,21 +420,21 @@ _left_running: list[subprocess.Popen[bytes]] = []
 """Children that outlive the runtime that started them: the standard library warns of one that is dropped."""
 
 
-def _all_children_run() -> bool:
-    """Whether none of this program's children has ended since it was last waited for: one system call for all."""
-    try:
-        return os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
-    except ChildProcessError:
-        return False  # it has none; those that an earlier program started are each looked at
-
-
 def _kill_all(run: _Run) -> None:
-    """End a run and everything in its session, or of its own user: it may have left the session."""
+    """End a run and everything in its session, and of its own user: it may have left the session."""
     if run.process is None:
         return
-    for pid in {*session_members(run.process), *processes_of(run.user)}:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    ended: set[int] = set()
+    for _ in range(_PASSES):
+        found = {*session_members(run.process)} - ended
+        if not found:
+            break
+        ended |= found
+        for pid in found:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    if run.user is not None:  # last: a run that was just being started was root until then
+        end_all_of(run.user)
 
 
 def _start_time(pid: int) -> int:

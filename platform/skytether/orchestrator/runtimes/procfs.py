@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,14 +83,12 @@ def session_members(leader: ProcessId) -> list[int]:
     return [stat.pid for stat in members if stat and not stat.zombie]
 
 
-def processes_of(user: int | None) -> list[int]:
-    """Processes of a user that is one instance's own; None: nobody's."""
-    found = []
-    for pid in _pids() if user else []:
-        with contextlib.suppress(OSError):
-            if os.stat(_PROC / str(pid)).st_uid == user:
-                found.append(pid)
-    return found
+def all_children_run() -> bool:
+    """Whether none of this program's children has ended since it was last waited for: one system call for all."""
+    try:
+        return os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    except ChildProcessError:
+        return False  # it has none; those that an earlier program started are each looked at
 
 
 def find_by_environment(variable: str, value: str) -> ProcessId | None:
