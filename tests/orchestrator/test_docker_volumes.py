@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import nullcontext
 from typing import Any
+
+import pytest
 
 from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker.objects import Seen, observation, parse
@@ -24,6 +27,8 @@ DISK = {
 class FakeEngine:
     """Says what is on its disk, or nothing."""
 
+    base_url, api_version, timeout = "http+docker://localhost", "1.41", 120.0
+
     def __init__(self) -> None:
         self.disk: dict[str, Any] = dict(DISK)
         self.asks = 0
@@ -36,18 +41,28 @@ class FakeEngine:
     def api(self, _timeout_s: float) -> FakeEngine:
         return self
 
-    def df(self) -> dict[str, Any]:
+    def get(self, url: str, params: dict[str, str], timeout: float) -> FakeEngine:
+        assert url == "http+docker://localhost/v1.41/system/df"
+        assert params == {"type": "volume", "verbose": "1"}, "neither images nor layers"
+        assert timeout == self.timeout
         self.asks += 1
         if self.hangs is not None:
             self.hangs.wait(30)
         if self.refuses:
             raise RuntimeFailure("no")
+        return self
+
+    def raise_for_status(self) -> None:
+        """It was answered."""
+
+    def json(self) -> dict[str, Any]:
         return self.disk
 
 
 def test_what_the_engine_says_of_its_volumes() -> None:
     assert sizes(DISK) == {"full": (2 << 20) + 1, "good": 2 << 20}
-    assert sizes({}) == sizes({"Volumes": None}) == {}
+    assert sizes({}) == sizes({"Volumes": None}) == sizes({"VolumeUsage": {"TotalCount": 1}}) == {}
+    assert sizes({"VolumeUsage": {"Items": DISK["Volumes"]}}) == sizes(DISK), "from version 1.52 on"
 
 
 def test_a_volume_that_holds_too_much_is_named_until_there_is_room() -> None:
@@ -82,6 +97,29 @@ def test_an_engine_that_takes_its_time_is_asked_once_and_holds_nobody_up() -> No
             thread.join(30)
     assert engine.asks == 2
     assert scales.exceeds("full"), "what was known stays known"
+
+
+def test_an_engine_that_never_weighs_is_told_once_and_when_it_does_again(caplog: pytest.LogCaptureFixture) -> None:
+    engine, now = FakeEngine(), [0.0]
+    engine.refuses = True
+    scales = Scales(engine, 2, lambda: now[0])  # type: ignore[arg-type]
+
+    def weigh(times: int) -> None:
+        for _ in range(times):
+            now[0] += 100.0
+            scales.begin()
+            for thread in threading.enumerate():
+                if thread.name == "docker-volumes":
+                    thread.join(30)
+
+    with caplog.at_level(logging.INFO):
+        weigh(2)
+        assert caplog.text == "", "somebody else may have asked just then"
+        weigh(5)
+        assert caplog.text.count("volumes are not weighed, so that data_mb (2) bounds nothing: no") == 1
+        engine.refuses = False
+        weigh(2)
+        assert caplog.text.count("volumes are weighed again") == 1
 
 
 def test_what_wrote_too_much_is_seen_so() -> None:

@@ -8,6 +8,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import requests
+from docker.errors import create_api_error_from_http_exception
+
 from ..base import RuntimeFailure
 from .engine import Engine
 
@@ -16,12 +19,15 @@ log = logging.getLogger(__name__)
 _EVERY_S = 30.0
 _PATIENCE_S = 120.0
 """The engine looks at every file of its volumes."""
+_TOLERATED = 3
+"""Weighings in a row that may come to nothing before it is told: one that somebody else has asked for is refused."""
 
 
 def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
     """Bytes by volume, out of what the engine says of its disk; those of which it does not know are left out."""
     found = {}
-    for volume in answer.get("Volumes") or ():
+    # The second is where engines from version 1.52 of their interface on say it.
+    for volume in answer.get("Volumes") or (answer.get("VolumeUsage") or {}).get("Items") or ():
         size = (volume.get("UsageData") or {}).get("Size", -1)
         if size >= 0:
             found[str(volume["Name"])] = int(size)
@@ -38,6 +44,8 @@ class Scales:
         self._weighed_at = -_EVERY_S
         self._thread: threading.Thread | None = None
         self._full: frozenset[str] = frozenset()
+        self._failures = 0
+        """In a row."""
 
     def exceeds(self, volume: str) -> str:
         """Why nobody may write to it any more; empty: they may."""
@@ -59,7 +67,13 @@ class Scales:
         try:
             self.weigh()
         except RuntimeFailure as error:
-            log.debug("volumes are not weighed: %s", error)
+            self._failures += 1
+            level = logging.WARNING if self._failures == _TOLERATED else logging.DEBUG
+            log.log(level, "volumes are not weighed, so that data_mb (%d) bounds nothing: %s", self._data_mb, error)
+            return
+        if self._failures >= _TOLERATED:
+            log.info("volumes are weighed again")
+        self._failures = 0
 
     def weigh(self) -> None:
         """Ask the engine, and wait for it.
@@ -68,6 +82,14 @@ class Scales:
             RuntimeFailure: It does not say.
         """
         with self._engine.asked():
-            answer = self._engine.api(_PATIENCE_S).df()
+            api = self._engine.api(_PATIENCE_S)
+            # The SDK only knows how to have everything weighed, each layer of each image too.
+            asked = {"type": "volume", "verbose": "1"}
+            said = api.get(f"{api.base_url}/v{api.api_version}/system/df", params=asked, timeout=api.timeout)
+            try:
+                said.raise_for_status()
+            except requests.HTTPError as error:
+                create_api_error_from_http_exception(error)
+            answer = said.json()
         most = self._data_mb << 20
         self._full = frozenset(name for name, size in sizes(answer).items() if size > most)
