@@ -278,7 +278,7 @@ def test_calls_of_the_kernel_that_no_service_needs_are_refused(docker_site: Dock
     until_phase(runtime, Phase.RUNNING)
     (container,) = docker_site.containers()
     assert inside(container, _CALLS) == []
-    assert {"own user", "no capabilities", "seccomp"} <= set(runtime.isolation())
+    assert {"user 65532", "no capabilities", "seccomp"} <= set(runtime.isolation())
     toy = ("--entrypoint", PYTHON, docker_site.images.toy, "-c", _CALLS)
     open_there = json.loads(docker("run", "--rm", "--security-opt", "seccomp=unconfined", "--user", "65532", *toy))
     assert {"unshare of users", "shmget", "personality"} <= set(open_there), "the questions are good ones"

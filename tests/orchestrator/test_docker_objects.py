@@ -416,6 +416,14 @@ def test_the_profile_of_calls_is_an_allow_list_and_another_may_be_named(tmp_path
         DockerRuntime("edge", tmp_path, options(seccomp="/nowhere"))
 
 
+def test_what_holds_a_container_is_told_and_no_user_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        assert runtime.isolation() == (), "nothing is known of an engine that is away"
+        told = {"SecurityOptions": ["name=seccomp,profile=default", "name=userns", "name=other"]}
+        monkeypatch.setattr(runtime._follower, "info", lambda _: told)
+        assert runtime.isolation() == ("user 65532", "no capabilities", "user namespace", "seccomp")
+
+
 def test_the_bridge_is_of_one_network() -> None:
     assert len(bridge_of("n" * 200)) <= 15
     assert bridge_of("a") != bridge_of("b")

@@ -298,8 +298,8 @@ class Site(SiteCreate):
     reason: str = ""
     """Why it is not ready."""
     isolation: tuple[str, ...] = ()
-    """What holds its instances: ``own user``, ``own mounts``, ``Landlock 7``, ``seccomp``; empty: nothing that the
-    orchestrator knows of."""
+    """What holds its instances: ``own user`` (each has another) or ``user 65532`` (of all containers), ``own mounts``,
+    ``Landlock 7``, ``seccomp``; empty: nothing that the orchestrator knows of."""
     cpu: float | None = None
     memory_mb: int | None = None
     gpu: int | None = None

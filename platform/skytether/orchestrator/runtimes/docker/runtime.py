@@ -24,7 +24,7 @@ from .images import check_credentials
 from .launch import Job, kill, remove
 from .logs import ContainerLog
 from .network import ensure_network, remove_network
-from .objects import Seen, data_volume, observation, refusal
+from .objects import USER, Seen, data_volume, observation, refusal
 from .options import DockerOptions
 from .volumes import Scales
 
@@ -82,7 +82,7 @@ class DockerRuntime(Runtime):
         return {"owner": secrets.token_hex(6), **options}
 
     def _on_connect(self) -> None:
-        self._network_ready = False  # the engine's machine may have been started anew, without our filter
+        self._network_ready = False  # network and guard's image may have been removed meanwhile
         self._begin_early()
 
     def _begin_early(self) -> None:
@@ -120,7 +120,7 @@ class DockerRuntime(Runtime):
         except RuntimeFailure:
             return ()
         names = {row.partition(",")[0].removeprefix("name=") for row in told}
-        return ("own user", "no capabilities", *(word for name, word in _HOLDS.items() if name in names))
+        return (f"user {USER}", "no capabilities", *(word for name, word in _HOLDS.items() if name in names))
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return refusal(spec, self._options)

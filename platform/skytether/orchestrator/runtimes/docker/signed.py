@@ -1,7 +1,9 @@
 """Which images an operator vouches for: signatures (Ed25519, RFC 8032) of an image's id, checked before each start.
 
-The id is the SHA-256 of the image's configuration, which names all of its layers by theirs: the same wherever it was
-pulled from, and another after any change. A signature is a file ``HEX.sig`` of 64 bytes, HEX being the id's digits.
+The id is a SHA-256, and another after any change: of the image's configuration, which names all of its layers by
+theirs, or, where the engine keeps images in containerd's store (new installations of Docker 29), of its manifest or
+index, which names both. So the same image has one id at engines of the one kind, and another at those of the other. A
+signature is a file ``HEX.sig`` of 64 bytes, HEX being the id's digits.
 """
 
 from __future__ import annotations
