@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import os
+import secrets
 import socket
 import tempfile
 import time
@@ -19,7 +20,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.runtimes import confinement, process, users
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
-from skytether.orchestrator.runtimes.confinement import Machine, covers, free_user, opened, readable, this_machine
+from skytether.orchestrator.runtimes.confinement import Machine, covers, opened, readable, this_machine
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 
 INTRUDER = """
@@ -136,7 +137,7 @@ def test_two_instances_are_two_users_and_one_keeps_its_own(tmp_path: Path) -> No
     runtime.start(launch())
     until(runtime, Phase.RUNNING)
     owner = (tmp_path / "data/walker/toy/i1").stat().st_uid
-    assert confinement.USERS[0] <= owner <= confinement.USERS[1]
+    assert users.USERS[0] <= owner <= users.USERS[1]
     assert (tmp_path / "instances/i1").stat().st_uid == 0  # what it cannot write, it cannot make a trap of
     runtime.start(launch(attempt=2))
     until(runtime, Phase.RUNNING)
@@ -256,9 +257,42 @@ def test_the_outermost_folder_that_others_may_not_pass_is_covered(monkeypatch: p
         assert covers([f"{root}/a/b/c/e", f"{root}/a/b/c", f"{root}/d", "/run/x"]) == ["/run", f"{root}/a/b"]
 
 
-def test_a_user_that_has_a_name_or_an_instance_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(confinement, "USERS", (61_184, 61_186))
-    assert free_user({61_184, 61_186}) == 61_185
+def test_a_user_is_one_instances_of_all_sites_and_nobody_elses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(users, "_taken", {})
+    monkeypatch.setattr(users, "USERS", (61_184, 61_186))
+    monkeypatch.setattr(users, "users_of_processes", lambda: {0, 61_185})
+    first = users.take_user("lab/i1", None)
+    second = users.take_user("edge/i1", None)
+    assert {first, second} == {61_184, 61_186}
+    assert users.take_user("lab/i1", None) == first
+    with pytest.raises(RuntimeFailure, match="all users from 61184 to 61186 are taken"):
+        users.take_user("lab/i2", 61_185)
+    assert users.keep_user("lab/i3", second) is None
+    users.give_user_back("edge/i1")
+    assert users.take_user("lab/i2", second) == second
+    monkeypatch.setattr(users, "_taken", {})
+    assert users.keep_user("lab/i3", 61_185) == 61_185  # its own run
+    monkeypatch.setattr(users, "USERS", (0, 0))
+    monkeypatch.setattr(users, "users_of_processes", set)
+    with pytest.raises(RuntimeFailure):  # root has a name
+        users.take_user("lab/i4", None)
+
+
+@pytest.mark.slow
+def test_the_end_of_one_sites_instance_is_none_of_anothers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    low = users.USERS[0] + secrets.randbelow(1000)
+    monkeypatch.setattr(users, "USERS", (low, low + 1))  # so few that two sites would take the same one
+    lab, edge = (ProcessRuntime(name, tmp_path / name, ProcessOptions()) for name in ("lab", "edge"))
+    for runtime in (lab, edge):
+        runtime.start(launch())
+        until(runtime, Phase.RUNNING)
+    again = ProcessRuntime("lab", tmp_path / "lab", ProcessOptions())  # as after a restart
+    again.remove("i1")
+    assert edge.look_at(["i1"])["i1"].phase is Phase.RUNNING
+    edge.remove("i1")
+    lab.remove("i1")
 
 
 def test_what_a_machine_lacks_is_said() -> None:

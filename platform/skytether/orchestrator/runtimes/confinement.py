@@ -10,8 +10,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import pwd
-import secrets
 import stat
 import subprocess
 import sys
@@ -21,7 +19,6 @@ from pathlib import Path
 
 from . import confine
 from .base import RuntimeFailure
-from .users import USERS
 
 _READ = (
     *("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/opt/ros", "/proc", "/sys"),
@@ -140,19 +137,6 @@ def covers(paths: Sequence[str]) -> list[str]:
                 found.append(str(folder))
                 break
     return found
-
-
-def free_user(taken: Collection[int]) -> int:
-    """The number of a user that nobody is."""
-    first, last = USERS
-    while True:
-        number = first + secrets.randbelow(last - first + 1)
-        if number in taken:
-            continue
-        try:
-            pwd.getpwuid(number)
-        except KeyError:
-            return number
 
 
 def confined(

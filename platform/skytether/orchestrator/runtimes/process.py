@@ -38,12 +38,12 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
 from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
-from .confinement import confined, free_user, launch_file, opened, readable, this_machine
+from .confinement import confined, launch_file, opened, readable, this_machine
 from .disk import MOST_FILES, size_of
 from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
 from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, find_by_environment, session_members, stat_of
-from .users import end_all_of, noted_user
+from .users import end_all_of, give_user_back, keep_user, noted_user, take_user
 
 log = logging.getLogger(__name__)
 
@@ -188,7 +188,7 @@ class ProcessRuntime(Runtime):
     def _adopt(self, folder: Path) -> _Run:
         note = folder / "run.json"
         noted = _read_json(note)
-        process = None
+        process = user = None
         if noted.get("boot") == BOOT_ID:
             if "process" in noted:
                 process = ProcessId(*noted["process"])
@@ -197,7 +197,9 @@ class ProcessRuntime(Runtime):
                 process = find_by_environment(GRANT_VARIABLE, str(folder / _OWN / "grant.json"))
                 if process is not None:
                     _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-        ready, user = str(noted.get("ready", folder / "ready.json")), noted_user(noted.get("user"))
+        ready = str(noted.get("ready", folder / "ready.json"))
+        if process is not None:
+            user = keep_user(str(folder), noted_user(noted.get("user")))
         return _Run(int(noted.get("attempt", 0)), process, str(folder), str(noted.get("data", "")), ready, user)
 
     @override
@@ -235,7 +237,7 @@ class ProcessRuntime(Runtime):
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
             noted = _read_json(folder / "run.json")
             port = _port(Path(noted.get("ready", ""))) or _port(folder / "run.json")
-            user = self._user_for(noted)
+            user = self._user_for(folder, noted)
             ready = self._prepare(launch, folder, data, port, user)
             note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port, "ready": ready}
             note["user"] = user
@@ -244,6 +246,8 @@ class ProcessRuntime(Runtime):
             process = ProcessId(child.pid, _start_time(child.pid))
             _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
+            if old is None:
+                give_user_back(str(folder))
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
         self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), ready, user, child)
 
@@ -253,11 +257,11 @@ class ProcessRuntime(Runtime):
         more = launch_file(spec.launch, [*self._readable, *map(str, self._options.writable)], self._closed)
         return [*self._readable, more] if more else self._readable
 
-    def _user_for(self, noted: Mapping[str, Any]) -> int | None:
+    def _user_for(self, folder: Path, noted: Mapping[str, Any]) -> int | None:
         """An instance's own, the same in all its runs, so that it can go on with its data; None: there are none."""
         if not (self._machine and self._machine.user):
             return None
-        return noted_user(noted.get("user")) or free_user({run.user for run in self._runs.values() if run.user})
+        return take_user(str(folder), noted_user(noted.get("user")))
 
     def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None, user: int | None) -> str:
         """Make the run's own folder, with the grant in it; returns the path of the ready file."""
@@ -356,7 +360,8 @@ class ProcessRuntime(Runtime):
         _kill_all(run)
         if run.child is not None:
             run.child.wait()
-        shutil.rmtree(self._folder / instance, ignore_errors=True)
+        shutil.rmtree(run.folder, ignore_errors=True)
+        give_user_back(run.folder)
         with contextlib.suppress(OSError):  # not empty: then it is worth keeping
             os.removedirs(run.data)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,6 +90,15 @@ def all_children_run() -> bool:
         return os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
     except ChildProcessError:
         return False  # it has none; those that an earlier program started are each looked at
+
+
+def users_of_processes() -> set[int]:
+    """The numbers of all users that anything runs as now."""
+    found = set()
+    for pid in _pids():
+        with contextlib.suppress(OSError):
+            found.add(os.stat(f"{_PROC}/{pid}").st_uid)
+    return found
 
 
 def find_by_environment(variable: str, value: str) -> ProcessId | None:

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 import logging
+import pwd
+import random
 import subprocess
 import sys
+import threading
 
 from . import confine
+from .base import RuntimeFailure
+from .procfs import users_of_processes
 
 log = logging.getLogger(__name__)
 
 USERS = (61_184, 65_519)
 """Their numbers, as systemd takes them for its dynamic users (systemd.exec(5))."""
+_taken: dict[str, int] = {}
+"""By instance, of all sites of this program: who ends one user's processes must end nobody else's."""
+_lock = threading.Lock()
 _TRIES = 3
 _END_S = 30
 
@@ -20,6 +28,47 @@ _END_S = 30
 def noted_user(noted: object) -> int | None:
     """One of them, from a note; None: it names none."""
     return noted if type(noted) is int and USERS[0] <= noted <= USERS[1] else None
+
+
+def take_user(instance: str, noted: int | None) -> int:
+    """An instance's own, until it is given back: the same again, that of its runs before, or one that nobody is.
+
+    Raises:
+        RuntimeFailure: There are no more.
+    """
+    with _lock:
+        if instance in _taken:
+            return _taken[instance]
+        busy = users_of_processes().union(_taken.values())
+        numbers = random.SystemRandom().sample(range(USERS[0], USERS[1] + 1), USERS[1] - USERS[0] + 1)
+        for number in numbers if noted is None else [noted, *numbers]:
+            if number not in busy and not _has_name(number):
+                _taken[instance] = number
+                return number
+    raise RuntimeFailure(f"all users from {USERS[0]} to {USERS[1]} are taken")
+
+
+def keep_user(instance: str, noted: int | None) -> int | None:
+    """Of a run that an earlier orchestrator began; None: it had none of its own, or another instance has it now."""
+    with _lock:
+        if noted is None or any(number == noted and other != instance for other, number in _taken.items()):
+            return None
+        _taken[instance] = noted
+        return noted
+
+
+def give_user_back(instance: str) -> None:
+    """Nothing of the instance is left."""
+    with _lock:
+        _taken.pop(instance, None)
+
+
+def _has_name(user: int) -> bool:
+    try:
+        pwd.getpwuid(user)
+    except KeyError:
+        return False
+    return True
 
 
 def end_all_of(user: int) -> None:
