@@ -196,6 +196,26 @@ def test_who_leaves_its_session_and_forks_all_the_time_ends(tmp_path: Path) -> N
     assert beat.read_bytes() == last
 
 
+@pytest.mark.slow
+def test_what_it_wrote_before_it_had_a_user_is_its_own_and_nothing_else_is(tmp_path: Path) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    data, secret = tmp_path / "data/walker/toy/i1", tmp_path / "secret"
+    (data / "maps/old").mkdir(parents=True)
+    (data / "maps/old/hall").touch(0o600)
+    secret.touch(0o600)
+    (data / "maps/link").symlink_to(secret)
+    (data / "folder").symlink_to(tmp_path)
+    (data / "same").hardlink_to(secret)
+    runtime = ProcessRuntime("lab", tmp_path, ProcessOptions())
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    (user,) = {path.stat().st_uid for path in (data, data / "maps", data / "maps/old", data / "maps/old/hall")}
+    assert users.noted_user(user)
+    assert {path.stat().st_uid for path in (secret, tmp_path)} == {0}
+    runtime.remove("i1")
+
+
 def test_nobody_else_is_ended() -> None:
     for user in (-1, 0, 1000, users.USERS[1] + 1):
         with pytest.raises(ValueError, match="no instance's own user"):

@@ -43,7 +43,7 @@ from .disk import MOST_FILES, size_of
 from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
 from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, find_by_environment, session_members, stat_of
-from .users import end_all_of, give_user_back, keep_user, noted_user, take_user
+from .users import end_all_of, give_user_back, hand_over, keep_user, noted_user, take_user
 
 log = logging.getLogger(__name__)
 
@@ -279,8 +279,9 @@ class ProcessRuntime(Runtime):
         )
         _write_private(own / "grant.json", grant.model_dump_json())
         if user is not None:
-            for path in (own / "grant.json", own, data):  # the folder last: until then nobody else can reach into it
-                os.chown(path, user, user, follow_symlinks=False)
+            hand_over(str(own), user)
+            if data.lstat().st_uid != user:  # new, or from when it had no user of its own
+                hand_over(str(data), user)
         return ready
 
     def _spawn(
