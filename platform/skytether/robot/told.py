@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 
 from skytether.control.admittance import STANDSTILL, Velocity
 
+from .safety.sources import Hand
 from .supervisor import Limits, Supervised
 
 
@@ -33,12 +34,12 @@ class Told:
     @property
     def nobody(self) -> bool:
         """Nobody may drive: the robot is stopped, or who wants to drive must want a standstill first."""
-        return self.hand == "nobody"
+        return self.hand == Hand.NOBODY
 
     @property
     def agent(self) -> bool:
         """The agent drives, or may."""
-        return self.hand == "agent"
+        return self.hand == Hand.AGENT
 
 
 @runtime_checkable

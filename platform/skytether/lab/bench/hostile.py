@@ -23,6 +23,7 @@ import psutil
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, RobotCreate, SiteCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
+from skytether.orchestrator.runtimes.disk import size_of
 
 from .api import lost, start
 from .hostile_robot import EVIL, EVIL_MANIFEST, Target, attack
@@ -38,6 +39,8 @@ _QUIET_S = 20.0
 """For how long nobody is hostile at first, at most."""
 _LOOK_S = 1.0
 """Between looks at the memory."""
+_MOST_STATE = 1 << 40
+"""Bytes of a state folder that are looked at."""
 _SEED = 21
 _END_S = 60.0
 
@@ -202,4 +205,4 @@ def _watched(pid: int) -> Iterator[list[float]]:
 
 def _size(folder: Path) -> int:
     """Bytes of all files."""
-    return sum(one.stat().st_size for one in folder.rglob("*") if one.is_file())
+    return size_of(str(folder), _MOST_STATE) or 0

@@ -32,7 +32,7 @@ _SCRATCH_SIZE = "64m"
 
 # Landlock, linux/landlock.h. The three calls have the same number on all architectures.
 _CREATE, _ADD_RULE, _RESTRICT = 444, 445, 446
-_RULE_PATH, _RULE_PORT = 1, 2
+_RULE_PATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1, 2, 4, 8
 _REFER, _TRUNCATE, _IOCTL_DEV = 1 << 13, 1 << 14, 1 << 15
 _FIRST = (1 << 13) - 1
@@ -41,7 +41,6 @@ _READ = _EXECUTE | _READ_FILE | _READ_DIR
 _OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _IOCTL_DEV
 HOLDS_TRUNCATE = 3
 """The first version of Landlock that does."""
-_BIND_TCP, _CONNECT_TCP = 1, 2
 _SCOPE_ABSTRACT_UNIX, _SCOPE_SIGNAL = 1, 2
 
 # Classic BPF, linux/filter.h and linux/seccomp.h.
@@ -217,13 +216,14 @@ def end_all(user: int) -> None:
         return  # there is none
 
 
-def landlock(version: int, read: list[str], write: list[str], connect: list[int] | None) -> None:
-    """Let only these folders and files be reached, and only these TCP ports; None: all."""
+def landlock(version: int, read: list[str], write: list[str]) -> None:
+    """Let only these folders and files be reached."""
     files = _FIRST | (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
     files |= _IOCTL_DEV if version >= 5 else 0
-    ports = _CONNECT_TCP if version >= 4 and connect is not None else 0
     scoped = (_SCOPE_ABSTRACT_UNIX | _SCOPE_SIGNAL) if version >= 6 else 0
-    attributes = struct.pack("QQQ", files, ports, scoped)[: 24 if version >= 6 else 16 if version >= 4 else 8]
+    attributes = struct.pack(
+        "QQQ", files, 0, scoped
+    )  # no port is held[: 24 if version >= 6 else 16 if version >= 4 else 8]
     rules = _checked(
         _LIBC.syscall(_CREATE, ctypes.c_char_p(attributes), ctypes.c_size_t(len(attributes)), 0), "Landlock"
     )
@@ -237,9 +237,6 @@ def landlock(version: int, read: list[str], write: list[str], connect: list[int]
             rule = struct.pack("=Qi", granted, file)
             _checked(_LIBC.syscall(_ADD_RULE, rules, _RULE_PATH, ctypes.c_char_p(rule), 0), f"Landlock of {path}")
             os.close(file)
-    for port in connect or () if ports else ():
-        rule = struct.pack("QQ", _CONNECT_TCP, port)
-        _checked(_LIBC.syscall(_ADD_RULE, rules, _RULE_PORT, ctypes.c_char_p(rule), 0), f"Landlock of port {port}")
     _checked(_LIBC.syscall(_RESTRICT, rules, 0), "Landlock")
     os.close(rules)
 
@@ -332,7 +329,7 @@ def main() -> None:
         become(user, asked["groups"])
     _checked(_LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "no new privileges")
     if asked["landlock"]:
-        landlock(asked["landlock"], read, write, asked["connect"])
+        landlock(asked["landlock"], read, write)
     if asked["seccomp"]:
         seccomp(asked["families"], owner=user is None, empties=user is None and asked["landlock"] < HOLDS_TRUNCATE)
     os.execv(asked["command"][0], asked["command"])  # noqa: S606 (no shell is wanted)

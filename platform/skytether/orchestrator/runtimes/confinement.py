@@ -166,7 +166,6 @@ def confined(
         "user": user,
         "groups": list(groups),
         "landlock": machine.landlock,
-        "connect": None,
         "seccomp": machine.seccomp,
         # Without mounts of its own, every socket in the file system that the orchestrator's user may use is in its
         # reach, that of a Docker engine among them; Landlock does not mind those.

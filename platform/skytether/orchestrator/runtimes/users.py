@@ -11,6 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
+from itertools import chain
 
 from . import confine
 from .base import RuntimeFailure
@@ -42,8 +43,8 @@ def take_user(instance: str, noted: int | None) -> int:
         if instance in _taken:
             return _taken[instance]
         busy = users_of_processes().union(_taken.values())
-        numbers = random.SystemRandom().sample(range(USERS[0], USERS[1] + 1), USERS[1] - USERS[0] + 1)
-        for number in numbers if noted is None else [noted, *numbers]:
+        first, most = random.SystemRandom().randint(*USERS), USERS[1] + 1
+        for number in chain([] if noted is None else [noted], range(first, most), range(USERS[0], first)):
             if number not in busy and not _has_name(number):
                 _taken[instance] = number
                 return number

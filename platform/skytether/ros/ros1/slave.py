@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from socketserver import ThreadingMixIn
 from typing import Any, Protocol, cast
 from urllib.parse import urlsplit
@@ -72,10 +73,8 @@ class MasterHost:
             return True
         if self._clock() >= self._until:
             self._until = self._clock() + _RESOLVED_S
-            try:
+            with suppress(OSError):  # the name server is away: those of before
                 self._addresses = frozenset(str(found[4][0]) for found in socket.getaddrinfo(self._host, None))
-            except OSError:  # the name server is away: those of before
-                return address in self._addresses
         return address in self._addresses
 
 

@@ -251,7 +251,7 @@ def _run_guard(engine: Engine, image: str, container: str, script: str, security
             _remove_left(api, made)
             api.start(made)
             status = int(api.wait(made, timeout=_GUARD_TIMEOUT_S)["StatusCode"])
-            return api.logs(made).decode(errors="replace"), status
+            return api.logs(made).decode(errors="replace") if status else "", status
         finally:
             api.remove_container(made, force=True)
 
