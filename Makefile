@@ -3,21 +3,19 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-# A busy machine can make a test on real sockets or processes miss its moment: what failed is run again, and reported as such.
 # The tests start hundreds of programs: without this each compiles the platform anew where the environment forbids to keep it.
 export PYTHONDONTWRITEBYTECODE :=
 
-AGAIN := --reruns 2 --reruns-delay 3
 UNIT := $(BIN)/pytest -m "not slow"
-SLOW := $(BIN)/pytest $(AGAIN) --durations 30 -m "slow
+SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine-ros1 slow-others unit images fuzz check fmt docs licences lock clean
+.PHONY: demo test slow-engine-ros1 slow-others unit images fuzz jepsen check fmt docs licences audit lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
-	$(UNIT) -n 2 --dist loadfile || { echo "once more, those that failed:"; $(UNIT) --last-failed; }
+	$(UNIT) -n 2 --dist loadfile
 	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
 	@failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine-ros1 slow-others || failed=1; \
 		echo "The other slow tests, one at a time ..."; $(SLOW) and not together" || failed=1; exit $$failed
@@ -37,6 +35,10 @@ images: $(READY) ## the container images, on the Docker engine of this machine; 
 fuzz: $(READY) ## every byte that can arrive, with coverage, 30 s for each target (SECONDS=300 for more)
 	$(BIN)/python tests/fuzz/run.py --seconds $(or $(SECONDS),30)
 
+jepsen: $(READY) ## three orchestrators under faults, for MINUTES=5 (SEED=n, FAULTS=a,b of tests/jepsen/nemesis.py, PAIRS=1: two at once)
+	@SKYTETHER_REQUIRE=netns,nftables,postgres,faketime,docker MINUTES=$(MINUTES) SEED=$(SEED) FAULTS=$(FAULTS) PAIRS=$(PAIRS) \
+		$(BIN)/pytest -q tests/jepsen/long.py
+
 check: $(READY) ## style, types and layers: the same for people and CI
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -52,6 +54,13 @@ docs: $(READY) ## the pages that are made from the code
 
 licences: $(READY) ## the licences of all that requirements.lock names, as a page
 	$(BIN)/python .ci/licences.py > docs/licences.md
+
+audit: .audit/bin/pip-audit ## known faults of all that requirements.lock names, where advisories can be had
+	@$(PYTHON) .ci/audit.py $< $(WHERE)
+
+.audit/bin/pip-audit:
+	@$(PYTHON) -m venv .audit
+	@.audit/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
 
 lock: $(READY) ## resolve pyproject.toml anew into requirements.lock
 	$(BIN)/pip install --quiet uv
@@ -70,4 +79,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean: ## remove what the build and the tools made
-	rm -rf .venv .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .audit .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -32,6 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "images"
 WORK = ROOT / "build" / "images"
 TAG = "1"
+SOURCE = "source"
 PYTHON = "3.11"
 """Debian 12's."""
 EXTRAS: dict[str, tuple[str, ...]] = {
@@ -162,7 +163,7 @@ def order(names: Iterable[str]) -> list[str]:
     unknown = [name for name in wanted if name not in known()]
     if unknown:
         raise BuildError(f"there is no image '{unknown[0]}'; there are {', '.join(sorted(known()))}")
-    if any("ARG BASE" in (IMAGES / name / "Dockerfile").read_text() for name in wanted):
+    if any(needs(name, "BASE") for name in wanted):
         wanted.insert(0, "base")
     return sorted(dict.fromkeys(wanted), key=lambda name: name != "base")
 
@@ -213,14 +214,32 @@ def labels(name: str) -> dict[str, str]:
     return {f"org.opencontainers.image.{key}": value for key, value in said.items() if value}
 
 
-def build(client: docker.DockerClient, name: str, prefix: str, tag: str, debian: str) -> Built:
+def needs(name: str, what: str) -> bool:
+    """Whether an image is built on BASE or DEBIAN."""
+    return f"ARG {what}" in (IMAGES / name / "Dockerfile").read_text()
+
+
+def source_tag(name: str, debian_id: str) -> str:
+    """A tag that says what an image is made from: the same for the same files, wheels and image of Debian."""
+    parts = [context(name), debian_id.encode() if needs(name, "DEBIAN") else b""]
+    parts += [source_tag("base", debian_id).encode()] if needs(name, "BASE") else []
+    return "s-" + hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
+
+
+def tags(client: docker.DockerClient, names: Iterable[str], tag: str, debian: str) -> dict[str, str]:
+    """By image, its tag."""
+    if tag != SOURCE:
+        return dict.fromkeys(names, tag)
+    debian_id = str(client.api.inspect_image(debian)["Id"])
+    return {name: source_tag(name, debian_id) for name in names}
+
+
+def build(client: docker.DockerClient, name: str, prefix: str, tagged: dict[str, str], debian: str) -> Built:
     """Build one image; what it is built on is there."""
-    image = f"{prefix}{name}:{tag}"
+    image = f"{prefix}{name}:{tagged[name]}"
     begun = time.monotonic()
-    arguments = {"DEBIAN": debian, "BASE": f"{prefix}base:{tag}"}
-    used = {
-        key: value for key, value in arguments.items() if f"ARG {key}" in (IMAGES / name / "Dockerfile").read_text()
-    }
+    arguments = {"DEBIAN": debian, "BASE": f"{prefix}base:{tagged.get('base', '')}"}
+    used = {key: value for key, value in arguments.items() if needs(name, key)}
     lines: list[str] = []
     for line in client.api.build(
         fileobj=io.BytesIO(context(name)),
@@ -290,7 +309,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("name", nargs="*", help="default: all of them")
     parser.add_argument("--prefix", default="skytether/", help="before each name, such as REGISTRY/skytether/")
-    parser.add_argument("--tag", default=TAG)
+    parser.add_argument("--tag", default=TAG, help=f"{SOURCE}: one for each that says what it is made from")
     parser.add_argument("--debian", default="debian:bookworm-slim", help="what the base is built from")
     parser.add_argument("--sbom", type=Path, help="write a list of each image's packages (CycloneDX) into this folder")
     parser.add_argument("--json", action="store_true", help="print rows `image, seconds, size_mb, numerical_mb`")
@@ -305,8 +324,9 @@ def main() -> int:
                 fetch(group, machine)
         if "base" in names:
             make_wheel()
+        tagged = tags(client, names, asked.tag, asked.debian)
         for name in names:
-            rows.append(build(client, name, asked.prefix, asked.tag, asked.debian))
+            rows.append(build(client, name, asked.prefix, tagged, asked.debian))
             if asked.sbom:
                 write_bill(client, rows[-1].image, asked.sbom)
             if not asked.json:

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from skytether.api.plain import DEPTH, oddity
+from skytether.api.manifest import ServiceSpec, TopicSpec
+from skytether.api.plain import DEPTH, KEYS, LISTED_KEYS, oddity
+from skytether.api.rest import MOST_TOPICS, Report, TopicReport
 
 
 def nested(levels: int) -> Any:
@@ -22,6 +24,22 @@ def nested(levels: int) -> Any:
 )
 def test_what_json_can_hold_is_left_alone(document: Any) -> None:
     assert oddity(document) is None
+
+
+def test_as_many_topics_as_a_robot_and_a_service_may_have() -> None:
+    """A robot of 256 topics could not renew: with all keys of each its report had more than a document might."""
+    topic = TopicReport(topic="scan", direction="in", priority=1).model_dump()
+    report = {"topics": [{**topic, "topic": f"scan{n}"} for n in range(MOST_TOPICS)]}
+    assert (oddity({"report": report}), len(Report.model_validate(report).topics)) == (None, MOST_TOPICS)
+    row = TopicSpec(name="scan", type="sensor_msgs/msg/LaserScan", direction="in").model_dump()
+    spec = {"entrypoint": "toy.service", "topics": [{**row, "name": f"scan{n}"} for n in range(1000)]}
+    assert (oddity({"spec": spec}), len(ServiceSpec.model_validate(spec).topics)) == (None, 1000)
+
+
+def test_keys_are_bounded_in_lists_and_outside_of_them() -> None:
+    assert oddity({str(n): {} for n in range(KEYS)} | {"0": [{"a": {"b": 1}}] * (LISTED_KEYS // 2)}) is None
+    assert str(oddity({str(n): {} for n in range(KEYS + 1)})) == "has more than 4096 keys"
+    assert str(oddity([{"a": {"b": 1}}] * (LISTED_KEYS // 2 + 1))) == "has more than 20000 keys in lists"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from skytether.cli import main as entry
 from skytether.cli.app import app
 from skytether.cli.demo import _told
-from skytether.cli.output import log_to_console, print_table
+from skytether.cli.output import log_to_console, print_foreign, print_table
 from skytether.robot.arbiter import Reason
 from skytether.robot.command import Source
 from skytether.robot.driver import Transition
@@ -74,3 +74,12 @@ def test_a_plot_folder_that_cannot_be_made_is_one_sentence():
     assert result.stderr == (
         "error: cannot make the folder /proc/none: No such file or directory; give another with --output\n"
     )
+
+
+@pytest.mark.parametrize(("terminal", "shown"), [(True, "a       \\x1b[2Jb\\r\\x00\n"), (False, "a\tb\r\x00\n")])
+def test_a_terminal_gets_no_codes_of_a_service(
+    terminal: bool, shown: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    print_foreign("a\t\x1b[2Jb\r\x00\n")
+    assert capsys.readouterr().out == shown

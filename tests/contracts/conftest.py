@@ -6,16 +6,25 @@ import base64
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from skytether.api.grant import Grant
+from skytether.api.grant import GRANT_VARIABLE, Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, Runtime
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
-from skytether.testing.runtimes import CrashingRuntime, FakeOptions, FakeRun, FakeRuntime, SlowRuntime, StubbornRuntime
+from skytether.orchestrator.runtimes.procfs import ProcessStat
+from skytether.testing.runtimes import (
+    CrashingRuntime,
+    FakeOptions,
+    FakeRuntime,
+    FakeWorld,
+    SlowRuntime,
+    StubbornRuntime,
+)
 
 TOY = "skytether.testing.toy_service"
 
@@ -34,6 +43,10 @@ class Kit(ABC):
     @abstractmethod
     def open(self, behaviour: str = "good") -> Runtime:
         """A runtime over the same site each time; ``good``, ``stubborn`` or ``crashing`` services."""
+
+    @abstractmethod
+    def running(self, instance: str = "i1") -> int:
+        """How many runs of an instance the machine has now, whatever any runtime says."""
 
     def launch(self, instance: str = "i1", attempt: int = 1, behaviour: str = "good") -> Launch:
         params: dict[str, Any] = {
@@ -64,9 +77,11 @@ class Kit(ABC):
 
     def close(self) -> None:
         """Leave nothing behind."""
+        cleaner = self.open()  # of no leader
+        for instance in list(cleaner.observe()):
+            cleaner.remove(instance)
         for runtime in self.runtimes:
-            for instance in list(runtime.observe()):
-                runtime.remove(instance)
+            runtime.observe()  # what it began and another ended is waited for
             runtime.close()
 
 
@@ -75,6 +90,16 @@ class ProcessKit(Kit):
         runtime = ProcessRuntime("lab", self.folder, ProcessOptions())
         self.runtimes.append(runtime)
         return runtime
+
+    def running(self, instance: str = "i1") -> int:
+        wanted = f"{GRANT_VARIABLE}={self.folder}/instances/{instance}/own/grant.json".encode()
+        found = 0
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                stat = ProcessStat.read(int(folder.name))
+                leads = stat is not None and not stat.zombie and stat.session == stat.pid
+                found += leads and wanted in (folder / "environ").read_bytes().split(b"\0")
+        return found
 
 
 class DockerKit(Kit):
@@ -88,19 +113,25 @@ class DockerKit(Kit):
         self.runtimes.append(runtime)
         return runtime
 
+    def running(self, instance: str = "i1") -> int:
+        return len(self.site.labelled(f"skytether.io/instance={instance}", "status=running"))
+
 
 class FakeKit(Kit):
     kind: type[FakeRuntime] = FakeRuntime
 
     def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
         super().__init__(folder, request)
-        self.world: dict[str, FakeRun] = {}
+        self.world = FakeWorld()
 
     def open(self, behaviour: str = "good") -> Runtime:
         kind = {"good": self.kind, "stubborn": StubbornRuntime, "crashing": CrashingRuntime}[behaviour]
         runtime = kind("lab", self.folder, FakeOptions(), self.world)
         self.runtimes.append(runtime)
         return runtime
+
+    def running(self, instance: str = "i1") -> int:
+        return int(instance in self.world and not self.world[instance].ended)
 
 
 class SlowKit(FakeKit):

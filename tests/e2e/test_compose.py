@@ -243,6 +243,11 @@ def test_an_instance_runs_and_prometheus_knows_all_that_the_dashboard_asks(
         assert driven["value"][1] == "1"
 
         client.delete_instance(made.id)
-        # Series vanish with what they describe.
-        until(lambda: not stack.query('{__name__=~"skytether_.+", robot="walker"}'))
+        # Series vanish with what they describe; what it has written is there still.
+        until(
+            lambda: (
+                not stack.query('{__name__=~"skytether_.+", __name__!="skytether_robot_data_bytes", robot="walker"}')
+            )
+        )
+        assert stack.query('skytether_robot_data_bytes{robot="walker"}')
         assert stack.query("skytether_site_up")

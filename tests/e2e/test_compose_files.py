@@ -13,6 +13,7 @@ import yaml
 
 from skytether.api import report_metrics as reported
 from skytether.orchestrator import metrics as exported
+from skytether.orchestrator.runtimes.docker.objects import USER
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
@@ -42,6 +43,20 @@ def test_a_container_may_nothing_that_it_does_not_need(name: str) -> None:
         assert service["pull_policy"] == "never", "in a public registry anybody may have that name"
     for port in service.get("ports", ()):
         assert re.match(r"127\.0\.0\.1:|\$\{SKYTETHER_INSECURE_HTTP_ADDRESS:-127\.0\.0\.1}:", port)
+
+
+def test_the_orchestrator_is_another_user_than_the_services() -> None:
+    """On an engine without user namespaces, a service that got out of its container would be the orchestrator."""
+    users = {
+        name: re.findall(r"^USER (\d+:\d+)$", (ROOT / "images" / name / "Dockerfile").read_text(), re.MULTILINE)
+        for name in ("base", "ros1-base", "orchestrator")
+    }
+    assert users == {name: [f"{u}:{u}"] for name, u in (("base", USER), ("ros1-base", USER), ("orchestrator", 65531))}
+    ours = {SERVICES[name]["user"] for name in ("orchestrator", "passwords", "token")}
+    assert ours == set(users["orchestrator"])
+    others = [service["user"].split(":")[0] for service in SERVICES.values() if service["user"] not in ours]
+    assert len(others) == len(set(others))
+    assert str(USER) not in others
 
 
 def test_no_password_is_written_down_and_each_is_seen_only_by_those_who_need_it() -> None:

@@ -10,10 +10,15 @@ from pathlib import Path
 import pytest
 
 from skytether.guard.folder import objection
+from skytether.guard.mailbox import bind
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.requests import Requests
 from skytether.guard.velocity import Velocity
+from skytether.guard.wheels import SocketWheels
+from skytether.messages import Bool, encode
 from skytether.robot.safety.client import GateError, GateLink, ask, listens, stop
+from skytether.robot.safety.hardware import SocketSensors
+from skytether.robot.safety.inbox import Topics
 from skytether.robot.safety.protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, default_folder, pack_state
 
 root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")
@@ -159,16 +164,153 @@ def test_a_guard_answers_no_other_user(folder):
         f"import os, socket; os.setgid({ANOTHER}); os.setuid({ANOTHER})\n"
         "link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); link.settimeout(20)\n"
         f"link.connect({str(folder / STOP_SOCKET)!r})\n"
-        'try: link.send(b\'{"do": "status"}\'); print(link.recv(100))\n'
-        "except OSError as error: print(b'')\n"
+        'try: link.send(b\'{"do": "status"}\')\n'
+        "except BrokenPipeError: pass\n"
+        "print(link.recv(100))\n"
     )
     asks = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     while asks.poll() is None:
         guard.turn()
-    assert asks.stdout.read() == "b''\n"
+    assert f"you are the user {ANOTHER}, and only 0 and root may ask" in asks.stdout.read()
     assert handled == []
     asks.stdout.close()
     guard.close()
+
+
+def send_as(user, group, path, data):
+    """A datagram of another user, who by mistake (or on a file system without modes) may write there."""
+    for above in path.parent.parents:
+        if above.stat().st_uid == os.geteuid() and above != Path("/") and not above.stat().st_mode & 0o001:
+            above.chmod(0o711)
+    path.chmod(0o777)
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os.setgroups([])
+            os.setgid(group)
+            os.setuid(user)
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(data, str(path))
+        finally:
+            os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+
+
+@pytest.fixture
+def sensors(folder):
+    """Of a gate: its readings and its stops; what it says of those that it does not use."""
+    told = []
+
+    def make():
+        topics = Topics({"estop": Bool, "lock": Bool}, {"estop": lambda message: message.data})
+        paths = str(folder / "sensors.sock"), str(folder / "estop.sock")
+        made.append(SocketSensors(paths[0], bind(paths[1]), topics, lambda _, sentence: told.append(sentence)))
+        return made[-1], told
+
+    made = []
+    yield make
+    for one in made:
+        one.close()
+
+
+def reading(topic, value=True):
+    return topic.encode() + b"\0" + encode(Bool(value), "cdr")
+
+
+@root
+@pytest.mark.parametrize(("name", "topic"), [("sensors.sock", "lock"), ("estop.sock", "estop")])
+def test_what_another_user_sends_is_no_reading_and_no_press_and_no_release(folder, sensors, name, topic):
+    at, told = sensors()
+
+    def heard():
+        return [*at.stops(), *at.read()]
+
+    send_as(ANOTHER, ANOTHER, folder / name, reading(topic))
+    assert heard() == []
+    assert told == [
+        f"what comes to {folder / name} from another user is not used: it is the user {ANOTHER}, to whom {folder} does "
+        "not belong"
+    ]
+    send_as(0, 0, folder / name, reading(topic))
+    assert heard() == [(topic, Bool(True))]
+    os.chown(folder, ANOTHER, 0)  # a folder that systemd made for the user of the units
+    again, _ = sensors()
+    send_as(ANOTHER, ANOTHER, folder / name, reading(topic))
+    assert [*again.stops(), *again.read()] == [(topic, Bool(True))]
+
+
+@root
+def test_drivers_of_another_user_are_of_the_group_that_the_folder_hands_down(folder, sensors):
+    os.chown(folder, 0, ANOTHER + 1)
+    folder.chmod(0o750)
+    at, _ = sensors()
+    folder.chmod(0o711)
+    send_as(ANOTHER, ANOTHER + 1, folder / "sensors.sock", reading("lock"))
+    assert list(at.read()) == [], "a group alone is not enough: many have one that is everybody's"
+    folder.chmod(0o2711)
+    assert objection(str(folder)) == ""
+    at, _ = sensors()
+    assert (folder / "sensors.sock").stat().st_gid == ANOTHER + 1
+    send_as(ANOTHER, ANOTHER + 1, folder / "sensors.sock", reading("lock"))
+    send_as(ANOTHER, ANOTHER, folder / "sensors.sock", reading("lock", False))
+    assert list(at.read()) == [("lock", Bool(True))]
+
+
+@root
+def test_wheels_that_another_user_has_are_not_told(folder, tmp_path):
+    wheels = SocketWheels(str(folder / "wheels.sock"))
+    theirs = bind(str(folder / "wheels.sock"))
+    os.chown(folder / "wheels.sock", ANOTHER, ANOTHER)
+    with pytest.raises(PermissionError, match=f"may not have the wheels: it is the user {ANOTHER}"):
+        wheels.write(Velocity(0.1, 0))
+    os.chown(folder / "wheels.sock", 0, 0)
+    wheels.write(Velocity(0.1, 0))
+    assert theirs.recv(100)
+    wheels.close()
+    theirs.close()
+
+
+@root
+@pytest.mark.parametrize("make", ["bind", "link"])
+def test_wheels_of_whoever_may_write_to_the_folder_that_hands_its_group_down_are_not_told(folder, tmp_path, make):
+    group = ANOTHER + 1
+    os.chown(folder, 0, group)
+    folder.chmod(0o3770)
+    assert objection(str(folder)) == ""
+    for above in folder.parents:
+        if above.stat().st_uid == os.geteuid() and above != Path("/") and not above.stat().st_mode & 0o001:
+            above.chmod(0o711)
+    root_has = bind(str(tmp_path / "elsewhere"))
+    wheels = SocketWheels(str(folder / "wheels.sock"))
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os.setgroups([group])  # one of its further groups, as an administrator gives it
+            os.setgid(ANOTHER)
+            os.setuid(ANOTHER)
+            if make == "link":  # to one that is ours, for now
+                os.symlink(tmp_path / "elsewhere", folder / "wheels.sock")
+            else:
+                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).bind(str(folder / "wheels.sock"))
+        finally:
+            os._exit(0)
+    os.waitpid(pid, 0)
+    assert (folder / "wheels.sock").lstat().st_gid == group
+    with pytest.raises(PermissionError, match=f"may not have the wheels: it is the user {ANOTHER}"):
+        wheels.write(Velocity(0.1, 0))
+    wheels.close()
+    root_has.close()
+
+
+@root
+def test_wheels_of_another_user_have_a_folder_that_is_theirs(folder):
+    os.chown(folder, ANOTHER, ANOTHER)
+    theirs = bind(str(folder / "wheels.sock"))
+    os.chown(folder / "wheels.sock", ANOTHER, ANOTHER)
+    wheels = SocketWheels(str(folder / "wheels.sock"))
+    wheels.write(Velocity(0.1, 0))
+    assert theirs.recv(100)
+    wheels.close()
+    theirs.close()
 
 
 @root

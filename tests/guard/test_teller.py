@@ -24,10 +24,16 @@ class Wheels:
         self.told = []
         self.nodes = frozenset({"/base"})
         self.fails: Exception | None = None
+        self.room = True
+
+    def full(self):
+        return not self.room
 
     def write(self, velocity):
         if self.fails:
             raise self.fails
+        if not self.room:
+            raise BlockingIOError
         self.told.append(velocity)
 
     def listeners(self):
@@ -44,12 +50,12 @@ class One:
         self.teller = Teller(self.wheels, self.watch, self.board, role, PERIOD, lambda: self.now + self.late)
         self.teller.look()
 
-    def turn(self, now, wanted=None):
+    def turn(self, now, wanted=None, stopped=False):
         self.now = now
         if wanted is not None:
             self.watch.hear(Beat(now, wanted))
         self.teller.look()
-        return self.teller.tell(now)
+        return self.teller.tell(now, stopped)
 
 
 @pytest.fixture
@@ -194,6 +200,71 @@ def test_a_way_that_is_broken_is_silence(both):
         second.turn(1.001 + i * PERIOD)
     assert second.wheels.told[0].linear == pytest.approx(0.4 - 2.0 * 0.061)
     assert len(second.wheels.told) == 5
+
+
+def turns(one, start, end):
+    """At 50 Hz; when it told the wheels something, and what."""
+    spoke = []
+    at = start
+    while at < end - 1e-9:
+        with suppress(BlockingIOError):
+            if one.turn(at, FAST):
+                spoke.append((round(at, 3), one.wheels.told[-1].linear))
+        at += PERIOD
+    return spoke
+
+
+def not_read_until_1_4(one):
+    """Told of a velocity until 1.04, then without room, as seen last at 1.38."""
+    turns(one, 1.0, 1.05)
+    one.wheels.room = False
+    turns(one, 1.06, 1.4)
+    one.wheels.room = True
+
+
+def test_wheels_that_have_no_room_for_a_moment_are_told_what_follows_from_the_last_velocity(both):
+    first, _ = both
+    turns(first, 1.0, 1.05)
+    first.wheels.room = False
+    assert turns(first, 1.06, 1.1) == []
+    first.wheels.room = True
+    assert turns(first, 1.1, 1.11) == [(1.1, 0.4)]
+
+
+def test_wheels_that_had_no_room_for_longer_are_left_alone_until_they_stand(both):
+    """They turn by what they read late: a word between that and a standstill would be a jump."""
+    first, _ = both
+    not_read_until_1_4(first)
+    spoke = turns(first, 1.4, 1.6)
+    assert spoke[0] == (pytest.approx(1.38 + PATIENCE + 3 * PERIOD), 0.0)  # 1.38: it was full
+    assert spoke[1][1] == pytest.approx(1.0 * PERIOD)
+
+
+def test_wheels_that_do_not_read_are_named_as_long_as_they_do_not(both):
+    first, _ = both
+    turns(first, 1.0, 1.05)
+    first.wheels.room = False
+    for i in range(100):
+        with pytest.raises(BlockingIOError, match="their driver does not read"):
+            first.turn(1.06 + i * PERIOD, FAST)
+
+
+def test_a_stop_is_told_at_once_to_wheels_that_read_again(both):
+    first, _ = both
+    not_read_until_1_4(first)
+    assert first.turn(1.4, stopped=True)
+    assert first.wheels.told[-1] == STANDSTILL
+
+
+def test_the_second_knows_that_the_first_waits(both):
+    first, second = both
+    turns(first, 1.0, 1.05)
+    first.wheels.room = second.wheels.room = False
+    turns(first, 1.06, 1.4)
+    first.wheels.room = second.wheels.room = True
+    for i in range(6):
+        assert not first.turn(1.4 + i * PERIOD, FAST)
+        assert not second.turn(1.405 + i * PERIOD, FAST)
 
 
 def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():

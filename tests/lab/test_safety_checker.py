@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from skytether.control.admittance import Velocity
 from skytether.lab.safety.checker import Demand, Told, Wheels, check, tightest
+from skytether.lab.safety.socket_hardware import steady
 from skytether.robot.supervisor import Limits
 
 PERIOD = 0.02
@@ -154,3 +155,16 @@ def test_the_standstill_with_the_least_to_spare_is_told():
     assert tightest([(0.3, 0.5), (0.25, 0.3), (0.1, 0.2)]) == (0.25, 0.3)
     assert tightest([(0.3, 0.5), (0.7, 0.5)]) == (0.7, 0.5)
     assert tightest([]) is None
+
+
+def test_a_judge_that_loses_the_processor_between_two_clocks_does_not_date_a_velocity_earlier() -> None:
+    time = 0.0
+    held_up = iter([0.0, 0.17, 0.0, 0.0, 0.0])
+
+    def clock() -> float:
+        nonlocal time
+        read = time
+        time += next(held_up) or 1e-6
+        return read
+
+    assert steady(1000.0, clock, lambda: 1000.1 + clock()) == pytest.approx(-0.1, abs=1e-4)

@@ -6,7 +6,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from reconcile_bench import Bench
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
-from skytether.orchestrator import catalogue, sites
+from skytether.orchestrator import app, catalogue, sites
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
+from skytether.orchestrator.pause import Pause
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.server import listening
 from skytether.orchestrator.settings import Settings, Timing
@@ -108,6 +109,14 @@ def installed_services_are_read_once() -> Iterator[None]:
         patch.setattr(catalogue, "entry_points", installed)
         patch.setattr(sites, "entry_points", installed)
         patch.setattr(catalogue, "read_builtin", lambda points: read(tuple(points)))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def refusals_are_not_waited_for() -> Iterator[None]:
+    """Hundreds of tests ask what they may not; those of `Pause` have their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(app, "Pause", partial(Pause, 0.0))
         yield
 
 

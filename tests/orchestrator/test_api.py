@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -23,6 +24,7 @@ from skytether.api.rest import (
     State,
     TopicReport,
 )
+from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.sites import RUNTIMES
 
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
@@ -122,6 +124,12 @@ def test_no_site_at_all(served: Any) -> None:
     assert (status, text) == (409, "no site can run 'toy': there is none: add one with `skytether site add`")
 
 
+def test_a_site_that_was_added_at_another_orchestrator_a_moment_ago_counts(served_with: Callable[..., Any]) -> None:
+    served = served_with(timing=Timing(place=1000))
+    served.core.store.add_site(SiteCreate(name="lab", tier="edge", runtime="fake"))
+    assert served.operator.create_instance(ASK).state is State.PENDING
+
+
 def test_no_site_that_ever_could_says_each_ones_number(served: Any, manifest: Any) -> None:
     served.site("small", cpu=1)
     served.site("far")
@@ -208,7 +216,9 @@ def test_reports_reach_the_metrics_and_go_with_the_instance(served: Any, manifes
     assert made.session.id not in text
     robot.delete_instance(made.id)
     assert list(robot.watch(made.id, timeout=5))[-1].state.final
-    assert 'robot="walker"' not in operator.metrics()
+    end = time.monotonic() + 10
+    while 'robot="walker"' in operator.metrics():  # its stream's end is counted after the robot saw it
+        assert time.monotonic() < end
 
 
 def test_revoking_a_robot_ends_what_it_holds(served: Any) -> None:
@@ -246,7 +256,8 @@ def test_sites(served: Any) -> None:
     assert refused(operator.create_site, SiteCreate(name="lab", tier="edge", runtime="fake"))[0] == 409
     made = robot.wait_running(robot.create_instance(ASK).id, timeout=5)
     status, text = refused(operator.delete_site, "lab")
-    assert (status, text) == (409, f"site 'lab' has 1 instances: delete them first ({made.id})")
+    drain = "or drain it: it takes no more, and is deleted with its last one"
+    assert (status, text) == (409, f"site 'lab' has 1 instances: delete them first ({made.id}), {drain}")
     served.fleet.made["lab"].silent = True
     while operator.get_site("lab").state == "ready":
         pass
@@ -393,3 +404,66 @@ def test_a_body_of_unknown_length_is_bounded_too(shared: Any) -> None:
     answer = httpx.post(url, content=chunks, headers=headers, trust_env=False, verify=False)
     assert answer.status_code == 413
     assert answer.json()["status"] == 413
+
+
+def test_what_a_site_failed_to_start_is_told_operators(served_with: Callable[..., Any]) -> None:
+    served = served_with(timing=Timing())
+    served.site()
+    robot, fitness = served.robot(), served.core.sites.get("lab").fitness
+    made = robot.wait_running(robot.create_instance(ASK).id, timeout=5)
+    record = served.core.store.get(made.id)
+    fitness.failed(record, "ended with exit status 1", time.monotonic(), 1_784_894_400.0)
+    (unfit,) = served.operator.get_site("lab").unfit
+    assert (unfit.service, unfit.reason, unfit.failures, unfit.robots) == (
+        "toy",
+        "ended with exit status 1",
+        1,
+        ("walker",),
+    )
+    assert unfit.until.isoformat() == "2026-07-24T12:00:30+00:00"
+    assert served.operator.get_site("lab").state == "ready", "it can start everything else"
+    assert robot.get_site("lab").unfit == ()
+    waiting = robot.create_instance(ASK)
+    while not (reason := robot.get_instance(waiting.id).reason):
+        pass
+    again = "tried again at 12:00:30 UTC"
+    assert reason == f"waiting for a site: lab: cannot start it: the service ended with exit status 1; {again}"
+
+
+def test_a_site_that_is_drained_takes_no_more_and_goes_with_its_last_instance(served: Any) -> None:
+    served.site("lab")
+    operator, robot = served.operator, served.robot()
+    runs = robot.wait_running(robot.create_instance(ASK).id, timeout=5)
+    assert operator.delete_site("lab", drain=True) is False
+    assert operator.get_site("lab").draining
+    status, text = refused(robot.create_instance, ASK)
+    assert (status, text) == (409, "no site can run 'toy': lab: is being deleted, and takes no more instances")
+    served.site("other")
+    placement = robot.wait_running(robot.create_instance(ASK).id, timeout=5).placement
+    assert placement is not None
+    assert (placement.site, placement.refused[0].reason) == ("other", "draining")
+    assert refused(operator.migrate_instance, robot.instances()[0].id, "lab")[0] == 409
+    assert robot.get_instance(runs.id).state is State.RUNNING
+    robot.delete_instance(runs.id)
+    until_gone(operator, "lab")
+    assert operator.delete_site("other", drain=True) is False
+
+
+def test_what_holds_nothing_is_gone_at_once_and_a_standby_keeps_no_site(served: Any, manifest: Any) -> None:
+    served.site("lab")
+    operator = served.operator
+    assert operator.delete_site("lab", drain=True) is True
+    assert refused(operator.delete_site, "lab")[0] == 404
+    served.site("warm")
+    operator.put_service("toy", manifest(needs={"standby": 1}))
+    while not any(instance.placement for instance in operator.instances()):
+        time.sleep(0.02)
+    assert operator.delete_site("warm", drain=True) is False
+    until_gone(operator, "warm")
+
+
+def until_gone(operator: Any, site: str) -> None:
+    end = time.monotonic() + 10
+    while site in [one.name for one in operator.sites()]:
+        assert time.monotonic() < end
+        time.sleep(0.05)

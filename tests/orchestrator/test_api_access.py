@@ -152,3 +152,13 @@ def test_odd_authorization_headers_are_nobody(people: People, header: str) -> No
     answer = people.http.get(people.served.url + API + "/sites", headers=headers)  # type: ignore[arg-type]
     assert answer.status_code == 401
     assert "token" in answer.json()["detail"]
+
+
+def test_a_token_that_was_revoked_a_moment_ago_renews_nothing(shared: Any, people: People) -> None:
+    """Its body may be read still, as of somebody who was known; what it says is not done."""
+    token = shared.operator.create_robot(RobotCreate(name="leaver")).token
+    path, headers = f"{people.served.url}{API}/instances/{people.running}/renew", {"Authorization": f"Bearer {token}"}
+    assert people.http.post(path, json={}, headers=headers).status_code == 404  # another's: who asks is known
+    shared.operator.delete_robot("leaver")
+    answers = [people.http.post(path, json={}, headers=headers) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [401, 401]

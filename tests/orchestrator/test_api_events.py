@@ -5,6 +5,8 @@ import time
 from typing import Any
 
 import httpx
+import pytest
+from sqlalchemy.exc import OperationalError
 
 from skytether.api.rest import InstanceCreate, State
 
@@ -88,3 +90,31 @@ def test_watchers_are_let_go_when_the_orchestrator_ends(served: Any) -> None:
         assert next(lines)
         served.core.broker.close()
         list(lines)  # ends, and with it the test
+
+
+def test_a_stream_goes_on_when_the_database_did_not_answer_for_a_moment(
+    served: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    served.site()
+    operator, store = served.operator, served.core.store
+    made = operator.create_instance(ASK)
+    operator.wait_running(made.id, timeout=5)
+    events, failed = store.events, threading.Event()
+
+    def gone_once(*asked: Any) -> Any:
+        if not failed.is_set():
+            failed.set()
+            raise OperationalError("SELECT", {}, Exception("gone"))
+        return events(*asked)
+
+    url = f"{served.url}/api/v1/instances/{made.id}/events"
+    headers = {"Authorization": f"Bearer {served.token}"}
+    with httpx.stream("GET", url, headers=headers, trust_env=False, timeout=10) as answer:
+        lines = answer.iter_lines()
+        assert next(lines)
+        monkeypatch.setattr(store, "events", gone_once)
+        operator.delete_instance(made.id)
+        told = list(lines)
+    assert failed.is_set()
+    assert '"state":"stopped"' in [line for line in told if line.startswith("data:")][-1]
+    assert "Traceback" not in caplog.text

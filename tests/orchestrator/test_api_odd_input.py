@@ -11,7 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from skytether.api.client import ApiError
-from skytether.api.rest import Measurement, RobotCreate
+from skytether.api.rest import MOST_COUNTED, MOST_TOPICS, Measurement, Renew, Report, RobotCreate, TopicReport
+from skytether.orchestrator.settings import Limits
 
 ASK = '{"robot": "walker", "service": "toy", "params": {"mass": %s}}'
 
@@ -119,3 +120,40 @@ def test_so_it_is_whoever_asks(served: Any, path: str) -> None:
             answer = b"".join(iter(lambda: raw.recv(65_536), b""))
         assert answer.split()[1] in (b"404", b"405"), answer
     assert [robot.name for robot in served.operator.robots()] == ["walker"]
+
+
+@pytest.mark.parametrize(
+    ("report", "sentence"),
+    [
+        ({"topics": [{}] * 60_000}, "report.topics.0.topic: is missing; "),
+        ({f"k{n}": 1 for n in range(15_000)}, "has more than 4096 keys"),
+        ({f"k{n}": 1 for n in range(4_000)}, "report.k0: unknown key; "),
+        ({"topics": [{f"k{n}": 1 for n in range(20)}] * 1000}, "report.topics.0.topic: is missing; "),
+    ],
+)
+def test_what_has_thousands_of_faults_costs_no_more_than_what_has_ten(
+    http: httpx.Client, report: Any, sentence: str
+) -> None:
+    """To find and tell them all took a second, in which nobody was answered."""
+    answer = http.post("/instances/i1/renew", json={"report": report})
+    told = answer.json()
+    assert answer.status_code == 422
+    assert told["detail"].startswith(sentence.removesuffix("; ")), told["detail"][:200]
+    assert len(told["errors"]) <= 10
+    assert len(answer.content) < 10_000
+
+
+def test_a_robot_of_a_thousand_topics_renews(http: httpx.Client) -> None:
+    delays = dict.fromkeys(("delay_p50_s", "delay_p99_s", "jitter_s"), 1 / 7_000)
+    counters = dict.fromkeys(("sent", "delivered", "lost", "expired"), MOST_COUNTED >> 20)
+    row = TopicReport(topic="x" * 32, direction="out", priority=100, bytes_sent=MOST_COUNTED, **delays, **counters)
+    body = Renew(report=Report(topics=(row,) * MOST_TOPICS)).model_dump(mode="json")
+    answer = http.post("/instances/i1/renew", json=body)
+    assert (answer.status_code, answer.json()["title"]) == (404, "Not found")  # of the instance
+    assert len(answer.request.content) < Limits().robot_body_bytes
+
+
+def test_a_report_is_read_up_to_its_first_fault() -> None:
+    with pytest.raises(ValidationError) as caught:
+        Report.model_validate({"topics": [{}] * 1000})
+    assert caught.value.error_count() == 3  # keys that the first topic lacks

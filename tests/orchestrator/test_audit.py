@@ -46,7 +46,9 @@ def test_lines_vouch_for_one_another_over_restarts_and_full_files(tmp_path: Path
     assert verify(path).first > 1
 
 
-@pytest.mark.parametrize("attack", ["changed", "away", "put in", "swapped", "no json", "file away"])
+@pytest.mark.parametrize(
+    "attack", ["changed", "away", "put in", "swapped", "twice", "spaced", "deep", "no json", "file away"]
+)
 def test_what_was_done_to_the_file_is_found(tmp_path: Path, attack: str) -> None:
     path = tmp_path / "audit"
     written(path, range(40), full=3000)
@@ -60,6 +62,12 @@ def test_what_was_done_to_the_file_is_found(tmp_path: Path, attack: str) -> None
         lines.insert(1, lines[1])
     elif attack == "swapped":
         lines[1:3] = reversed(lines[1:3])
+    elif attack == "twice":  # JSON takes the last
+        lines[1] = '{"who": "somebody", ' + lines[1][1:]
+    elif attack == "spaced":
+        lines[1] = lines[1].replace(": ", ":  ")
+    elif attack == "deep":
+        lines[1] = '{"a": ' * 50_000
     elif attack == "no json":
         lines[1] = "{}"
     else:
@@ -217,6 +225,15 @@ def test_the_same_lines_go_to_syslog_and_journald(tmp_path: Path) -> None:
         assert b"SKYTETHER_WHO" not in said  # a line break would begin a field of the caller's making
         message = said.splitlines()[-1]
         assert json.loads(message.removeprefix(b"MESSAGE="))["who"] == "robot:r\n1"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to give a socket away")
+def test_the_audit_goes_to_no_other_users_socket(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listens:
+        listens.bind(str(tmp_path / "s"))
+        os.chown(tmp_path / "s", 54_321, 54_321)
+        with pytest.raises(PermissionError, match="may not have the audit: it is the user 54321"):
+            Sink(str(tmp_path / "s"))
 
 
 def test_a_log_of_the_system_that_takes_nothing_holds_nobody_up(

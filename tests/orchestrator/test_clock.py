@@ -49,6 +49,8 @@ def test_leases_count_anew_and_who_vanishes_then_still_frees_what_he_held(
     b.clock.set_by(by)
     b.step(2)
     assert (b.record().state, b.record("waits").state) == (State.RUNNING, State.PENDING)
+    b.clock.forward(2)  # by now every orchestrator knows
+    b.step()
     b.clock.forward(14)
     b.step(2)
     assert (b.record().state, b.record("waits").state) == (State.RUNNING, State.PENDING)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skytether.orchestrator.config import example, leaves, load, page
+from skytether.orchestrator.config import example, leaves, load, page, seen_by_others
 from skytether.orchestrator.errors import InvalidError
 from skytether.orchestrator.settings import Settings
 
@@ -70,3 +70,22 @@ def test_a_file_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
 
 def test_a_password_in_the_database_address_is_not_shown() -> None:
     assert "hunter2" not in repr(load(None, {"SKYTETHER_DATABASE_URL": "postgresql://a:hunter2@b/c"}, {}))
+
+
+def test_a_password_that_others_can_read_is_told(tmp_path: Path) -> None:
+    secret = "postgresql://me:hidden@host/name"
+    told = seen_by_others(None, {"database_url": secret})
+    assert "among the arguments: write it into a file with mode 0600 (?passfile=FILE" in told
+    assert seen_by_others(None, {"database_url": "postgresql://me@host/name?password=hidden"})
+    assert not seen_by_others(None, {"database_url": "postgresql://me@host/name?passfile=/x"})
+    assert not seen_by_others(None, {"database_url": None})
+    assert not seen_by_others(None, {"database_url": "postgresql://[me@host"})
+    file = tmp_path / "orchestrator.yaml"
+    file.write_text(f"database_url: {secret}\n")
+    file.chmod(0o644)
+    assert f"in {file}: chmod 600 it" in seen_by_others(file, {})
+    file.chmod(0o640)
+    assert not seen_by_others(file, {})
+    file.write_text("port: 1\n")
+    file.chmod(0o644)
+    assert "hidden" not in told + seen_by_others(file, {})

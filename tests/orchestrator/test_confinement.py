@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import contextlib
 import os
 import secrets
 import socket
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,13 +17,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from skytether.api.grant import Grant
-from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes import confinement, process, users
+from skytether.api.manifest import Limits, ServiceSpec
+from skytether.orchestrator.runtimes import confine, confinement, process, users
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.confinement import Machine, covers, opened, readable, this_machine
+from skytether.orchestrator.runtimes.notes import noted_port
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 
 INTRUDER = """
@@ -36,6 +41,7 @@ tries = {
     "other's data": lambda: open(f"{state}/data/robot/toy/other/kept").read(),
     "shadow": lambda: open("/etc/shadow").read(),
     "environment": lambda: open(f"/proc/{parent}/environ").read(),
+    "arguments": lambda: open(f"/proc/{parent}/cmdline").read(),
     "memory": lambda: open(f"/proc/{parent}/mem", "rb"),
     "its root": lambda: os.listdir(f"/proc/{parent}/root/{state}"),
     "signal": lambda: os.kill(parent, 0),
@@ -116,7 +122,8 @@ def test_an_instance_reaches_its_own_folders_and_nothing_of_the_orchestrator(
         pytest.skip(f"no users of their own: {machine.why or 'not root'}")
     machine = replace(machine, user=own_user, landlock=min(machine.landlock, newest))
     monkeypatch.setattr(process, "this_machine", lambda: machine)
-    allowed = ["signal", *ALLOWED] if not own_user and machine.landlock < 6 else ALLOWED
+    shared = [] if own_user else ["arguments", *(["signal"] if machine.landlock < 6 else [])]
+    allowed = [*shared, *ALLOWED]
     runtime = ProcessRuntime("lab", state, ProcessOptions(python_path=(str(state.parent / "code"),)))
     assert runtime.isolation()[-2:] == (f"Landlock {machine.landlock}", "seccomp")
     runtime.start(launch(entrypoint="intruder", say=str(state), parent=os.getpid()))
@@ -194,6 +201,35 @@ def test_who_leaves_its_session_and_forks_all_the_time_ends(tmp_path: Path) -> N
     last = beat.read_bytes()
     time.sleep(0.2)
     assert beat.read_bytes() == last
+
+
+CROWD = """
+import os, time
+try:
+    while os.fork():
+        pass
+    time.sleep(60)
+except BlockingIOError:
+    print("no more")
+"""
+
+
+@pytest.mark.slow
+def test_no_instance_has_more_processes_than_its_manifest_says(tmp_path: Path) -> None:
+    if not this_machine().user:
+        pytest.skip("no users of their own")
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code/crowd.py").write_text(CROWD)
+    runtime = ProcessRuntime("lab", tmp_path / "state", ProcessOptions(python_path=(str(tmp_path / "code"),)))
+    asked = launch(entrypoint="crowd")
+    runtime.start(replace(asked, spec=ServiceSpec(entrypoint="crowd", limits=Limits(pids=20))))
+    seen = until(runtime, Phase.EXITED)
+    assert runtime.logs("i1", 9) == "no more\n"
+    assert seen.exit_status == 0
+    user = (tmp_path / "state/data/walker/toy/i1").stat().st_uid
+    left = [one for one in psutil.process_iter(["uids"]) if one.info["uids"].real == user]
+    runtime.remove("i1")
+    assert 0 < len(left) <= 20
 
 
 @pytest.mark.slow
@@ -329,12 +365,34 @@ def test_what_a_machine_lacks_is_said() -> None:
     )
     assert "can empty the orchestrator's files, change" in Machine(2, seccomp=False, user=False).lacks()
     assert Machine(2, seccomp=False, user=True).holds() == ("own user", "own mounts", "Landlock 2")
+    assert Machine(0, seccomp=False, user=True, hidden=True).holds() == ("own user", "own mounts", "own processes")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to make mounts")
+def test_a_kernel_that_does_not_hide_processes_is_not_said_to() -> None:
+    """Before Linux 5.8 the option is taken, and does nothing."""
+    code = "import os, runpy, sys\nconfine = runpy.run_path(sys.argv[1])\nmount = confine['_mount']\n"
+    code += (
+        "if sys.argv[2] == 'old':\n    confine['own_mounts'].__globals__['_mount'] = lambda *given: mount(*given[:4])\n"
+    )
+    code += "print(confine['probe']())"
+
+    def probed(kernel: str) -> Any:
+        command = [sys.executable, "-I", "-S", "-c", code, confine.__file__, kernel]
+        return ast.literal_eval(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    new = probed("new")
+    if not new["hidden"]:
+        pytest.skip("this machine hides no processes")
+    assert new["user"]
+    old = probed("old")
+    assert (old["user"], old["hidden"]) == (True, False)
 
 
 def test_a_link_or_a_pipe_for_a_ready_file_is_none_and_holds_nobody_up(tmp_path: Path) -> None:
     (tmp_path / "real").write_text('{"port": 4000}')
     (tmp_path / "link").symlink_to(tmp_path / "real")
     os.mkfifo(tmp_path / "pipe")
-    assert process._port(tmp_path / "real") == 4000
-    assert process._port(tmp_path / "link") is None
-    assert process._port(tmp_path / "pipe") is None
+    assert noted_port(tmp_path / "real") == 4000
+    assert noted_port(tmp_path / "link") is None
+    assert noted_port(tmp_path / "pipe") is None

@@ -2,65 +2,28 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import platform
 import socket
 import ssl
 import subprocess
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from docker_runs import KEY, PYTHON, docker, inside, launch, until, until_phase
 from docker_site import DockerSite
 from engine_ways import EngineProxy, Registry, ssh_server
 
-from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.lab.bench.transports.certificate import write_certificate
-from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
-
-KEY = base64.b64encode(bytes(range(32))).decode()
-PATIENCE = 30.0
-PYTHON = "/app/bin/python"
-
-
-def launch(site: DockerSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
-    params, image = more.pop("params", {}), more.pop("image", site.images.toy)
-    grant = Grant(
-        instance=instance,
-        service="toy",
-        robot="walker",
-        params=params,
-        session_id="00112233445566aa",
-        session_key=KEY,
-        topics=(),
-    )
-    return Launch(attempt, ServiceSpec.model_validate({"image": image, **more}), grant)
-
-
-def until(what: Callable[[], Any]) -> Any:
-    """Wait for a condition; gives what it gave."""
-    deadline = time.monotonic() + PATIENCE
-    while not (found := what()):
-        assert time.monotonic() < deadline, "it did not come to pass"
-        time.sleep(0.02)
-    return found
-
-
-def until_phase(runtime: DockerRuntime, phase: Phase, instance: str = "i1") -> Observation:
-    def there() -> Observation | None:
-        seen = runtime.observe().get(instance)
-        return seen if seen is not None and seen.phase is phase else None
-
-    return until(there)
 
 
 def until_gone(runtime: DockerRuntime) -> str:
@@ -74,17 +37,6 @@ def until_gone(runtime: DockerRuntime) -> str:
         return ""
 
     return until(failure)
-
-
-def docker(*arguments: str, check: bool = True) -> str:
-    done = subprocess.run(["docker", *arguments], capture_output=True, text=True)
-    assert not check or done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
-def inside(container: str, program: str) -> Any:
-    """What a Python program in the container prints, as JSON."""
-    return json.loads(docker("exec", container, PYTHON, "-c", program))
 
 
 @pytest.fixture
@@ -311,6 +263,9 @@ def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room
         inside(container, "import os; os.remove('/run/skytether/data/i1/much'); print(1)")
         runtime._scales.weigh()
         assert runtime.observe()["i1"].exceeds == ""
+        inside(container, "open('/run/skytether/instance/much', 'wb').write(bytes(65 << 20)); print(1)")
+        runtime._scales.weigh()
+        assert runtime.observe()["i1"].exceeds == "has more than 64 MiB in a volume that is not for data"
         runtime.remove("i1")
 
 
@@ -407,21 +362,39 @@ def test_a_port_that_is_taken(docker_site: DockerSite, tmp_path: Path) -> None:
             assert docker_site.containers() == []
 
 
-def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
-    image = docker_site.images.name("ill")
-    often = "--interval=200ms --start-period=1ms --retries=2"
-    check = f'HEALTHCHECK {often} CMD ["/bin/sh", "-c", "echo its arm is stuck; exit 1"]'
-    (tmp_path / "Dockerfile").write_text(f"FROM {docker_site.images.toy}\n{check}\n")
+@contextmanager
+def checked(site: DockerSite, folder: Path, check: str) -> Iterator[str]:
+    """An image of the toy with another health check, which is asked often."""
+    image = site.images.name("checked")
+    often = "--interval=200ms --timeout=500ms --start-period=1ms --retries=2"
+    (folder / "Dockerfile").write_text(f"FROM {site.images.toy}\nHEALTHCHECK {often} CMD {check}\n")
     environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
     subprocess.run(
-        ["docker", "build", "-q", "-t", image, str(tmp_path)], check=True, env=environment, capture_output=True
+        ["docker", "build", "-q", "-t", image, str(folder)], check=True, env=environment, capture_output=True
     )
     try:
+        yield image
+    finally:
+        docker("image", "rm", "-f", image)
+
+
+def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
+    with checked(docker_site, tmp_path, '["/bin/sh", "-c", "echo its arm is stuck; exit 1"]') as image:
         runtime.start(launch(docker_site, image=image))
         until(lambda: (seen := runtime.observe()["i1"]).phase is Phase.RUNNING and seen.detail == "its arm is stuck")
-    finally:
         runtime.remove("i1")
-        docker("image", "rm", "-f", image)
+
+
+def test_who_is_asked_too_slowly_is_not_ill(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
+    """As on a machine that is so busy that no check of a health ends in time."""
+    with checked(docker_site, tmp_path, '["sleep", "600"]') as image:
+        runtime.start(launch(docker_site, image=image))
+        until_phase(runtime, Phase.RUNNING)
+        (container,) = docker_site.containers()
+        until(lambda: docker("inspect", "-f", "{{.State.Health.Status}}", container) == "unhealthy")
+        runtime._follower.look(container)
+        assert runtime.observe()["i1"].detail == ""
+        runtime.remove("i1")
 
 
 def test_a_network_that_was_pruned_is_made_again_and_goes_with_its_site(

@@ -14,6 +14,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker import launch as docker_launch
+from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.objects import Seen
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
@@ -60,7 +61,7 @@ class House:
         launch = Launch(1, ServiceSpec.model_validate({"image": "toy", "needs": needs}), grant)
         options = DockerOptions.model_validate({"ports": (7600, 7602), "gpu": 2} | given)
         fake: Any = anything
-        return Begun(launch, fake, options, "me", fake, lambda **_: None, None)
+        return Begun(launch, fake, options, "me", fake, lambda **_: None, fake, Fence(fake, "me"), None)
 
 
 @pytest.fixture

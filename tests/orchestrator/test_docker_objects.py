@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
 import io
 import json
-import sys
+import os
+import socket
 import tarfile
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from typing import Any
 import pytest
 import yaml
 from docker.errors import ImageNotFound
+from image_builder import build_script
+from nothing_lost import litter
 from pydantic import ValidationError
 
 from skytether.api.grant import Grant
@@ -24,12 +27,14 @@ from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
-from skytether.orchestrator.runtimes.docker.engine import Tunnel, root_cause
+from skytether.orchestrator.runtimes.docker.engine import Engine, EngineGoneError, Tunnel, root_cause
+from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.images import Progress, check_credentials, ensure_image
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
+    Namespace,
     Seen,
     advised,
     container,
@@ -37,9 +42,12 @@ from skytether.orchestrator.runtimes.docker.objects import (
     free_gpus,
     free_port,
     grant_archive,
+    guard,
+    holder,
     last_line,
     observation,
     parse,
+    parse_helper,
     refusal,
 )
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
@@ -233,7 +241,11 @@ def test_where_robots_find_instances(given: dict[str, str], bound: str, advertis
         ({"engine": "unix://"}, "engine must be"),
         ({"engine": "ssh://"}, "engine must be"),
         ({"engine": "ssh://edge:port"}, "engine: "),
-        ({"engine": "ssh://-oProxyCommand=x"}, "may begin with '-'"),
+        ({"engine": "ssh://-oProxyCommand"}, "do not begin with '-'"),
+        ({"engine": "ssh://-l@edge"}, "do not begin with '-'"),
+        ({"engine": "ssh://edge;touch"}, "user and host have letters, digits"),
+        ({"engine": "ssh://`id`@edge"}, "user and host have letters, digits"),
+        ({"engine": "ssh://edge%h"}, "user and host have letters, digits"),
         ({"engine": "ssh://me:secret@edge"}, "no password"),
         ({"engine": "tcp://edge"}, "engine must be"),
         ({"engine": "tcp://edge:2375"}, "without it anyone is let in"),
@@ -303,6 +315,40 @@ def test_a_container_is_known_by_its_labels() -> None:
     assert parse(foreign) is None
 
 
+def test_who_joins_a_network_says_nothing_of_it_and_is_found_where_that_is_published() -> None:
+    made = body(namespace=Namespace("h1", "holder", 40_124))
+    assert made["HostConfig"]["NetworkMode"] == "container:h1"
+    assert "ExposedPorts" not in made, "the engine refuses it"
+    assert not made["HostConfig"].keys() & {"PortBindings", "Dns", "ExtraHosts"}
+    joined = described()
+    joined["Config"]["Labels"] = made["Labels"]
+    joined["NetworkSettings"] = {"Ports": {}}
+    seen = parse(joined)
+    assert seen is not None
+    assert (seen.namespace, seen.host_port) == ("h1", 40_124)
+    seen = replace(seen, ready=True)
+    assert observation(seen, options()).detail == ""
+    assert observation(seen, options(), cut_off=True).detail == "the container that held its network has ended"
+
+
+def test_who_holds_a_network_has_no_right_and_a_guard_one_in_one_network() -> None:
+    holds, guards = holder(options(), "me", "sha256:1"), guard(options(), "me", "sha256:1", "c1", "list ruleset")
+    assert holds["User"] == "65532:65532"
+    assert guards["HostConfig"]["CapAdd"] == ["NET_ADMIN"]
+    assert guards["HostConfig"]["NetworkMode"] == "container:c1"
+    for host in (holds["HostConfig"], guards["HostConfig"]):
+        assert (host["CapDrop"], host["ReadonlyRootfs"], host["IpcMode"]) == (["ALL"], True, "none")
+        assert host["SecurityOpt"] == options().security
+        assert not host.keys() & {"Privileged", "Binds", "Mounts", "PidMode"}
+    assert "CapAdd" not in holds["HostConfig"]
+    for made, target in ((holds, ""), (guards, "c1")):
+        found = parse_helper({**described(), "Name": "/x", "Config": {"Labels": made["Labels"]}})
+        assert found is not None
+        assert (found.name, found.runs, found.target) == ("x", True, target)
+        assert parse({**described(), "Config": {"Labels": made["Labels"]}}) is None
+    assert parse_helper({**described(), "Name": "/x"}) is None
+
+
 @pytest.mark.parametrize(
     ("state", "status", "detail"),
     [
@@ -327,6 +373,12 @@ def test_a_failed_health_check_is_told_in_its_own_words() -> None:
     seen = parse(described(Health={"Status": "unhealthy", "Log": log}))
     assert seen is not None
     assert seen.ill == "the service's loop has hung for 12 s"
+    silent = parse(described(Health={"Status": "unhealthy", "Log": [{"ExitCode": 1, "Output": " \n"}]}))
+    assert silent is not None
+    assert silent.ill == "its health check fails"
+    late = parse(described(Health={"Status": "unhealthy", "Log": [*log, {"ExitCode": -1, "Output": "exceeded (3s)"}]}))
+    assert late is not None
+    assert late.ill == "", "nobody who runs is started again because the machine is busy"
     for status in ("starting", "healthy"):
         well = parse(described(Health={"Status": status, "Log": log}))
         assert well is not None
@@ -436,13 +488,26 @@ def test_names_are_known_within() -> None:
 
 def test_the_ssh_client_asks_nobody() -> None:
     given = options(engine="ssh://me@edge:2222/run/docker.sock", ssh={"identity": "/keys/id", "known_hosts": "/k"})
-    command = Tunnel(given).command(Path("/tmp/x/engine.sock"))
+    command = Tunnel(given).command(Path("/tmp/x/engine.sock"), Path("/tmp/x/said"))
+    assert command[command.index("-E") + 1] == "/tmp/x/said"
     assert command[-4:] == ["-L", "/tmp/x/engine.sock:/run/docker.sock", "me@edge", "cat"]
     assert "BatchMode=yes" in command
     assert {"StrictHostKeyChecking=yes", "VerifyHostKeyDNS=no", "NoHostAuthenticationForLocalhost=no"} <= set(command)
     assert {"UserKnownHostsFile=/k", "GlobalKnownHostsFile=/dev/null"} <= set(command)
     assert command[command.index("-p") + 1] == "2222"
-    assert Tunnel(options(engine="ssh://edge")).command(Path("s"))[-3] == "s:/var/run/docker.sock"
+    assert Tunnel(options(engine="ssh://edge")).command(Path("s"), Path("e"))[-3] == "s:/var/run/docker.sock"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to listen as another user")
+def test_what_another_user_listens_at_is_no_engine(tmp_path: Path) -> None:
+    path = tmp_path / "docker.sock"
+    with socket.socket(socket.AF_UNIX) as listens:
+        listens.bind(str(path))
+        os.seteuid(54_321)
+        listens.listen()
+        os.seteuid(0)
+        with pytest.raises(EngineGoneError, match="may not be the engine: it is the user 54321"):
+            Engine(options(engine=f"unix://{path}")).api()
 
 
 def test_an_error_is_told_by_its_root() -> None:
@@ -469,19 +534,6 @@ mypy==2.4 \\
 """
 
 
-def build_script() -> Any:
-    found = importlib.util.spec_from_file_location("images_build", ROOT / "images" / "build.py")
-    assert found is not None
-    assert found.loader is not None
-    build = importlib.util.module_from_spec(found)
-    sys.modules["images_build"] = build  # dataclasses look their module up
-    try:
-        found.loader.exec_module(build)
-    finally:
-        del sys.modules["images_build"]
-    return build
-
-
 def test_what_is_in_an_image_is_listed_the_same_each_time() -> None:
     rows = ["pypi\tPyYAML\t6.0.3", "deb\tg++\t4:12.2.0-3~x\tamd64", "deb\tg++\t4:12.2.0-3~x\tamd64", ""]
     made = build_script().bill("skytether/x:1", "sha256:ab", "\n".join(rows))
@@ -491,6 +543,57 @@ def test_what_is_in_an_image_is_listed_the_same_each_time() -> None:
         "pkg:deb/debian/g%2B%2B@4%3A12.2.0-3~x?arch=amd64",
         "pkg:pypi/pyyaml@6.0.3",
     ]
+
+
+def test_the_list_of_an_image_is_a_file_beside_those_of_the_others(tmp_path: Path) -> None:
+    ran: list[Any] = []
+
+    class Client:
+        """An engine that runs one program."""
+
+        containers = property(lambda self: self)
+        api = property(lambda self: self)
+
+        def run(self, image: str, command: list[str], **how: Any) -> bytes:
+            ran.append((image, command[0], how))
+            return b"pypi\tPyYAML\t6.0.3\n"
+
+        def inspect_image(self, image: str) -> dict[str, str]:
+            return {"Id": f"sha256:{image}"}
+
+    for image in ("registry.example:5000/skytether/recorder:1", "skytether/base:1"):
+        build_script().write_bill(Client(), image, tmp_path / "sbom")
+    names = ["registry.example_5000_skytether_recorder_1.cdx.json", "skytether_base_1.cdx.json"]
+    assert sorted(path.name for path in (tmp_path / "sbom").iterdir()) == names
+    made = json.loads((tmp_path / "sbom" / names[1]).read_text())
+    assert made["metadata"]["component"]["version"] == "sha256:skytether/base:1"
+    assert [row["name"] for row in made["components"]] == ["PyYAML"]
+    how = {"entrypoint": "/bin/sh", "remove": True, "network_disabled": True}
+    assert ran[0] == ("registry.example:5000/skytether/recorder:1", "-c", how)
+
+
+def test_a_tag_says_what_an_image_is_made_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    build = build_script()
+    for name, text in (("base", "ARG DEBIAN"), ("trail", "ARG BASE"), ("guard", "ARG DEBIAN")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "Dockerfile").write_text(text)
+    monkeypatch.setattr(build, "IMAGES", tmp_path)
+    monkeypatch.setattr(build, "EXTRAS", {})
+    monkeypatch.setattr(build, "WORK", tmp_path)
+    (tmp_path / "wheels" / "project").mkdir(parents=True)
+
+    def made() -> list[str]:
+        return [build.source_tag(name, "sha256:ab") for name in ("base", "trail", "guard")]
+
+    before = made()
+    assert made() == before
+    assert len(set(before)) == 3
+    assert build.source_tag("trail", "sha256:cd") != before[1], "what it is built on is built on another Debian"
+    (tmp_path / "wheels" / "project" / "skytether.whl").write_bytes(b"other code")
+    base, trail, guard = made()
+    assert base != before[0]
+    assert trail != before[1]
+    assert guard == before[2]
 
 
 def test_an_image_gets_what_the_lock_file_pins_for_it() -> None:
@@ -524,6 +627,7 @@ def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
 
     monkeypatch.setattr(docker_runtime, "ensure_network", cannot)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        monkeypatch.setattr(runtime._follower, "info", lambda _: {})
         runtime._prepare_early()
         runtime._prepare_early()
         assert runtime.blocked() == "no guard"
@@ -533,10 +637,106 @@ def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
     assert caplog.text.count("site edge: nothing can be started: no guard") == 1, "said once"
 
 
+def test_guards_that_earlier_releases_left_are_found_though_they_name_no_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class FakeApi:
+        def prune_containers(self, filters: dict[str, Any]) -> None:
+            pruned.append(filters)
+
+    pruned: list[dict[str, Any]] = []
+    with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        monkeypatch.setattr(runtime, "_prepare", lambda: None)
+        monkeypatch.setattr(runtime._engine, "api", FakeApi)
+        runtime._prepare_early()
+    assert pruned == [{"label": ["skytether.io/guard"], "until": "60s"}], "and none that is at work"
+
+
+def test_one_guard_left_behind_is_litter_where_no_network_is_ready() -> None:
+    """Of what the tests of faults look at."""
+
+    class FakeSite:
+        network, owner = "net", "me"
+
+        def __init__(self, **labels: list[str]) -> None:
+            self.by_label = {"skytether.io/helper=": labels["holders"], "skytether.io/helper": labels["helpers"]}
+            self.by_label["skytether.io/namespace"] = labels["used"]
+
+        def labelled(self, label: str, *_: str) -> list[str]:
+            return self.by_label[label]
+
+        def helpers(self) -> list[str]:
+            return self.labelled("skytether.io/helper")
+
+        def volumes(self) -> list[str]:
+            return []
+
+        def volumes_with(self, *_: str) -> list[str]:
+            return []
+
+        def docker(self, *_: str) -> str:
+            return ""
+
+    def left(**labels: list[str]) -> list[str]:
+        site: Any = FakeSite(**labels)
+        return litter(site)()
+
+    assert left(holders=[], helpers=["guard"], used=[]) == ["guard"]
+    assert left(holders=["a"], helpers=["a"], used=[]) == left(holders=["a", "b"], helpers=["a", "b"], used=["i"]) == []
+    assert left(holders=["a", "b"], helpers=["a", "b"], used=[]) == ["a", "b"]
+
+
+def test_what_a_start_has_given_up_is_no_run_and_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An engine that is slow started it, and will end it: both without an answer in time."""
+    nothing: Any = None
+    begun = Seen("c1", "i1", 3, "running", host_port=40_123, ready=True)
+    with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        monkeypatch.setattr(runtime._follower, "seen", lambda _: [begun])
+        monkeypatch.setattr(runtime._follower, "of", lambda _: [begun])
+        job = runtime._jobs["i1"] = Job(
+            launch(), nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None
+        )
+        job.unanswered = True
+        runtime.start(launch())
+        assert runtime._jobs["i1"] is job, "it runs, whoever said so"
+        assert runtime.observe()["i1"].phase is Phase.RUNNING
+        job.given_up.add("c1")
+        assert runtime.observe() == {}
+        runtime.start(launch())
+        again = runtime._jobs["i1"]
+        assert again is not job
+        assert "c1" in again.given_up
+
+
+def test_what_a_start_has_given_up_is_removed_though_nobody_asks_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its instance may have ended before it was begun anew."""
+    nothing: Any = None
+    there = [Seen("c1", "i1", 3, "running"), Seen("c2", "i2", 1, "running"), Seen("c3", "i3", 1, "exited")]
+    removed: list[str] = []
+    monkeypatch.setattr(
+        "skytether.orchestrator.runtimes.docker.runtime.remove", lambda *given: removed.append(given[-1])
+    )
+    with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
+        monkeypatch.setattr(runtime._follower, "seen", lambda _: there)
+        job = runtime._jobs["i1"] = Job(
+            launch(), nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None
+        )
+        job.unanswered = True
+        job.given_up.add("c1")
+        monkeypatch.setattr(Job, "ended", property(lambda _: False))
+        runtime._remove_unbegun()
+        assert removed == [], "who is at it does it"
+        monkeypatch.setattr(Job, "ended", property(lambda _: True))
+        runtime._remove_unbegun()
+        assert removed == ["c1"]
+
+
 def test_who_sees_that_a_start_failed_sees_that_nothing_is_left_of_it() -> None:
     class Failing(Job):
-        def _clear(self) -> None:
-            """Nothing is there."""
+        def _clear(self) -> bool:
+            return False
 
         def _launch(self) -> None:
             raise RuntimeFailure("no space left")
@@ -547,6 +747,31 @@ def test_who_sees_that_a_start_failed_sees_that_nothing_is_left_of_it() -> None:
             super().__setattr__(name, value)
 
     nothing: Any = None
-    job = Failing(nothing, nothing, nothing, "", nothing, nothing, None)
+    job = Failing(nothing, nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None)
     job._run()
     assert "no space left" in job.failure
+
+
+@pytest.mark.parametrize(
+    ("told", "without", "blocked"),
+    [
+        (
+            {"MemoryLimit": False, "CpuCfsQuota": True, "PidsLimit": False},
+            False,
+            "no limit of memory and processes, so",
+        ),
+        ({"MemoryLimit": False, "CpuCfsQuota": True, "PidsLimit": False}, True, ""),
+        ({"MemoryLimit": True, "Rootless": True, "CgroupVersion": "1"}, False, "no limit of memory and processor time"),
+        ({"MemoryLimit": True, "Rootless": True, "CgroupVersion": "2"}, False, ""),
+    ],
+)
+def test_an_engine_that_holds_no_limits_starts_nothing_unless_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: dict[str, Any], without: bool, blocked: str
+) -> None:
+    monkeypatch.setattr(docker_runtime, "ensure_network", lambda *_: None)
+    given = options(engine=f"unix://{tmp_path}/none", without_limits=without)
+    with closing(DockerRuntime("edge", tmp_path, given)) as runtime:
+        monkeypatch.setattr(runtime._follower, "info", lambda _: told)
+        runtime._prepare_early()
+        assert blocked in runtime.blocked()
+        assert bool(runtime.blocked()) == bool(blocked)

@@ -148,9 +148,9 @@ def test_what_a_machine_lacks_another_site_has(house: House) -> None:
     events = house.core.store.events(instance, 0)
     assert sum(event.state is State.STARTING and not event.reason for event in events) == 2  # once at each
     house.end(instance)
-    left = f"label=skytether.io/owner={options['owner']}"
+    left = [f"--filter=label={one}" for one in (f"skytether.io/owner={options['owner']}", "skytether.io/instance")]
     deadline = time.monotonic() + PATIENCE
-    while docker("ps", "-aq", "--filter", left):
+    while docker("ps", "-aq", *left):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     house.core.sites.delete("bare")

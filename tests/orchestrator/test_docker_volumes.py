@@ -65,22 +65,34 @@ def test_what_the_engine_says_of_its_volumes() -> None:
     assert sizes({"VolumeUsage": {"Items": DISK["Volumes"]}}) == sizes(DISK), "from version 1.52 on"
 
 
+def test_robots_sums_are_made_when_volumes_are_weighed_and_not_when_they_are_asked_for() -> None:
+    engine = FakeEngine()
+    scales = Scales(engine, "ab", 2)  # type: ignore[arg-type]
+    volumes = {"skytether-ab-data-walker-toy": 1, "skytether-ab-data-walker-recorder": 2, "skytether-cd-data-x-toy": 4}
+    engine.disk = {"Volumes": [{"Name": name, "UsageData": {"Size": size}} for name, size in volumes.items()]}
+    assert scales.by_robot == {}
+    scales.weigh()
+    assert scales.by_robot == {"walker": 3}
+
+
 def test_a_volume_that_holds_too_much_is_named_until_there_is_room() -> None:
     engine = FakeEngine()
-    scales = Scales(engine, 2)  # type: ignore[arg-type]
+    scales = Scales(engine, "ab", 2)  # type: ignore[arg-type]
     assert scales.exceeds("full") == "", "not looked at yet"
     scales.weigh()
     assert scales.exceeds("full").startswith("has more than 2 MiB in the volume full (the site's data_mb)")
     assert not any(map(scales.exceeds, ("good", "elsewhere", "unknown", "")))
-    engine.disk = {"Volumes": []}
+    assert scales.exceeds("good", ["full"]) == "", "64 MiB are, in each that is not for data"
+    engine.disk = {"Volumes": [{"Name": "grant", "UsageData": {"Size": (64 << 20) + 1}}]}
     scales.weigh()
     assert scales.exceeds("full") == ""
+    assert scales.exceeds("good", ["", "grant"]) == "has more than 64 MiB in a volume that is not for data"
 
 
 def test_an_engine_that_takes_its_time_is_asked_once_and_holds_nobody_up() -> None:
     engine, now = FakeEngine(), [0.0]
     engine.hangs = threading.Event()
-    scales = Scales(engine, 2, lambda: now[0])  # type: ignore[arg-type]
+    scales = Scales(engine, "ab", 2, lambda: now[0])  # type: ignore[arg-type]
     for _ in range(5):
         scales.begin()
         now[0] += 100.0
@@ -102,7 +114,7 @@ def test_an_engine_that_takes_its_time_is_asked_once_and_holds_nobody_up() -> No
 def test_an_engine_that_never_weighs_is_told_once_and_when_it_does_again(caplog: pytest.LogCaptureFixture) -> None:
     engine, now = FakeEngine(), [0.0]
     engine.refuses = True
-    scales = Scales(engine, 2, lambda: now[0])  # type: ignore[arg-type]
+    scales = Scales(engine, "ab", 2, lambda: now[0])  # type: ignore[arg-type]
 
     def weigh(times: int) -> None:
         for _ in range(times):

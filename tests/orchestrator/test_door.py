@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import math
+import socket
 from typing import Any
 
-from skytether.orchestrator.door import Book, Guest, _place_of
+import pytest
+from uvicorn import Config
+from uvicorn.server import ServerState
+
+from skytether.orchestrator.door import Book, Door, GuardedProtocol, Guest, _place_of
 from skytether.orchestrator.settings import Limits
+from skytether.orchestrator.strain import Strain
 
 
 def book(most: int = 100, **limits: int) -> Book:
@@ -88,3 +96,63 @@ def test_one_customers_network_is_one_address() -> None:
     assert _place_of("::ffff:192.0.2.7") == "192.0.2.7" == _place_of("192.0.2.7")
     assert _place_of("fe80::1%eth0") == _place_of("fe80::2%eth0")
     assert _place_of("unix") == "unix"
+
+
+async def answers_to(*asked: bytes) -> tuple[bytes, list[str]]:
+    """All that a real connection is sent, until it is closed, and the paths that were served.
+
+    Each part of what is asked is sent, and read, for itself, before there is an answer.
+    """
+    served: list[str] = []
+    sent = asyncio.Event()
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        served.append(scope["path"])
+        await sent.wait()
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"2")]})
+        await send({"type": "http.response.body", "body": b"ok"})
+
+    config = Config(app, http=GuardedProtocol, log_config=None, lifespan="off")
+    config.load()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        door = Door(
+            listener,
+            lambda: GuardedProtocol(config, ServerState(), {}),
+            None,
+            Limits(idle_s=0.5),
+            100,
+            (),
+            Strain(),
+        )
+        try:
+            reader, writer = await asyncio.open_connection(*listener.getsockname())
+            for part in asked:
+                writer.write(part)
+                await asyncio.sleep(0.02)
+            sent.set()
+            answers = b""
+            with contextlib.suppress(OSError):
+                answers = await reader.read()
+            writer.close()
+        finally:
+            door.close()
+            await door.wait_closed()
+    return answers, served
+
+
+def get(path: str) -> bytes:
+    return f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+
+
+@pytest.mark.parametrize("asked", [(get("/a") + get("/b") * 3,), (get("/a"), get("/b"), get("/c"), b"GET /d HT", b"!")])
+def test_a_request_before_the_last_answer_ends_the_connection_after_that_answer(asked: tuple[bytes, ...]) -> None:
+    answers, served = asyncio.run(answers_to(*asked))
+    assert served == ["/a"]
+    assert answers.count(b"HTTP/1.1 200") == 1
+    assert b"connection: close" in answers
+    assert answers.endswith(b"\r\n\r\nok")
+
+
+def test_who_sends_on_and_on_instead_of_waiting_is_cut_off() -> None:
+    answers, served = asyncio.run(answers_to(get("/a"), *(get("/b") * 5000,) * 4))
+    assert (answers, served) == (b"", ["/a"])

@@ -30,10 +30,6 @@ def engine(docker_images: Images, netns: None) -> Iterator[OwnEngine]:
     try:
         engine.start()
         engine.load(docker_images.toy, docker_images.name("guard"))
-        # Its health check is another test's: on a busy machine three in a row may be late, and it is started again.
-        made = engine.docker("create", docker_images.toy)
-        engine.docker("commit", "--change", "HEALTHCHECK NONE", made, docker_images.toy)
-        engine.docker("rm", made)
         yield engine
     finally:
         engine.close()
@@ -43,7 +39,7 @@ def engine(docker_images: Images, netns: None) -> Iterator[OwnEngine]:
 def site(engine: OwnEngine, docker_images: Images) -> Iterator[DockerSite]:
     # An orchestrator that a test before killed may have been closing the network off: the next one to do so removes
     # what it left, but a minute later at the earliest.
-    guards = engine.docker("ps", "-aq", "--filter", "label=skytether.io/guard").split()
+    guards = engine.docker("ps", "-aq", "--filter", "label=skytether.io/helper").split()
     if guards:
         engine.docker("rm", "-f", *guards)
     site = DockerSite(docker_images, engine.address)

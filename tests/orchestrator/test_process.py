@@ -3,6 +3,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import math
 import os
 import signal
 import socket
@@ -61,6 +62,7 @@ def open_runtime(tmp_path: Path) -> Iterator[Open]:
     for runtime in opened:
         for instance in list(runtime.observe()):
             runtime.remove(instance)
+        runtime.close()
 
 
 def until(runtime: ProcessRuntime, phase: Phase, patience: float = 10.0) -> Observation:
@@ -235,9 +237,9 @@ def test_a_strangers_process_with_the_same_pid_is_not_taken_for_ours(open_runtim
     assert second.observe()["i1"].phase is Phase.EXITED
     second.stop("i1", force=True)
     second.remove("i1")
-    assert first.observe()["i1"].phase is not Phase.EXITED  # the process is not touched
-    assert alive(document["process"][0])
+    assert alive(document["process"][0])  # it is not touched
     _put_back(tmp_path, real)
+    assert first.observe()["i1"].phase is not Phase.EXITED
 
 
 def _put_back(folder: Path, note: str) -> None:
@@ -255,6 +257,7 @@ def test_nothing_from_before_a_reboot_is_taken_for_alive(open_runtime: Open, tmp
     assert document["boot"] == BOOT_ID
     note.write_text(json.dumps({**document, "boot": "another"}))
     assert open_runtime().observe()["i1"].phase is Phase.EXITED
+    note.write_text(json.dumps(document))  # or it would be nobody's
 
 
 @pytest.mark.slow
@@ -385,6 +388,18 @@ def test_a_ready_file_with_rubbish_in_it_is_no_ready_file(tmp_path: Path, open_r
     runtime.start(launch(attempt=2, entrypoint="this"))  # it is read once more, for the port to keep
 
 
+def test_a_folder_for_a_ready_file_takes_no_file_descriptor(tmp_path: Path, open_runtime: Open) -> None:
+    runtime = open_runtime()
+    runtime.start(launch(entrypoint="this"))
+    (tmp_path / "instances/i1/own/ready.json").mkdir()
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(10):
+        assert runtime.observe()["i1"].port is None
+    until(runtime, Phase.EXITED)
+    runtime.start(launch(attempt=2, entrypoint="this"))
+    assert len(os.listdir("/proc/self/fd")) <= before
+
+
 def test_of_a_log_no_more_is_told_than_is_kept(tmp_path: Path, open_runtime: Open) -> None:
     runtime = open_runtime(log_bytes=1024)
     runtime.start(launch(entrypoint="this"))
@@ -428,3 +443,29 @@ def test_what_a_robots_services_write_is_bounded_and_nothing_starts_beyond(open_
     (kept / "old.mcap").unlink()
     runtime.start(launch(attempt=2))
     until(runtime, Phase.RUNNING)
+
+
+@pytest.mark.slow
+def test_no_folder_that_a_service_made_keeps_it_from_being_weighed_started_and_removed(
+    open_runtime: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = open_runtime()
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    own = tmp_path / "instances/i1/own"
+    at = os.open(own, os.O_PATH)
+    for _ in range(1_500):  # beyond what has a path, and beyond Python's recursion
+        os.mkdir("deep", dir_fd=at)
+        at = os.open("deep", os.O_PATH, dir_fd=at)
+    runtime.tidy()
+    assert "too deep ones in its own folder" in runtime.observe()["i1"].exceeds
+    runtime.start(launch(attempt=2))
+    until(runtime, Phase.RUNNING)
+    assert not (own / "deep").exists()
+    monkeypatch.setattr("skytether.orchestrator.runtimes.disk.MOST_FILES", 2)
+    runtime._weighed_at = -math.inf
+    (own / "one").touch()
+    runtime.tidy()
+    assert "files or too deep ones in its own folder" in runtime.observe()["i1"].exceeds
+    runtime.remove("i1")
+    assert not own.parent.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from skytether.orchestrator.access import Principal
 from skytether.orchestrator.errors import TooManyError
 from skytether.orchestrator.quotas import Quotas
 from skytether.orchestrator.runtimes.base import Observation, Phase
-from skytether.orchestrator.runtimes.disk import size_of
+from skytether.orchestrator.runtimes.disk import remove_tree, size_of
 from skytether.orchestrator.settings import Quotas as Settings
 from skytether.orchestrator.store import Store
 
@@ -174,6 +175,17 @@ def test_what_wrote_too_much_is_ended_for_good_with_the_reason(served: Any) -> N
     assert last.reason.startswith("the service has written too much")
 
 
+def too_deep(folder: str) -> None:
+    """Folders that have no path: the system takes 4,096 characters; and more than Python calls of one in another."""
+    at = os.open(folder, os.O_PATH)
+    for _ in range(1_500):
+        os.mkdir("d" * 9, dir_fd=at)
+        below = os.open("d" * 9, os.O_PATH, dir_fd=at)
+        os.close(at)
+        at = below
+    os.close(at)
+
+
 def test_how_much_is_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a/b").mkdir(parents=True)
     (tmp_path / "a/b/large").write_bytes(bytes(1 << 20))
@@ -181,5 +193,11 @@ def test_how_much_is_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (1 << 20) <= (size_of(str(tmp_path), 1 << 30) or 0) < (1 << 20) + 100_000
     assert (size_of(str(tmp_path), 1000) or 0) > 1000
     assert size_of(str(tmp_path / "none"), 1) == 0
-    monkeypatch.setattr("skytether.orchestrator.runtimes.disk.MOST_FILES", 2)
+    too_deep(str(tmp_path / "a"))
+    assert size_of(str(tmp_path), 1 << 30) is None
+    remove_tree(str(tmp_path / "a"))
+    assert not (tmp_path / "a").exists()
+    assert size_of(str(tmp_path), 1 << 30) == 0
+    (tmp_path / "a/b").mkdir(parents=True)
+    monkeypatch.setattr("skytether.orchestrator.runtimes.disk.MOST_FILES", 1)
     assert size_of(str(tmp_path), 1 << 30) is None

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 from typing import Any
+
+import pytest
 
 from skytether.orchestrator.access import Principal
 from skytether.orchestrator.errors import UnauthenticatedError
-from skytether.orchestrator.reception import Reception
+from skytether.orchestrator.pause import Pause
+from skytether.orchestrator.problems import GivenUp
+from skytether.orchestrator.reception import RUN, Reception
 from skytether.orchestrator.settings import Limits
 from skytether.orchestrator.strain import Strain
 
@@ -19,13 +24,25 @@ OTHER = "/api/v1/instances"
 class Knows:
     """Knows each token as the robot of that name, and ``operator``."""
 
+    def __init__(self) -> None:
+        self.lately: dict[str, Principal] = {}
+        self.spent: list[str] = []
+        self.verified: list[str | None] = []
+
     def authenticate(self, token: str | None, address: str) -> Principal:
         if not token:
             raise UnauthenticatedError("a token is needed")
         return Principal(None, scopes=frozenset()) if token == "operator" else Principal(token)
 
     def recent(self, token: str | None) -> Principal | None:
-        return None
+        return self.lately.get(token or "")
+
+    def spend(self, caller: Principal) -> None:
+        self.spent.append(caller.owner)
+
+    def verify(self, token: str | None) -> Principal:
+        self.verified.append(token)
+        return self.authenticate(token, "")
 
     def charge(self, caller: Principal, length: int) -> None:
         pass
@@ -39,11 +56,17 @@ class Scene:
         self.read: list[bytes] = []
         self.now = 0.0
         self.strain = Strain(lambda: self.now)
-        self.reception = Reception(self.app, Knows(), Limits(**limits), self.strain, pause_s)
+        self.knows = Knows()
+        self.renewed: list[float] = []
+        self.reception = Reception(
+            self.app, self.knows, Limits(**limits), self.strain, Pause(pause_s), self.renewed.append
+        )
 
     async def app(self, scope: Any, receive: Any, send: Any) -> None:
         self.read.append((await receive())["body"])
         await self.go.wait()
+        if scope["path"] == RENEWAL:
+            await scope["state"][RUN](self.read.append, b"renewed")
         if scope["path"].endswith("broken"):
             raise ValueError
         await send({"type": "http.response.start", "status": 200, "headers": []})
@@ -143,6 +166,54 @@ def test_who_is_a_stranger_or_asks_too_often_waits_for_the_answer_and_nobody_els
     run(scene)
 
 
+def test_however_many_connections_are_refused_at_once_some_hundred_are_in_a_second() -> None:
+    async def scene() -> None:
+        pause = Pause(0.25)
+        assert pause.next_s == 0.25
+        refused = [asyncio.create_task(pause.wait()) for _ in range(640)]
+        await asyncio.sleep(0)
+        assert pause.next_s == pytest.approx(0.25 * 11)
+        refused += [asyncio.create_task(pause.wait()) for _ in range(600)]
+        await asyncio.sleep(0)
+        assert pause.next_s == 5.0
+        for one in refused:
+            one.cancel()
+        await asyncio.gather(*refused, return_exceptions=True)
+        assert pause.next_s == 0.25
+
+    run(scene)
+
+
+def test_tokens_that_nobody_knows_keep_no_renewal_waiting() -> None:
+    """They are looked up in threads of their own; who was known a moment ago is asked again in the renewal's."""
+
+    async def scene() -> None:
+        at = Scene()
+        at.go.set()
+        looking, found = threading.Event(), threading.Event()
+
+        def slowly(token: str | None, address: str) -> Principal:
+            looking.set()
+            found.wait(30)
+            raise UnauthenticatedError("unknown")
+
+        at.knows.lately["walker"] = Principal("walker")
+        at.knows.authenticate = slowly  # type: ignore[method-assign]
+        at.knows.verify = lambda token: at.knows.verified.append(token) or Principal(token)  # type: ignore[method-assign, func-returns-value]
+        strangers = [asyncio.create_task(at.ask(RENEWAL, f"made-up-{n}")) for n in range(50)]
+        await asyncio.to_thread(looking.wait, 30)
+        assert (await at.ask(RENEWAL, "walker"))[0] == 200
+        assert at.knows.spent == ["robot:walker"]
+        assert at.knows.verified == ["walker"]
+        assert at.read == [b"", b"renewed"]
+        assert len(at.renewed) == 1
+        found.set()
+        assert {status for status, _ in await asyncio.gather(*strangers)} == {401}
+        assert len(at.renewed) == 1
+
+    run(scene)
+
+
 def test_a_body_is_bounded_whether_it_says_so_or_not_and_a_robots_is_smaller() -> None:
     async def scene() -> None:
         at = Scene(body_bytes=100, robot_body_bytes=10)
@@ -183,3 +254,28 @@ def test_a_renewal_for_which_there_is_no_room_is_felt_as_strain() -> None:
         assert at.strain.felt()
 
     run(scene)
+
+
+def test_who_still_waits_when_an_orchestrator_ends_is_told_to_ask_again() -> None:
+    sent: list[Any] = []
+
+    async def hangs(*_: Any) -> None:
+        await asyncio.Event().wait()
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def nothing() -> Any:
+        return {}
+
+    async def ended() -> None:
+        scope = {"type": "http", "method": "POST", "path": "/x", "query_string": b"", "headers": []}
+        asking = asyncio.ensure_future(GivenUp(hangs)(scope, nothing, send))
+        await asyncio.sleep(0)
+        asking.cancel()
+        await asking
+
+    asyncio.run(ended())
+    assert sent[0]["status"] == 503
+    assert (b"retry-after", b"2") in sent[0]["headers"]
+    assert b"ask again" in sent[1]["body"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -9,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import httpx
@@ -158,6 +160,10 @@ def test_the_database_is_away_for_longer_than_a_lease_and_nothing_is_lost(
     made = client.create_instance(ASK.model_copy(update={"lease_s": 3}))
     until(lambda: running(client, made.id))
     pids = program.services()
+    told_of = Queue[str | None]()
+    watching = threading.Thread(target=watch, args=(program, made.id, told_of))
+    watching.start()
+    assert told_of.get(timeout=30)
     postgres_server.stop()
     try:
         time.sleep(4)  # longer than the lease: what cannot be renewed must not end
@@ -175,8 +181,23 @@ def test_the_database_is_away_for_longer_than_a_lease_and_nothing_is_lost(
     assert (back.state, back.restarts) == (State.RUNNING, 0)
     assert program.services() == pids
     assert_nothing_lost(told(client), {made.id: State.RUNNING}, processes(program.folder))
+    client.delete_instance(made.id)
+    watching.join(30)
+    assert [line for line in iter(told_of.get_nowait, None) if line][-1] == "stopped", "the stream went on"
     assert program.log.count("the database does not answer, trying again") <= 3
     assert "Traceback" not in program.log
+
+
+def watch(program: Replica, instance: str, states: Queue[str | None]) -> None:
+    """One stream of events, from its begin to its end, which is None."""
+    url, headers = f"{program.url}/api/v1/instances/{instance}/events", {"Authorization": f"Bearer {program.token}"}
+    try:
+        with httpx.stream("GET", url, headers=headers, timeout=60) as answer:
+            for line in answer.iter_lines():
+                if line.startswith("data:"):
+                    states.put(json.loads(line.removeprefix("data:"))["state"])
+    finally:
+        states.put(None)
 
 
 def test_a_server_that_hangs_is_given_up_and_then_one_at_a_time_waits_for_it(
@@ -213,6 +234,18 @@ def outcome(ask: Callable[[], int]) -> str:
         return str(ask())
     except OperationalError as error:
         return str(error)
+
+
+def test_a_transaction_that_stood_still_for_too_long_is_a_connection_that_is_gone(postgres: str) -> None:
+    engine = make_engine(postgres)
+    with engine.connect() as connection:
+        connection.exec_driver_sql("SET idle_in_transaction_session_timeout = 50")
+        time.sleep(0.5)
+        with pytest.raises(OperationalError, match="idle-in-transaction"):
+            connection.exec_driver_sql("SELECT 1")
+    with engine.begin() as connection:
+        assert connection.exec_driver_sql("SELECT 1").scalar_one() == 1
+    engine.dispose()
 
 
 def test_a_database_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
@@ -254,3 +287,61 @@ def test_two_that_migrate_at_once_do_not_collide(postgres: str) -> None:
                 os._exit(status)
         pids.append(pid)
     assert [os.waitpid(pid, 0)[1] for pid in pids] == [0, 0]
+
+
+def test_a_leader_that_is_frozen_is_replaced_and_does_nothing_when_it_goes_on(
+    replicas: Callable[..., Replica], manifest: Any, tmp_path: Path
+) -> None:
+    one, two = replicas("one"), replicas("two")
+    with_toy(one.up(), manifest)
+    second = two.up()
+    site = SiteCreate(name="shared", tier="cloud", runtime="process", options={"folder": str(tmp_path / "instances")})
+    second.create_site(site)
+    second.delete_site("local")
+    made = second.create_instance(ASK)
+    until(lambda: running(second, made.id))
+    pids = services(tmp_path / "instances")
+    assert one.process is not None
+    one.process.send_signal(signal.SIGSTOP)
+    began = time.monotonic()
+    try:
+        until(lambda: "this orchestrator leads" in two.log)
+        assert time.monotonic() - began < 5, "2.4 s, and what a busy machine takes"
+        later = second.create_instance(ASK)
+        until(lambda: running(second, later.id))
+    finally:
+        one.process.send_signal(signal.SIGCONT)
+    until(lambda: "this orchestrator leads no more" in one.log)
+    assert_nothing_lost(told(second), {made.id: State.RUNNING, later.id: State.RUNNING}, processes(tmp_path))
+    assert pids < services(tmp_path / "instances")
+    assert len(services(tmp_path / "instances")) == 2
+    assert "this orchestrator leads:" not in one.log[one.log.index("leads no more") :]
+
+
+def test_clocks_of_orchestrators_an_hour_apart_end_nothing(
+    replicas: Callable[..., Replica], manifest: Any, tmp_path: Path, faketime: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The leader's is ahead, the other one's behind; leases are dated by the database's."""
+    monkeypatch.setenv("LD_PRELOAD", faketime)
+    monkeypatch.setenv("FAKETIME_DONT_FAKE_MONOTONIC", "1")
+    up = []
+    for name, offset in (("one", "+1h"), ("two", "-1h")):
+        monkeypatch.setenv("FAKETIME", offset)
+        up.append(replicas(name))
+        up[-1].up()
+    for name in ("LD_PRELOAD", "FAKETIME"):
+        monkeypatch.delenv(name)
+    one, two = up
+    assert one.client is not None
+    assert two.client is not None
+    with_toy(one.client, manifest)
+    made = two.client.create_instance(ASK.model_copy(update={"lease_s": 4}))
+    until(lambda: running(two.client, made.id))
+    for _ in range(8):
+        time.sleep(1)
+        two.client.renew_instance(made.id, Renew())
+    kept = running(one.client, made.id)
+    assert abs(kept.created_at.timestamp() - time.time()) < 60
+    assert "3600 s ahead of the database's" in one.log
+    assert "3600 s behind the database's" in two.log
+    until(lambda: one.client and one.client.get_instance(made.id).state is State.STOPPED)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import threading
@@ -15,9 +14,9 @@ from typing import Any
 
 import httpx
 import pytest
+from newer_code import newer_code
 from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 
-import skytether
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import InstanceCreate, SiteCreate, State
 from skytether.orchestrator import db
@@ -26,18 +25,6 @@ from skytether.orchestrator.settings import Timing
 pytestmark = pytest.mark.slow
 
 PERIOD_S = 0.05
-NEXT = '''\
-"""What a later version adds."""
-
-import sqlalchemy as sa
-from alembic import op
-
-revision, down_revision, branch_labels, depends_on = "9001", "{head}", None, None
-
-
-def upgrade() -> None:
-    op.add_column("instances", sa.Column("colour", sa.String(8), nullable=False, server_default="red"))
-'''
 
 
 class OneAddress:
@@ -125,10 +112,7 @@ def newer(tmp_path: Path, postgres: str) -> Path:
     engine = db.make_engine(postgres)
     head = db.migrate(engine)
     engine.dispose()
-    root = tmp_path / "newer"
-    copied = shutil.copytree(Path(skytether.__file__).parent, root / "skytether")
-    (copied / "orchestrator/migrations/versions/9001_colour.py").write_text(NEXT.format(head=head))
-    return root
+    return newer_code(tmp_path / "newer", head)
 
 
 def free_ports(count: int) -> list[int]:
@@ -263,7 +247,8 @@ def test_a_rolling_update_to_a_new_schema_is_noticed_by_nobody(
         until(lambda: operator.get_instance(held[0].id).state is State.STOPPED)
     assert seen == ["pending", "placing", "starting", "running", "stopping", "stopped"], "one stream, over all of it"
     assert not any(follower.is_alive() for follower in followers)
-    assert set("".join(log).split("(again) ")) == {"toy service\n"}, "so is the log, once for each connection"
+    shown = set("".join(log).split("(again) ")) - {""}  # of a connection that ended before its first line
+    assert shown == {"toy service\n"}, "so is the log, once for each connection"
     assert "(again) " in log
     assert "Traceback" not in one.log + two.log
     status, line = old_over_new(pair[0])

@@ -56,10 +56,19 @@ def test_a_secret_file_that_cannot_be_used_is_told(tmp_path: Path) -> None:
         secret_file(tmp_path / "none" / "key", lambda: b"new")
 
 
+@pytest.mark.parametrize("name", ["operator.token", "secret.key"])
+def test_a_secret_that_was_cut_off_is_refused(tmp_path: Path, name: str) -> None:
+    """Whoever tries all that are as short finds it."""
+    Secrets(tmp_path)
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:15])
+    with pytest.raises(SecretFileError, match=f"{name} has 15 bytes, too few for a secret: put all of it back"):
+        Secrets(tmp_path)
+
+
 def test_an_operators_token_that_is_none_is_told(tmp_path: Path) -> None:
     path = tmp_path / "operator.token"
     path.touch(mode=0o600)
-    path.write_bytes(b"\xff\xfe")
+    path.write_bytes(b"\xff\xfe" * 16)
     with pytest.raises(SecretFileError, match="holds no token: delete it"):
         Secrets(tmp_path)
 

@@ -12,12 +12,13 @@ from skytether.api.rest import SiteCreate
 from skytether.orchestrator import sites as module
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.errors import ConflictError, InvalidError
+from skytether.orchestrator.leader import fenced
 from skytether.orchestrator.runtimes.base import Observation, Phase, Runtime
 from skytether.orchestrator.runtimes.process import ProcessRuntime
 from skytether.orchestrator.settings import Settings, Timing
 from skytether.orchestrator.sites import load_runtime
 from skytether.orchestrator.store import Store
-from skytether.testing.runtimes import FakeOptions, FakeRuntime
+from skytether.testing.runtimes import FakeOptions, FakeRun, FakeRuntime, FakeWorld
 
 Start = Callable[..., Orchestrator]
 
@@ -104,6 +105,26 @@ def test_what_ended_instances_left_goes_with_their_site(start: Start) -> None:
     assert did == ["removed ended", "dismantled"]
 
 
+def test_a_site_is_emptied_also_by_one_that_led_there_before(start: Start) -> None:
+    worlds: dict[str, FakeWorld] = {}
+
+    class Shared(FakeRuntime):
+        def __init__(self, site: str, folder: Path, options: Any) -> None:
+            super().__init__(site, folder, options, worlds.setdefault(site, FakeWorld()))
+
+        def observe(self) -> Any:
+            return {"ended": Observation(1, Phase.EXITED)} if "ended" in self.world else {}
+
+    core = start(find=lambda _: Shared)
+    site = core.sites.add(SiteCreate(name="mine", tier="cloud", runtime="shared"))
+    site.loop.stop(5)
+    site.runtime.lead(10**10)
+    worlds["mine"].epoch += 1  # another one leads by now
+    worlds["mine"]["ended"] = FakeRun(None, 1)  # type: ignore[arg-type]
+    core.sites.delete("mine")
+    assert not worlds["mine"]
+
+
 class OwnedOptions(FakeOptions):
     owner: str = ""
 
@@ -149,24 +170,14 @@ def test_a_reconciler_that_hangs_is_not_ready(start: Start, monkeypatch: pytest.
     assert core.not_ready() == "the reconciler has made no pass for 31 s"
 
 
-def test_sites_that_are_looked_at_anew_are_listed_all_the_while(start: Start) -> None:
-    """Whoever comes to lead does that; who asks for a service meanwhile must not be told that there is no site."""
-    listed: list[list[str]] = []
-
-    class Seen(FakeRuntime):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            listed.append([site.name for site in core.sites.all()] if started else [])
-
-        def close(self) -> None:
-            super().close()
-            listed.append([site.name for site in core.sites.all()])
-
-    started: list[Orchestrator] = []
-    core = start(find=lambda _: Seen)
-    started.append(core)
-    before = core.sites.get("local")
-    listed.clear()
-    core.sites.reopen()
-    assert listed == [["local"], ["local"]], "when the new one is made, and when the old one is closed"
-    assert core.sites.get("local") is not before
+def test_a_drained_site_is_not_deleted_for_a_leader_that_was_followed(start: Start, tmp_path: Path) -> None:
+    stored(tmp_path, SiteCreate(name="lab", tier="edge", runtime="fake"))
+    one = start()
+    one.placer.stop(timeout=5.0)
+    site = one.sites.get("lab")
+    site.draining = True
+    with fenced(1):  # by now the epoch is the present time
+        one.sites.end_drained((), list)
+    assert site.ender is not None
+    site.ender.join()
+    assert [there.name for there in one.store.sites()] == ["lab"]

@@ -192,6 +192,22 @@ def test_a_renewal_beats_who_was_about_to_end_it(store: Store, new_record: NewRe
     assert (longer.record.lease_s, longer.record.lease_expires_at) == (60, NOW + 80)
 
 
+def test_a_renewal_that_comes_late_takes_nothing_from_a_later_one(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record(site="lab", state=State.RUNNING), "operator", None, "")
+    store.renew("i1", NOW + 60, None)
+    for late in (None, 15):  # of an orchestrator that was frozen before it asked the database
+        renewed = store.renew("i1", NOW + 14, late)
+        assert renewed is not None
+        assert renewed.record.lease_expires_at == NOW + 75
+    store.extend_leases(NOW + 20, at_least=True)
+    assert store.all()[0].lease_expires_at == NOW + 75
+    store.extend_leases(NOW + 70, at_least=True)
+    assert store.all()[0].lease_expires_at == NOW + 85
+    shorter = store.renew("i1", NOW + 61, 5)
+    assert shorter is not None
+    assert shorter.record.lease_expires_at == NOW + 66
+
+
 def test_what_ends_is_not_renewed(store: Store, new_record: NewRecord) -> None:
     store.add(new_record("a", state=State.STOPPING), "operator", None, "")
     store.add(new_record("b", state=State.FAILED), "operator", None, "")
@@ -257,7 +273,10 @@ def test_robots_sites_and_services(store: Store) -> None:
     assert store.add_site(site)
     assert not store.add_site(site)
     assert store.sites() == [site]
+    store.drain_site("lab")
+    assert store.draining_sites() == {"lab"}
     store.delete_site("lab")
+    assert store.draining_sites() == set()
     assert store.sites() == []
 
     store.put_service("s", {"v": 1})
@@ -273,6 +292,13 @@ def test_robots_sites_and_services(store: Store) -> None:
 def test_an_address_of_no_database_says_what_to_write(address: str) -> None:
     with pytest.raises(AddressError, match="write postgresql://USER@HOST/NAME or sqlite:///PATH"):
         make_engine(address)
+
+
+def test_no_part_of_a_password_is_taken_for_a_host() -> None:
+    with pytest.raises(AddressError) as told:
+        make_engine("postgresql://me@host/name".replace("@", ":a@secret@"))
+    assert "write an @ of its password as %40" in str(told.value)
+    assert "secret" not in str(told.value)
 
 
 @pytest.mark.parametrize("scheme", ["postgres", "postgresql", "postgresql+psycopg"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
-import ipaddress
 import json
 import logging
 import os
@@ -15,9 +13,7 @@ from typing import Any
 
 import httpx
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from certificates import certificate
 from orchestrator_program import Program, until, with_toy
 
 from skytether.api.client import ApiError, Client, Unreachable
@@ -26,24 +22,6 @@ from skytether.orchestrator.audit import verify
 from skytether.orchestrator.logs import TextFormatter
 
 pytestmark = pytest.mark.slow
-
-
-def certificate(folder: Path, address: str = "127.0.0.1") -> tuple[Path, Path]:
-    """A certificate for an address that is its own authority, and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "test")])
-    now = datetime.datetime.now(datetime.UTC)
-    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-    builder = builder.not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(
-        now + datetime.timedelta(days=1)
-    )
-    names = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))])
-    signed = builder.add_extension(names, critical=False).sign(key, hashes.SHA256())
-    paths = folder / "cert.pem", folder / "key.pem"
-    paths[0].write_bytes(signed.public_bytes(serialization.Encoding.PEM))
-    encoding = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    paths[1].write_bytes(key.private_bytes(*encoding))
-    return paths
 
 
 @pytest.fixture
@@ -210,6 +188,8 @@ def test_a_robot_that_asks_too_often_is_told_to_wait(program: Callable[..., Prog
         assert int(refused[0].headers["retry-after"]) >= 1
         assert "too many requests" in refused[0].json()["detail"]
         assert len([operator.sites() for _ in range(20)]) == 20  # an operator is not limited
+    assert running.log.count("skytether.audit: robot:walker 127.0.0.1 GET /api/v1/sites 429") == len(refused)
+    assert "nobody" not in running.log
 
 
 def test_what_others_send_is_no_line_of_its_own() -> None:

@@ -174,6 +174,18 @@ def test_a_token_has_one_successor_and_of_a_family_two_are_good(served: Any) -> 
     assert not any(_is_good(served.client(token)) for token in tokens)
 
 
+def test_the_id_of_the_first_revokes_all_that_were_made_of_it_since(served: Any) -> None:
+    first = served.operator.create_token(TokenCreate(name="watch", scopes=["read"]))
+    stolen = first.token
+    for _ in range(3):
+        stolen = served.client(stolen).rotate_token().token
+        assert _is_good(served.client(stolen))
+    assert first.id not in {token.id for token in served.operator.tokens()}
+    served.operator.delete_token(first.id)
+    assert not _is_good(served.client(stolen))
+    assert served.operator.tokens() == []
+
+
 def _is_good(client: Client) -> bool:
     with contextlib.suppress(ApiError):
         return bool(client.sites()) or True
@@ -252,6 +264,7 @@ def test_no_scope_makes_a_site_that_runs_as_the_orchestrator(served: Any, option
         {"network": "bridge"},
         {"egress": ["*"]},
         {"seccomp": "default"},
+        {"registry_auth": "/root/.docker/config.json"},  # told to an engine that the same scope chooses
     ],
 )
 def test_no_scope_gives_a_site_of_containers_what_opens_the_machine(served: Any, option: dict[str, Any]) -> None:

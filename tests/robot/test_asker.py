@@ -50,12 +50,25 @@ def test_while_a_start_takes_long_its_lease_is_kept(orchestrator):
     now = 10.0
     asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, renew_s=2.0, random=Random(1))
     orchestrator.states = [State.STARTING]
-    for _ in range(100):  # 5 s
-        assert asker.step() == 0.03
-        now += 0.05
+    while now < 15.0:
+        now += asker.step()
     names = [name for name, _ in orchestrator.calls]
     assert (names.count("create"), names.count("renew")) == (1, 2)
+    assert len(names) < 70, "every 30 ms at first, and less and less often"
+    now += 60
+    assert asker.step() == 0.25
     assert orchestrator.calls[names.index("renew")][1].report is None
+
+
+def test_a_restart_is_waited_for_like_a_start_however_long_it_ran(orchestrator):
+    now = 10.0
+    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, random=Random(1))
+    orchestrator.states = [State.RUNNING]
+    for _ in range(3):
+        asker.step()
+        now += 3600
+    orchestrator.states = [State.STARTING]
+    assert asker.step() == 0.03
 
 
 def test_when_the_link_goes_bad_it_looks_sooner(orchestrator, asked):

@@ -166,13 +166,15 @@ class Gate:
     """What the gate tells an agent, by hand."""
 
     def __init__(self, base):
-        self.hand = "agent"
+        self.hand, self.stopped, self.started = "agent", "", False
         self._base = base
         base.told = self._told
 
     def _told(self, now):
         moves = self._base.written and self.hand != "nobody"
-        return Told(Velocity(*self._base.written[-1]) if moves else STANDSTILL, 0.0, "", self.hand)
+        return Told(
+            Velocity(*self._base.written[-1]) if moves else STANDSTILL, 0.0, self.stopped, self.hand, self.started
+        )
 
 
 @pytest.fixture
@@ -213,9 +215,31 @@ def test_a_service_that_a_person_starts_after_a_reset_goes_on(reset_on_its_own):
     rig = reset_on_its_own
     rig.gate.hand = "nobody"
     assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
-    rig.gate.hand = "agent"
+    rig.gate.hand, rig.gate.started = "agent", True
     rig.run(0.1, linear=0.2, angular=0.0)
     assert rig.run(1.0).source is Source.FALLBACK
+    assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
+
+
+def test_a_service_that_owes_a_standstill_goes_on_once_a_person_starts_it(reset_on_its_own):
+    """Also where the gate had let the agent go already, for the fallback's standstill."""
+    rig = reset_on_its_own
+    assert rig.run(2.0, linear=0.2, angular=0.0).source is Source.FALLBACK
+    rig.gate.started = True
+    assert rig.run(0.1, linear=0.2, angular=0.0).source is Source.CLOUD
+
+
+def test_a_service_that_came_up_before_the_first_reset_drives_once_a_person_lets_the_agent_go(base, make_cloud, bridge):
+    """As `robot run` does with a gate of its own: the service may be quicker, and wants to move from its first word."""
+    gate, base.push = Gate(base), 0.0
+    gate.hand, gate.stopped = "nobody", "nobody has reset the robot"
+    rig = Rig(base, make_cloud, Stop())
+    rig.run(0.5)
+    rig.connect(bridge)
+    rig.run(0.3, linear=0.2, angular=0.0)
+    gate.stopped = ""
+    rig.run(0.05, linear=0.2, angular=0.0)
+    gate.hand, gate.started = "agent", True
     assert rig.run(1.5, linear=0.2, angular=0.0).source is Source.CLOUD
 
 

@@ -1,4 +1,7 @@
 import json
+import socket
+import threading
+from contextlib import suppress
 from dataclasses import replace
 
 import httpx
@@ -99,6 +102,49 @@ def test_a_web_page_whose_name_was_made_this_address_reads_nothing():
         assert httpx.get(url + path, headers={"Host": f"evil.example:{server.port}"}).status_code == 421
     for host in ("localhost", f"localhost:{server.port}", "[::1]", "192.0.2.7:80"):
         assert httpx.get(f"{url}/status", headers={"Host": host}).status_code == 200
+    server.close()
+
+
+@pytest.mark.slow
+def test_who_asks_without_end_holds_up_neither_the_others_nor_the_end(capfd):
+    server, ended = StatusServer(0, dict, lambda: b""), threading.Event()
+
+    def drip():
+        with socket.create_connection(("127.0.0.1", server.port)) as link, suppress(OSError):
+            link.sendall(b"GET /status HTTP/1.1\r\nA: ")
+            while not ended.wait(0.1):
+                link.sendall(b"b")
+
+    threads = [threading.Thread(target=drip) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    try:
+        assert httpx.get(f"http://127.0.0.1:{server.port}/status", timeout=30).status_code == 200
+        for thread in threads:
+            thread.join(30)
+        assert not any(thread.is_alive() for thread in threads), "each is ended when its time is over"
+        again = threading.Thread(target=drip)
+        again.start()
+        threads.append(again)
+        server.close()
+        assert not server._thread.is_alive()
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_more_connections_than_there_is_room_for_are_closed(monkeypatch):
+    for patience in ("_PATIENCE_S", "_Handler.timeout"):
+        monkeypatch.setattr(f"skytether.robot.status.{patience}", 60.0)  # it is not this that ends them
+    server = StatusServer(0, dict, lambda: b"")
+    links = [socket.create_connection(("127.0.0.1", server.port), timeout=10) for _ in range(16)]
+    for _ in range(24):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10) as beyond:
+            assert beyond.recv(1) == b""
+    for link in links:
+        link.close()
     server.close()
 
 

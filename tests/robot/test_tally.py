@@ -1,6 +1,6 @@
 from dataclasses import replace
 
-from skytether.api.rest import MOST_COUNTED
+from skytether.api.rest import MOST_COUNTED, MOST_TOPICS
 from skytether.robot.snapshot import report
 from skytether.robot.tally import Tally
 from skytether.wire.stats import SessionStats, TopicStats
@@ -63,3 +63,11 @@ def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one
     scan, old = told.topics
     assert (told.life, scan.topic, scan.sent, scan.delivered, scan.delay_p50_s) == ("a", "scan", MOST_COUNTED, 14, 0.02)
     assert (old.topic, old.sent, old.delay_p50_s) == ("old", 3, None)
+
+
+def test_a_report_of_more_topics_than_it_may_have_names_those_of_the_present_session():
+    tally, now = Tally("a"), of(SCAN)
+    tally.take(Session(), of(*(TopicStats(str(n), "in", 5) for n in range(MOST_TOPICS))), last=True)
+    tally.take(Session(), now)
+    told = report(None, tally, now, 0.1).topics
+    assert (len(told), told[0].topic) == (MOST_TOPICS, "scan")

@@ -64,16 +64,34 @@ class DockerSite:
         return done.stdout.strip()
 
     def containers(self) -> list[str]:
-        """Ids of all that are this site's, ended ones too."""
-        return self.docker("ps", "-aq", "--no-trunc", "--filter", f"label=skytether.io/owner={self.owner}").split()
+        """Ids of those of this site's instances, ended ones too."""
+        return self.labelled("skytether.io/instance")
+
+    def helpers(self) -> list[str]:
+        """Ids of the others: guards, and what holds a network."""
+        return self.labelled("skytether.io/helper")
+
+    def labelled(self, label: str, *more: str) -> list[str]:
+        """Ids of this site's containers with a label as well; ``more`` filters."""
+        labels = f"label=skytether.io/owner={self.owner}", f"label={label}"
+        filters = [f"--filter={one}" for one in (*labels, *more)]
+        return self.docker("ps", "-aq", "--no-trunc", *filters).split()
 
     def volumes(self) -> list[str]:
         """Names of the volumes that hold what the services wrote."""
         return self.docker("volume", "ls", "-q", "--filter", f"name=skytether-{self.owner}-data-").split()
 
+    def volumes_with(self, *labels: str) -> list[str]:
+        """Names of this site's volumes with these labels: ``skytether.io/instance``, or ``skytether.io/epoch``."""
+        filters = [f"--filter=label={label}" for label in (f"skytether.io/owner={self.owner}", *labels)]
+        return self.docker("volume", "ls", "-q", *filters).split()
+
     def clean(self) -> None:
         """Remove containers and data."""
-        for kind, names in (("container", self.containers()), ("volume", self.volumes())):
+        for kind, names in (
+            ("container", self.containers() + self.helpers()),
+            ("volume", self.volumes_with()),
+        ):
             if names:
                 self.docker(kind, "rm", *(["-f", "-v"] if kind == "container" else ["-f"]), *names)
 

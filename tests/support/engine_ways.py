@@ -80,12 +80,13 @@ class EngineProxy:
             threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
+        engine = socket.socket(socket.AF_UNIX)
         try:
             if self._context is not None:
                 client = self._context.wrap_socket(client, server_side=True)
-            engine = socket.socket(socket.AF_UNIX)
             engine.connect(self._target)
         except OSError:
+            engine.close()
             client.close()
             return
         self._open += [client, engine]

@@ -55,16 +55,22 @@ def containers(site: DockerSite) -> Runs:
 
 
 def litter(site: DockerSite) -> Litter:
-    """On an engine of a test's own: what was made and never begun, guards, volumes and networks that nobody uses."""
+    """On an engine of a test's own: what was made and never begun, guards, volumes and networks that nobody uses.
+
+    Beyond one of a site's networks that is held for the next start.
+    """
 
     def look() -> list[str]:
         begun = [f"{i}: {c}" for i, cs in _containers(site, "created", "dead", "removing").items() for c in cs]
-        guards = site.docker("ps", "-aq", "--filter", "label=skytether.io/guard").split()
-        kept = set(site.volumes())
+        holders = site.labelled("skytether.io/helper=")
+        guards = sorted({*site.helpers()} - {*holders})
+        spare = len(holders) > len(site.labelled("skytether.io/namespace", "status=running")) + 1
+        epochs = site.docker("volume", "ls", "-q", "-f", "label=skytether.io/epoch").split()  # other owners' too
+        kept = {*site.volumes(), *epochs} - {*site.volumes_with("skytether.io/epoch")[1:]}
         volumes = [v for v in site.docker("volume", "ls", "-q", "-f", "dangling=true").split() if v not in kept]
         known = {"bridge", "host", "none", site.network}
         networks = [n for n in site.docker("network", "ls", "--format", "{{.Name}}").split() if n not in known]
-        return begun + guards + volumes + networks
+        return begun + guards + (holders if spare else []) + volumes + networks
 
     return look
 
@@ -72,7 +78,8 @@ def litter(site: DockerSite) -> Litter:
 def _containers(site: DockerSite, *statuses: str) -> dict[str, list[str]]:
     form = '{{.Label "skytether.io/instance"}} {{.ID}}'
     filters = [f"--filter=status={status}" for status in statuses]
-    rows = site.docker("ps", "-a", "--filter", f"label=skytether.io/owner={site.owner}", *filters, "--format", form)
+    filters += [f"--filter=label={label}" for label in (f"skytether.io/owner={site.owner}", "skytether.io/instance")]
+    rows = site.docker("ps", "-a", *filters, "--format", form)
     found: dict[str, list[str]] = {}
     for row in rows.splitlines():
         instance, container = row.split()

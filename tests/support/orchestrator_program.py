@@ -30,6 +30,8 @@ class Program:
         self.options = options
         self.code: Path | None = None
         """Another source root than this one's."""
+        self.environment: dict[str, str] = {}
+        """More variables."""
         self.process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -38,13 +40,14 @@ class Program:
 
     def spawn(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "skytether.cli", "orchestrator", "run", "--state-dir", str(self.folder)]
-        path = os.pathsep.join([*([str(self.code)] if self.code else []), os.environ.get("PYTHONPATH", "")])
+        given = {**os.environ, **self.environment}
+        path = os.pathsep.join([*([str(self.code)] if self.code else []), given.get("PYTHONPATH", "")])
         with (self.folder.parent / "log").open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--port", "0", *self.options],
                 stdout=log,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": path, "PYTHONFAULTHANDLER": "1"},
+                env={**given, "PYTHONPATH": path, "PYTHONFAULTHANDLER": "1"},
             )
         return self.process
 

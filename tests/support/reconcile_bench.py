@@ -34,6 +34,9 @@ class FixedSites:
     def refresh(self) -> None:
         """Nobody adds or deletes any."""
 
+    def end_drained(self, *_: Any) -> None:
+        """None is drained."""
+
 
 class Bench:
     """A reconciler over one site, ``lab``; a test may add others."""
@@ -63,7 +66,7 @@ class Bench:
 
     def _site(self) -> Site:
         asked = SiteCreate(name="lab", tier="edge", runtime="fake")
-        site = Site(asked, self.runtime, self.reconciler.site_step, silent_after=1e9)
+        site = Site(asked, self.runtime, self.reconciler.site_step, Timing(site_silent=1e9))
         self._let_know(site)
         weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
         sites = self.reconciler.sites
@@ -77,7 +80,7 @@ class Bench:
         """Another site, ``other``; at equal scores it comes second."""
         asked = SiteCreate(name="other", tier="edge", runtime="fake")
         runtime = kind("other", folder, FakeOptions(**options))
-        other = Site(asked, runtime, self.reconciler.site_step, silent_after=1e9)
+        other = Site(asked, runtime, self.reconciler.site_step, Timing(site_silent=1e9))
         self._let_know(self.site, other)
         self.reconciler.site_step(other)
         return other

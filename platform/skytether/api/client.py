@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-import ssl
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from datetime import UTC, datetime
-from pathlib import Path
-from types import TracebackType
-from typing import Any, TypeVar
+from http import HTTPStatus
+from typing import Any
 
 import httpx
-from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from .bounded import WHOLE, BoundedTransport, EndlessError
+from .connection import AWAY, ApiError, Connection, Unreachable, addresses, json_of, parse, strange
 from .manifest import Manifest
-from .plain_http import is_readable_on_the_way
-from .printable import printable
 from .rest import (
     CHANGE,
     PATH_NAME,
@@ -48,127 +41,26 @@ from .rest import (
     TokenRotate,
 )
 
-_Model = TypeVar("_Model", bound=BaseModel)
-_PREFIX = "/api/v1"
-_GIVE_TOKEN = "give the operator's or a robot's with --token-file or SKYTETHER_TOKEN"  # noqa: S105 (no token)
+__all__ = ["ApiError", "Client", "NotRunning", "Unreachable", "addresses"]
+
 _PING_LIMIT = 45.0
 """Seconds without a sign of life after which an event stream counts as dead; the server pings every 15."""
-
-
 _RESUME_S = 30.0
 """How long an event stream that was lost is tried again [s]: an orchestrator is restarted in less."""
 _RESUME_PAUSE_S = 0.2
 _END_SEEN_S = 1.0
 """By when an orchestrator has seen that a run has ended [s]."""
-_STEPS = 4
-"""An answer may take so many times as long as one step of its request: connect, send, and two to receive."""
-_LARGEST = 1 << 26
-"""Bytes of an answer: the instances of ten thousand robots are less."""
-_LONGEST = 4096
-"""Characters of what an orchestrator says is wrong; some are lists of what a manifest lacks."""
-_AWAY = (502, 503, 504)
-"""Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
-_REPEATABLE = ("/renew", "/migrate", "/session")
-"""Ends of paths to which a request that comes twice does what it would do once."""
-
-
-def addresses(base_url: str) -> list[str]:
-    """Each of the addresses that are given with commas between them; one that is empty stays, to be complained of."""
-    return [url.strip().rstrip("/") for url in base_url.split(",") if url.strip()] or [""]
-
-
-class ApiError(Exception):
-    """The orchestrator answered that it will not; ``str()`` is its one sentence."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        super().__init__(problem.detail or problem.title)
-
-
-class Unreachable(Exception):  # noqa: N818 (a state of affairs, not a mistake)
-    """No orchestrator answers; ``str()`` says what to do."""
 
 
 class NotRunning(Exception):  # noqa: N818
     """An instance ended, or did not get ready in time; ``str()`` says why."""
 
 
-class Client:
+class Client(Connection):
     """An orchestrator, as the owner of one token sees it. Safe from any thread; use it as a context manager.
-
-    Of several over one database the one that answered last is asked first, and the others when that is away. A request
-    whose connection was lost is sent again, if that can do no harm: it looks only, or does the same once more. So an
-    orchestrator that is being restarted is not noticed where there is another one.
 
     Every method raises :class:`ApiError` or :class:`Unreachable`, and nothing else.
     """
-
-    def __init__(
-        self,
-        base_url: str,
-        token: str | None = None,
-        *,
-        timeout: float = 10.0,
-        ca_file: Path | str | None = None,
-        insecure_http: bool = False,
-        largest: int = _LARGEST,
-    ) -> None:
-        """One orchestrator, or several.
-
-        Args:
-            base_url: ``https://host:port``; of several, with commas between them.
-            token: An operator's or a robot's.
-            timeout: Seconds for each step of a request: connect, send, receive; all of it takes four of them at most.
-            ca_file: PEM file of the authority that the orchestrator's certificate is by; None: the system's.
-            insecure_http: Use plain http beyond this machine too, where others can read token and keys on the way.
-            largest: Bytes of an answer that is not followed as it comes.
-
-        Raises:
-            ApiError: The token holds characters that no token has, or the file holds no certificate.
-            Unreachable: An address is plain http beyond this machine.
-        """
-        self._urls = addresses(base_url)
-        self._at = 0
-        """Which of them answered last."""
-        if token and not (token.isascii() and token.isprintable()):
-            raise ApiError(Problem(title="No valid token", status=401, detail="what was given as token is none"))
-        readable = [url for url in self._urls if is_readable_on_the_way(url)]
-        if readable and not insecure_http:
-            raise Unreachable(
-                f"{readable[0]} would be asked without TLS, and the token could be read on the way: write https:// "
-                "(the orchestrator's tls.certificate, or a proxy before it); inside a network that is all yours, such "
-                "as a VPN, allow it with SKYTETHER_INSECURE_HTTP=true, or insecure_http: true in robot.yaml"
-            )
-        self._whole = {WHOLE: _STEPS * timeout}
-        # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
-        verify = None if all(url.startswith("http://") for url in self._urls) else _trust(ca_file)
-        self._http = httpx.Client(
-            headers={"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {token}"} if token else {}),
-            timeout=timeout,
-            transport=BoundedTransport(verify, largest),
-            # No proxies from the environment: what keeps a robot driving must not take a way round by accident.
-            trust_env=False,
-        )
-
-    def set_token(self, token: str) -> None:
-        """Use another token from the next request on."""
-        self._http.headers["Authorization"] = f"Bearer {token}"
-
-    @property
-    def _shown(self) -> str:
-        return ", ".join(self._urls)
-
-    def close(self) -> None:
-        """Let go of the connections."""
-        self._http.close()
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # Instances
 
@@ -250,10 +142,10 @@ class Client:
             ApiError: It said that it will not.
             Unreachable: It was never there, or has been away for too long.
         """
-        away = not isinstance(error, ApiError) or error.problem.status in _AWAY
+        away = not isinstance(error, ApiError) or error.problem.status in AWAY
         if not (reached and away) or time.monotonic() - silent_since > _RESUME_S:
             if isinstance(error, httpx.TransportError | httpx.InvalidURL):
-                raise self._unreachable(error) from error
+                raise self.unreachable(error) from error
             raise error
 
     def watch(self, instance_id: str, after: int = 0, *, timeout: float | None = None) -> Iterator[InstanceEvent]:
@@ -294,22 +186,9 @@ class Client:
         with self._stream(path, patience, {"Last-Event-ID": str(after)}) as response:
             for line in response.iter_lines():
                 if line.startswith("data:"):
-                    yield _parse(InstanceEvent, json.loads(line.removeprefix("data:")))
+                    yield parse(InstanceEvent, json.loads(line.removeprefix("data:")))
                 if time.monotonic() >= deadline:
                     return
-
-    @contextmanager
-    def _stream(
-        self, path: str, patience: float | None, headers: dict[str, str] | None = None
-    ) -> Iterator[httpx.Response]:
-        """An answer that comes bit by bit; ``patience`` is for each bit, in seconds."""
-        timeout = httpx.Timeout(self._http.timeout.connect, read=patience)
-        response = self._send("GET", _PREFIX + path, headers=headers, timeout=timeout, stream=True)
-        with closing(response):
-            if response.is_error:
-                response.read()
-                raise ApiError(_problem(response))
-            yield response
 
     def wait_running(
         self, instance_id: str, timeout: float = 30.0, on_event: Callable[[InstanceEvent], None] = lambda _: None
@@ -358,8 +237,8 @@ class Client:
         try:
             change = Change(response.headers.get(CHANGE, ""))
         except ValueError as error:
-            raise ApiError(_strange(f"no {CHANGE}")) from error
-        return _parse(Manifest, _json(response)), change
+            raise ApiError(strange(f"no {CHANGE}")) from error
+        return parse(Manifest, json_of(response)), change
 
     def delete_service(self, name: str) -> None:
         """Remove a service that was put."""
@@ -379,9 +258,13 @@ class Client:
         """Add a site."""
         return self._one(Site, "POST", "/sites", site)
 
-    def delete_site(self, name: str) -> None:
-        """Forget a site that has no instances."""
-        self._request("DELETE", _at("sites", name))
+    def delete_site(self, name: str, *, drain: bool = False) -> bool:
+        """Forget a site that has no instances; with ``drain`` it takes no more, and goes with its last one.
+
+        Returns:
+            Whether it is gone by now.
+        """
+        return self._request("DELETE", _at("sites", name) + "?drain=true" * drain).status_code != HTTPStatus.ACCEPTED
 
     def probe(self, site: str) -> float:
         """One round trip to where a site answers, in seconds; the first one also opens the connection."""
@@ -410,12 +293,12 @@ class Client:
     def stop_robots(self, reason: str) -> list[StopOrder]:
         """Order all registered robots to stop."""
         response = self._request("POST", "/robots/stop", StopRobot(reason=reason))
-        return [_parse(StopOrder, document) for document in _json(response)]
+        return [parse(StopOrder, document) for document in json_of(response)]
 
     def stop_order(self, name: str) -> StopOrder | None:
         """The last order to a robot to stop."""
-        document = _json(self._request("GET", _at("robots", name, "stop")))
-        return None if document is None else _parse(StopOrder, document)
+        document = json_of(self._request("GET", _at("robots", name, "stop")))
+        return None if document is None else parse(StopOrder, document)
 
     def acknowledge_stop(self, name: str, order: str) -> StopOrder:
         """A robot says that it stands; with its own token only."""
@@ -454,100 +337,6 @@ class Client:
         """In Prometheus' text format."""
         return self._request("GET", "/metrics", prefix="").text
 
-    def _one(
-        self, model: type[_Model], method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
-    ) -> _Model:
-        return _parse(model, _json(self._request(method, path, body, headers)))
-
-    def _many(self, model: type[_Model], path: str) -> list[_Model]:
-        document = _json(self._request("GET", path))
-        try:
-            return TypeAdapter(list[model]).validate_python(document)  # type: ignore[valid-type]
-        except ValidationError as error:
-            raise ApiError(_strange(str(error))) from error
-
-    def _request(
-        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None, prefix: str = _PREFIX
-    ) -> httpx.Response:
-        document = body.model_dump(mode="json", by_alias=True) if isinstance(body, BaseModel) else body
-        again = method != "POST" or "Idempotency-Key" in (headers or {}) or path.endswith(_REPEATABLE)
-        try:
-            response = self._send(method, prefix + path, again=again, json=document, headers=headers)
-        except (httpx.TransportError, httpx.InvalidURL) as error:
-            raise self._unreachable(error) from error
-        if not response.is_success:
-            raise ApiError(_problem(response))
-        return response
-
-    def _send(
-        self, method: str, path: str, *, again: bool = True, stream: bool = False, **request: Any
-    ) -> httpx.Response:
-        """Ask the one that answered last; if it is away, each of the others, and that one once more.
-
-        Args:
-            method: Of the request.
-            path: Below the address.
-            again: Whether it does no harm if two get it.
-            stream: Whether the answer's body is left to be read.
-            request: All else, for httpx.
-
-        Raises:
-            httpx.TransportError: Nobody answers; the last one's.
-        """
-        first, count = self._at, len(self._urls)
-        alone = count == 1
-        for turn in range(count + 1):
-            at, last = (first + turn) % count, turn == count
-            try:
-                asked = self._http.build_request(method, self._urls[at] + path, **request)
-                asked.extensions |= {} if stream else self._whole
-                response = self._http.send(asked, stream=stream)
-            except (httpx.ConnectError, httpx.ConnectTimeout):
-                if last or alone:
-                    raise
-            except httpx.TimeoutException:
-                if last or alone or not again:
-                    raise
-            except httpx.TransportError:  # a connection that was kept open, and that the other end has closed
-                if last or not again:
-                    raise
-            else:
-                if last or alone or not again or response.status_code not in _AWAY:
-                    self._at = at
-                    return response
-                response.close()
-        raise AssertionError("the last turn returns or raises")
-
-    def _unreachable(self, error: Exception | None = None) -> Unreachable:
-        if "CERTIFICATE_VERIFY_FAILED" in str(error):
-            why = str(error).partition("CERTIFICATE_VERIFY_FAILED] ")[2].partition(" (_ssl")[0]
-            dated = "expired" in why or "not yet valid" in why
-            advice = "give the file of its authority (SKYTETHER_CA_FILE), or correct the address"
-            if dated:
-                advice = f"correct this machine's clock ({datetime.now(UTC):%Y-%m-%d %H:%M} UTC), or renew it"
-            return Unreachable(f"the certificate of {self._shown} is not trusted ({why}): {advice}")
-        if isinstance(error, httpx.UnsupportedProtocol | httpx.InvalidURL):
-            wrong = [url for url in self._urls if not url.startswith(("http://", "https://"))] or self._urls
-            return Unreachable(
-                f"'{', '.join(wrong)}' is no address of an orchestrator: write http://HOST:PORT or https://HOST:PORT "
-                "(--url, SKYTETHER_URL, or orchestrator in robot.yaml)"
-            )
-        at = error.request.url if isinstance(error, httpx.TransportError) else httpx.URL()
-        asked = f"{at.scheme}://{at.netloc.decode('ascii')}"
-        if "WRONG_VERSION_NUMBER" in str(error):
-            return Unreachable(f"{asked} does not speak TLS: write http:// instead of https://, or correct the port")
-        if isinstance(error, EndlessError):
-            return Unreachable(f"{asked} is no orchestrator: {error}")
-        if isinstance(error, httpx.RemoteProtocolError) and at.scheme == "http":
-            return Unreachable(
-                f"{asked} closes the connection without an answer: if it has a certificate, write https:// instead of "
-                "http://; if it is being restarted, try again"
-            )
-        return Unreachable(
-            f"no orchestrator answers at {self._shown}: "
-            "start one with `skytether orchestrator run`, or correct its address (--url, or orchestrator in robot.yaml)"
-        )
-
 
 def _at(kind: str, name: str, what: str = "") -> str:
     """The path of something by its name, which is a word; anything else would lead to something else.
@@ -559,49 +348,3 @@ def _at(kind: str, name: str, what: str = "") -> str:
         detail = f"{name!r} is no name of anything: names are letters, digits, '-' and '_'"
         raise ApiError(Problem(title="Not found", status=404, detail=detail))
     return f"/{kind}/{name}/{what}" if what else f"/{kind}/{name}"
-
-
-def _trust(ca_file: Path | str | None) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca_file)
-    except (OSError, ssl.SSLError) as error:
-        detail = f"{ca_file} is no file of certificates: {getattr(error, 'strerror', None) or error}"
-        raise ApiError(Problem(title="No certificate", status=495, detail=detail)) from error
-
-
-def _json(response: httpx.Response) -> Any:
-    try:
-        return response.json()
-    except (ValueError, RecursionError) as error:  # deeper than Python calls
-        raise ApiError(_strange("no JSON")) from error
-
-
-def _parse(model: type[_Model], document: Any) -> _Model:
-    try:
-        return model.model_validate(document)
-    except ValidationError as error:
-        raise ApiError(_strange(str(error))) from error
-
-
-def _problem(response: httpx.Response) -> Problem:
-    try:
-        problem = Problem.model_validate_json(response.content)
-        problem = problem.model_copy(update={"title": _shown(problem.title), "detail": _shown(problem.detail)})
-        if problem.status != 401:
-            return problem
-        # The orchestrator speaks of headers; who uses this client gave a token, or forgot to.
-        refused = problem.detail if "authorization" in response.request.headers else "the orchestrator wants a token"
-        return problem.model_copy(update={"detail": f"{refused}; {_GIVE_TOKEN}"})
-    except ValidationError:
-        detail = f"the answer was HTTP {response.status_code}: is this the address of an orchestrator?"
-        return Problem(title=response.reason_phrase, status=response.status_code, detail=detail)
-
-
-def _shown(text: str) -> str:
-    """What may be shown: no codes that a terminal obeys, and no more than somebody reads."""
-    return printable(text[:_LONGEST])
-
-
-def _strange(what: str) -> Problem:
-    detail = f"the orchestrator's answer is not understood: has it another version? ({what.splitlines()[0]})"
-    return Problem(title="Strange answer", status=502, detail=detail)

@@ -7,12 +7,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-_MAX_FAULTS = 10
-"""More help nobody."""
+MAX_FAULTS = 10
+"""More help nobody, and a document of some kilobytes can have a hundred thousand."""
 _BRANCH = re.compile(r"(literal|tuple|list|dict)\[.*\]", re.DOTALL)
 """What pydantic puts into a path where a value may be of several kinds; nobody wrote it."""
 
@@ -49,7 +50,7 @@ def _schema_of(model: type[BaseModel]) -> Mapping[str, Any]:
 def faults(errors: Iterable[Mapping[str, Any]], schema: Mapping[str, Any], prefix: Sequence[str] = ()) -> list[Fault]:
     """The same of errors that pydantic listed; ``schema`` is the document's JSON schema, to find known keys in."""
     found = []
-    for error in errors:
+    for error in islice(errors, MAX_FAULTS):
         path = [step for step in error["loc"] if not (isinstance(step, str) and _BRANCH.fullmatch(step))]
         if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
             detail = unknown(str(path[-1]), _keys(schema, path[:-1]))
@@ -65,7 +66,7 @@ def faults(errors: Iterable[Mapping[str, Any]], schema: Mapping[str, Any], prefi
             message = str(error["msg"]).removeprefix("Value error, ")
             detail = message[:1].lower() + message[1:]
         found.append(Fault(".".join([*prefix, *(str(p) for p in path)]), detail))
-    return found[:_MAX_FAULTS]
+    return found
 
 
 def unknown(key: str, known: Iterable[str]) -> str:

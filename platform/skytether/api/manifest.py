@@ -212,7 +212,7 @@ class Needs(Strict):
 
 
 class Limits(Strict):
-    """What a container may take at most; a process site has no limits."""
+    """What a container may take at most; of a process with a user of its own, ``pids`` alone."""
 
     cpu: Annotated[float, Field(gt=0)] | None = None
     """Cores; None: one, or what it needs if that is more. Below that, its share is by need."""

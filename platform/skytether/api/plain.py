@@ -12,6 +12,11 @@ from .faults import Fault
 
 DEPTH = 64
 """Levels of a document: what is deeper would exhaust the stack of some reader. People need ten."""
+KEYS = 4096
+"""Of a document, its lists aside. People need hundreds; each that nobody knows is a fault to find, and costs all who
+ask."""
+LISTED_KEYS = 20_000
+"""In its lists: a robot reports 16 of each of a thousand topics. Reading a robot's rows stops at a fault."""
 _WHOLE = 1 << 63
 
 _Odd = tuple[list[str], str]
@@ -28,17 +33,16 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
         document: What was read.
         text: The JSON that it was read from, where somebody wrote one.
     """
-    keys = 0
+    keys = [0, 0]
 
-    def look(value: Any, depth: int) -> _Odd | None:
+    def look(value: Any, depth: int, listed: bool) -> _Odd | None:
         """Where a request holds a hundred numbers: no place is written down before something is wrong there."""
-        nonlocal keys
         inner: Iterable[tuple[Any, Any]]
         if isinstance(value, dict):
-            keys += len(value)
+            keys[listed] += len(value)
             inner = value.items()
         elif isinstance(value, list):
-            inner = enumerate(value)
+            inner, listed = enumerate(value), True
         else:
             trouble = _of_scalar(value)
             return None if trouble is None else ([], trouble)
@@ -48,18 +52,21 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
             trouble = _of_text(key) if isinstance(key, str) else None
             if trouble is not None:
                 return [], f"one of its keys {trouble}"
-            odd = look(one, depth + 1)
+            odd = look(one, depth + 1, listed)
             if odd is not None:
                 odd[0].append(str(key))
                 return odd
         return None
 
-    odd = look(document, 0)
+    odd = look(document, 0, False)
     if odd is not None:
         place, trouble = odd[0][::-1], odd[1]
         return Fault(".".join(place if len(place) < DEPTH else place[:3]), trouble)
+    for count, most, where in zip(keys, (KEYS, LISTED_KEYS), ("", " in lists"), strict=True):
+        if count > most:
+            return Fault("", f"has more than {most} keys{where}")
     # A colon follows each key: no more colons than keys, and none was dropped; then there is no need to look again.
-    return _doubled(text) if text.count(b":") > keys else None
+    return _doubled(text) if text.count(b":") > sum(keys) else None
 
 
 def _doubled(text: bytes) -> Fault | None:

@@ -7,7 +7,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, FailFast, Field
 
 from .manifest import Name, Needs, Strict, Tier, Topics
 
@@ -76,7 +76,7 @@ class Refusal(Strict):
     site: str
     reason: str
     """Bounded, for metrics: ``tier``, ``architecture``, ``image``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``,
-    ``runtime``, ``start``, ``unreachable``, ``blocked``."""
+    ``runtime``, ``draining``, ``start``, ``unfit``, ``unreachable``, ``blocked``."""
     detail: str
 
 
@@ -187,6 +187,8 @@ _Delay = Annotated[float | None, _between(-10, 3600)]
 """One way; as wrong as the clocks of both ends are, and so perhaps negative."""
 MOST_COUNTED = 10**15
 """A counter's largest value: in bytes 4 MB/s for eight years. Sums of many such are exact in a double."""
+MOST_TOPICS = 1024
+"""In a report. Beside those of a service there is room for some of the one before it."""
 _Count = Annotated[int, Field(ge=0, le=MOST_COUNTED)]
 _Counts = Annotated[dict[Annotated[str, Field(max_length=64)], _Count], Field(max_length=64)]
 """By reasons, of which there are few."""
@@ -239,7 +241,8 @@ class Report(Strict):
     """Which counting it is of: another one begins at zero, and adds to what was counted before. Made up anew at each
     start of the robot's program; under the same one counters go on over all its sessions with a service."""
     rtt_s: _Duration = None
-    topics: Annotated[tuple[TopicReport, ...], Field(max_length=1024)] = ()
+    # Up to the first fault only: 180,000 of them, in a body that a robot may send, took a second to find and tell.
+    topics: Annotated[tuple[TopicReport, ...], Field(max_length=MOST_TOPICS), FailFast()] = ()
     control_source: Annotated[str, Field(max_length=16)] | None = None
     """Who drives: ``cloud``, ``fallback`` or ``stop``."""
     fallback_transitions: _Counts = {}
@@ -290,6 +293,19 @@ class SiteCreate(Strict):
     """Patterns (``registry.example/*``) of the images that may run there."""
 
 
+class Unfit(Strict):
+    """A service that a site failed to start, and of which it gets no more for a while."""
+
+    service: str
+    reason: str
+    """How the last start ended; continues "the service ..."."""
+    failures: int
+    """In a row; those that were under way together count once."""
+    robots: tuple[str, ...]
+    """Whose instances failed, two at most; one alone: it holds for that robot only. None: for standbys only."""
+    until: datetime
+
+
 class Site(SiteCreate):
     """A site and what is known of it."""
 
@@ -299,7 +315,7 @@ class Site(SiteCreate):
     """Why it is not ready."""
     isolation: tuple[str, ...] = ()
     """What holds its instances: ``own user`` (each has another) or ``user 65532`` (of all containers), ``own mounts``,
-    ``Landlock 7``, ``seccomp``; empty: nothing that the orchestrator knows of."""
+    ``own processes``, ``Landlock 7``, ``seccomp``; empty: nothing that the orchestrator knows of."""
     cpu: float | None = None
     memory_mb: int | None = None
     gpu: int | None = None
@@ -307,6 +323,10 @@ class Site(SiteCreate):
     load: float | None = None
     """Share of its processors that is busy."""
     instances: int = 0
+    unfit: tuple[Unfit, ...] = ()
+    """What it failed to start, as far as the orchestrator that leads has seen; told by that one, and to operators."""
+    draining: bool = False
+    """It takes no more instances, and is deleted with its last one."""
 
 
 TokenLife = Annotated[float, Field(ge=1, le=10 * 365 * 86_400)]
@@ -335,6 +355,10 @@ class RobotUse(Strict):
     cpu: float = 0.0
     """Cores."""
     memory_mb: int = 0
+    streams: int = 0
+    """Logs and events that it follows at the orchestrator that was asked."""
+    data_mb: int = 0
+    """MiB that its services have written and left at all sites, as the orchestrator that leads weighed them last."""
 
 
 class StopRobot(Strict):

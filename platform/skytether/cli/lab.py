@@ -73,7 +73,7 @@ def start(
     """Time from a robot's request over REST to the first velocity command that it accepts.
 
     With docker, the images must be there (`make images`), and `docker run` of the same image is timed in turn, until
-    its service listens.
+    its service listens; each after three seconds of rest.
     """
     from rich.table import Table
 

@@ -34,6 +34,7 @@ def hostile(
     else:
         table = Table("", "measured", title=f"{row.robots} robots, one of them hostile for {row.minutes:g} min")
         table.add_row("renewals of the others, p50 / p99", f"{row.renew_p50_ms:.1f} / {row.renew_p99_ms:.1f} ms")
+        table.add_row("the same at the orchestrator, p99", f"{row.served_p99_ms:.1f} ms")
         table.add_row("the same before, p99", f"{row.quiet_p99_ms:.1f} ms")
         table.add_row("without a good answer", f"{row.failed} of {row.renewals}")
         table.add_row("instances of the others that ended", str(row.ended_wrongly))

@@ -36,7 +36,10 @@ def run(
     catalog: Annotated[Path | None, typer.Option(help="Folder of manifests beside the built-in ones.")] = None,
     database: Annotated[
         str | None,
-        typer.Option(help="postgresql://USER@HOST/NAME; without it SQLite in the state folder."),
+        typer.Option(
+            help="postgresql://USER@HOST/NAME, without a password: all users see arguments. Without it SQLite in the "
+            "state folder."
+        ),
     ] = None,
     secrets_dir: Annotated[
         Path | None,
@@ -62,7 +65,7 @@ def run(
     Every key of the configuration is a variable of the environment too, which goes before the file; options go before
     both. TLS, logs, limits and the reconciler's patience are set there: see `skytether orchestrator config`.
     """
-    from skytether.orchestrator.config import load
+    from skytether.orchestrator.config import load, seen_by_others
     from skytether.orchestrator.errors import InvalidError
     from skytether.orchestrator.server import StartError
     from skytether.orchestrator.server import run as serve
@@ -79,7 +82,10 @@ def run(
         "open_metrics": open_metrics,
     }
     try:
-        serve(load(config, os.environ, given))
+        settings = load(config, os.environ, given)
+        if warning := seen_by_others(config, given):
+            typer.echo(f"warning: {warning}", err=True)
+        serve(settings)
     except InvalidError as error:
         fail(str(error), 2)
     except StartError as error:

@@ -61,6 +61,11 @@ def _complain(sentence: str) -> None:
     console.print(sentence, markup=False, soft_wrap=True)
 
 
+def print_foreign(text: str) -> None:
+    """What a service wrote, as it wrote it; but a terminal gets no codes of it, which could write all over it."""
+    typer.echo(printable(text.expandtabs()) if sys.stdout.isatty() else text, nl=False)
+
+
 def print_json(document: Any) -> None:
     """Print one JSON document on standard output, and nothing else."""
     json.dump(document, sys.stdout, allow_nan=False, separators=(",", ":"))

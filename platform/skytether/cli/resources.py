@@ -10,7 +10,7 @@ import typer
 
 from . import names
 from .connection import Json, TokenFile, Url, connected
-from .output import console, fail, or_dash, plain, print_json, print_table
+from .output import console, fail, or_dash, plain, print_foreign, print_json, print_table
 from .waiting import until_running
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from skytether.api.rest import GateReport, StopOrder
+    from skytether.api.rest import GateReport, Site, StopOrder
 
 service_app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
 site_app = typer.Typer(help="Where instances run.", no_args_is_help=True)
@@ -76,9 +76,15 @@ def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False
         print_json([plain(site) for site in found])
         return
     rows = [
-        (s.name, s.tier, s.runtime, s.state, or_dash(s.cpu), or_dash(s.memory_mb), s.instances, s.reason) for s in found
+        (s.name, s.tier, s.runtime, s.state, or_dash(s.cpu), or_dash(s.memory_mb), s.instances, _why(s)) for s in found
     ]
     print_table(("site", "tier", "runtime", "state", "cores", "MiB", "instances", "reason"), rows)
+
+
+def _why(site: Site) -> str:
+    """What is wrong with a site: with all of it, or with single services there."""
+    unfit = (f"no {u.service} before {u.until:%H:%M:%S} UTC: the service {u.reason}" for u in site.unfit)
+    return "; ".join(filter(None, ("draining" if site.draining else "", site.reason, *unfit)))
 
 
 @site_app.command("show")
@@ -139,10 +145,18 @@ def _value(text: str) -> Any:
 
 
 @site_app.command("delete")
-def delete_site(name: SiteName, url: Url = None, token_file: TokenFile = None) -> None:
+def delete_site(
+    name: SiteName,
+    drain: Annotated[
+        bool, typer.Option("--drain", help="Take no more instances, and go with the last one; this cannot be undone.")
+    ] = False,
+    url: Url = None,
+    token_file: TokenFile = None,
+) -> None:
     """Forget a site that has no instances."""
     with connected(url, token_file) as client:
-        client.delete_site(name)
+        if not client.delete_site(name, drain=drain):
+            console.print(f"site {name} takes no more instances, and is deleted when those that are there have ended")
 
 
 @instance_app.command("list")
@@ -226,13 +240,13 @@ def show_logs(
     with connected(url, token_file) as client:
         if follow:
             for text in client.follow_logs(instance, tail, lambda: console.print(_RESUMED)):
-                typer.echo(text, nl=False)
+                print_foreign(text)
             return
         text = client.logs(instance, tail)
     if json:
         print_json({"instance": instance, "lines": text.splitlines()})
     else:
-        typer.echo(text, nl=False)
+        print_foreign(text)
 
 
 @instance_app.command("migrate")
@@ -296,6 +310,8 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
             f"{r.use.instances} of {r.quota.instances}",
             f"{r.use.cpu:g} of {r.quota.cpu:g}",
             f"{r.use.memory_mb} of {r.quota.memory_mb}",
+            f"{r.use.data_mb} of {r.quota.data_mb}",
+            f"{r.use.streams} of {r.quota.streams}",
             _gate(r.gate, r.gate_heard_at),
             _stop(r.stop),
         )
@@ -309,6 +325,8 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
         "instances",
         "cores",
         "memory MiB",
+        "data MiB",
+        "streams",
         "gate",
         "stop from afar",
     )

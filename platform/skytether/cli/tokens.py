@@ -46,7 +46,7 @@ def create_token(
     scope: Annotated[
         list[str] | None,
         typer.Option(
-            help="read, instances, catalog, sites, robots, tokens or metrics; may be given again.",
+            help="read, instances, sessions, catalog, sites, robots, tokens or metrics; may be given again.",
             autocompletion=names.scopes,
         ),
     ] = None,
@@ -100,9 +100,9 @@ def delete_token(
     url: Url = None,
     token_file: TokenFile = None,
 ) -> None:
-    """Revoke a token by its id, and the one that it was renewed by."""
+    """Revoke a token by its id, and those that it was renewed by."""
     with connected(url, token_file) as client:
-        need("token", token, lambda: [row.id for row in client.tokens()])
+        need("token", token, lambda: [id_ for row in client.tokens() for id_ in (row.id, row.family)])
         client.delete_token(token)
 
 

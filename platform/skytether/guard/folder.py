@@ -8,6 +8,9 @@ import stat
 import struct
 
 _CREDENTIALS = struct.Struct("iII")
+ROOM = socket.CMSG_SPACE(_CREDENTIALS.size)
+"""Of a sender's credentials, beside a datagram."""
+_NOBODY = -1
 
 
 def objection(folder: str) -> str:
@@ -61,12 +64,60 @@ def _peer(link: socket.socket) -> tuple[int, int, int]:
     return process, user, group
 
 
-def sender(ancillary: list[tuple[int, int, bytes]]) -> int | None:
-    """The user who sent a datagram to a socket with SO_PASSCRED, as the kernel says; None: it does not."""
+def sender(ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
+    """User and group who sent a datagram to a socket with SO_PASSCRED, as the kernel says; -1: it does not."""
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
-            return int(_CREDENTIALS.unpack(data[: _CREDENTIALS.size])[1])
-    return None
+            _, user, group = _CREDENTIALS.unpack(data[: _CREDENTIALS.size])
+            return user, group
+    return _NOBODY, _NOBODY
+
+
+class Known:
+    """Who may be at the other end of a datagram socket with a path: the own user, root and the folder's owner.
+
+    Where the folder hands its group down (chgrp GROUP, chmod g+s), so may whoever has that as the group of their
+    process (``Group=`` of a unit; further groups of a user do not count, for the kernel does not tell them).
+
+    Args:
+        path: Of the socket, or where it will be.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        folder = os.path.dirname(path) or "."
+        found = os.stat(folder)
+        self._users = trusted(folder)
+        self._group = found.st_gid if found.st_mode & stat.S_ISGID else _NOBODY
+
+    @classmethod
+    def of(cls, source: socket.socket) -> Known | None:
+        """Of a socket that was bound; None: it has no path, and whoever has a way to it was given it."""
+        path = source.getsockname() if source.family == socket.AF_UNIX else ""
+        return cls(path) if path and isinstance(path, str) else None
+
+    def objection(self, user: int, group: int) -> str:
+        """Why somebody is not; empty: they are."""
+        if user in self._users or group == self._group != _NOBODY:
+            return ""
+        who = f"the user {user}" if user != _NOBODY else "a user of whom nothing is known"
+        return f"it is {who}, to whom {os.path.dirname(self._path)} does not belong"
+
+    def objection_to_listener(self) -> str:
+        """The same of who made the socket that is there now, its user alone. Raises OSError: there is none.
+
+        Its group says nothing: in a folder that hands its own down every file has that, whoever made it.
+        """
+        for found in (os.lstat(self._path), os.stat(self._path)):  # who made a link may point it elsewhere at any time
+            if why := self.objection(found.st_uid, _NOBODY):
+                return why
+        return ""
+
+
+def objection_to(link: socket.socket, path: str) -> str:
+    """Why the other end of a connected stream socket may not be whom its path promises; empty: it may."""
+    _, user, group = _peer(link)
+    return Known(path).objection(user, group)
 
 
 def _writable(found: os.stat_result) -> bool:

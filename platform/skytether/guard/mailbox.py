@@ -14,11 +14,13 @@ from .descriptors import refuse
 from .wheels import Address
 
 MODE = 0o660
-"""Of a path: for the user and the group."""
+"""Of a path: for the user and the group; who of the group is heard, `folder.Known` says."""
 
 
 def bind(address: Address, mode: int = MODE) -> socket.socket:
-    """A socket that never waits; a path that is left from before is taken over, and has its mode from the beginning.
+    """A socket that never waits, and is told who sends.
+
+    A path that is left from before is taken over, and has its mode from the beginning.
 
     Raises:
         OSError: The address cannot be had.
@@ -28,6 +30,7 @@ def bind(address: Address, mode: int = MODE) -> socket.socket:
     made.setblocking(False)
     if family == socket.AF_UNIX:
         refuse(made)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
     try:
         if isinstance(address, str):
             with suppress(FileNotFoundError):

@@ -89,10 +89,13 @@ class Requests:
                 client, _ = self._listener.accept()
             except OSError:  # nobody more
                 return
-            if peer(client) not in (0, os.geteuid()):  # the path's mode says so too: two locks are better than one
-                client.close()
-                continue
             client.setblocking(False)
+            user = peer(client)
+            if user not in (0, os.geteuid()):  # the path's mode says so too: two locks are better than one
+                with suppress(OSError):
+                    receive(client, _LARGEST)  # what was not read when a socket is closed takes the answer along
+                self._send(client, {"refused": f"you are the user {user}, and only {os.geteuid()} and root may ask"})
+                continue
             if len(self._clients) >= _CLIENTS:
                 idle = [known for known, pending in self._clients.items() if pending is None]
                 self._drop(next(iter(idle or self._clients)))

@@ -9,10 +9,16 @@ the other one has either seen that or cannot speak any more:
 - The first, once the second may speak (`LATE` periods after its claim), claims too and waits for a period, in which
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
+
+Whoever turns the wheels may be held up, and read later what waits for it. Once no more can be sent to it, nobody knows
+whether they turn: it is told what goes on from the last velocity, or, when that was too long ago, nothing until it has
+read all and the wheels stand by themselves. A word between them and a standstill would be a jump for one of the two.
+Only a stop is not kept waiting.
 """
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from math import isnan, nan
 from typing import Protocol
@@ -28,6 +34,9 @@ LATE = 0.75
 """Periods."""
 _SOON = 0.5
 """Periods. So much later than the second's claim the first may still speak without a claim of its own."""
+_UNREAD = "their driver does not read what it is sent"
+_LATER = 2
+"""Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
 _AGAIN_S = 1.0
 """Between attempts on a way that is broken; meanwhile the other one speaks."""
 
@@ -48,9 +57,14 @@ class Wheels(Protocol):
         """What the wheels do until the next call. Returns at once.
 
         Raises:
+            BlockingIOError: What was sent before waits to be read, and there is no room for more.
             OSError: There is nobody whom anybody could tell anything.
             Exception: This way to them is broken.
         """
+        ...
+
+    def full(self) -> bool:
+        """Whether there is no room for more, as what was sent before waits to be read."""
         ...
 
     def listeners(self) -> frozenset[str] | None:
@@ -82,6 +96,7 @@ class Teller:
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers = False
         self._broken_at = nan
+        self._full_at = nan
         self._own, self._claim = board.of(role)  # of who had the role before
 
     def look(self) -> None:
@@ -102,6 +117,7 @@ class Teller:
             is silent.
 
         Raises:
+            BlockingIOError: Who turns the wheels does not read. It counts as silence.
             OSError: There is nobody whom anybody could tell anything. It counts as a standstill.
             Exception: This way to them is broken. It counts as silence.
         """
@@ -110,12 +126,17 @@ class Teller:
             return False
         if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:
             self._failed(now)  # they know nothing of what was told before, and nobody else has told them
+        if not stopped and self._waits(now):
+            return False
         velocity, _ = self._watch.want(now, stopped)
         at = self._clock()
         if at - now > LATE * self._period_s or not self._may(at):
             return False
         try:
             self._wheels.write(velocity)
+        except BlockingIOError:
+            self._full_at = at
+            raise BlockingIOError(errno.EAGAIN, _UNREAD) from None
         except OSError:
             self._failed(now)
             raise
@@ -124,6 +145,27 @@ class Teller:
             raise
         self._watch.wrote(velocity, now)
         self._put(self._watch.told)
+        return True
+
+    def _waits(self, now: float) -> bool:
+        """Whether the wheels may still turn by what they read late, and what is told now begins at a standstill.
+
+        Raises:
+            BlockingIOError: They have not read it yet.
+        """
+        if isnan(self._full_at):
+            return False
+        full = self._wheels.full()
+        if full:
+            self._full_at = now
+        if self._watch.goes_on(now):
+            return False
+        if not 0 <= now - self._full_at <= self._watch.patience_s + _LATER * self._period_s:
+            self._full_at = nan
+            return False
+        self._put(self._own, now)  # a sign, for the other one knows less
+        if full:
+            raise BlockingIOError(errno.EAGAIN, _UNREAD)
         return True
 
     def _may(self, at: float) -> bool:

@@ -1,7 +1,8 @@
 """What the wheels are told next. Pure: time is an argument.
 
 It starts from what the wheels were really told last, never from what somebody wanted: a gap in the telling, a failed
-write, or nobody who listens counts as standstill, because drives that hear nothing stop by themselves.
+write, or nobody who listens counts as standstill, because drives that hear nothing stop by themselves; and that is what
+they are told first.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class Watch:
 
     Args:
         bounds: Of the wheels.
-        period_s: Of the loop; what a step counts for when the time before is not known [s].
+        period_s: Of the loop; what a step counts for when the clock went back [s].
         patience_s: Oldest word that is followed, and longest gap in the telling that is no standstill [s].
     """
 
@@ -29,7 +30,7 @@ class Watch:
         """What the wheels were told last."""
         self._bounds = bounds
         self._period_s = period_s
-        self._patience_s = patience_s
+        self.patience_s = patience_s
         self._beat: Beat | None = None
 
     def hear(self, beat: Beat) -> None:
@@ -65,13 +66,17 @@ class Watch:
         """
         target, wrong = self.target(now, stopped)
         gap = now - self.told.at
-        if 0 <= gap <= self._patience_s:
+        if self.goes_on(now):
             base, step = self.told.velocity, gap
-        elif gap > self._patience_s or not isfinite(self.told.at):
-            base, step = STANDSTILL, self._period_s
+        elif gap > self.patience_s or not isfinite(self.told.at):
+            base, step = STANDSTILL, 0.0
         else:  # the clock went back, or is no number
             return brake(self._bounds, self.told.velocity, self._period_s), wrong or "has a clock that went back"
         return toward(self._bounds, base, target, step), wrong
+
+    def goes_on(self, now: float) -> bool:
+        """Whether what was told last still holds, and the next velocity begins there."""
+        return 0 <= now - self.told.at <= self.patience_s
 
     def target(self, now: float, stopped: bool = False) -> tuple[Velocity, str]:
         """Where the wheels are to get, however far that is; see `want`."""
@@ -102,7 +107,7 @@ class Watch:
         target, wrong = self.target(now, stopped)
         if wrong or self._beat is None or target != self.told.velocity:
             return now + self._period_s
-        return min(now + repeat_s, self._beat.at + self._patience_s + _ROUNDING)
+        return min(now + repeat_s, self._beat.at + self.patience_s + _ROUNDING)
 
     def _clipped(self, velocity: Velocity) -> Velocity:
         """Without what rounding has put beyond the limits."""
@@ -114,7 +119,7 @@ class Watch:
 
     def _wrong(self, now: float) -> str:
         beat, bounds = self._beat, self._bounds
-        if beat is None or not 0 <= now - beat.at + _ROUNDING <= self._patience_s:
+        if beat is None or not 0 <= now - beat.at + _ROUNDING <= self.patience_s:
             return "says nothing"
         linear, angular = beat.velocity
         if not _finite(beat.velocity):

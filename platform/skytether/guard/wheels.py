@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import select
 import socket
 
 from .descriptors import receive
+from .folder import Known
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
 from .velocity import Velocity
 
@@ -31,10 +34,20 @@ class SocketWheels:
             self._socket = _connected(self._address)
         try:
             self._socket.send(pack_twist(velocity))
+        except BlockingIOError:  # the same driver is there, and may read yet
+            raise
         except OSError:
             self._socket.close()
             self._socket = None
             raise
+
+    def full(self) -> bool:
+        """Wheels: ask the kernel."""
+        if self._socket is None:
+            return False
+        room = select.poll()
+        room.register(self._socket, select.POLLOUT)
+        return not room.poll(0)
 
     def listeners(self) -> frozenset[str] | None:
         """Wheels: not known; a driver that starts anew is a write that fails."""
@@ -101,6 +114,8 @@ def _connected(address: Address) -> socket.socket:
     made = socket.socket(family_of(address), socket.SOCK_DGRAM)
     made.setblocking(False)
     try:
+        if isinstance(address, str) and (why := Known(address).objection_to_listener()):
+            raise PermissionError(errno.EPERM, f"whoever listens at {address} may not have the wheels: {why}")
         made.connect(address)
     except OSError:
         made.close()

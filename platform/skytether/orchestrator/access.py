@@ -39,7 +39,7 @@ _SEEN_EVERY = 10.0
 """Seconds between two notes that a robot was seen: one write per request would be too much."""
 
 _RECENT = 10.0
-"""Seconds for which a token that was good is good enough to measure a round trip."""
+"""Seconds for which a token that was good is good enough to measure a round trip, and to read a renewal."""
 _MOST_RECENT = 4096
 _PER_REQUEST = 8192
 """Bytes of a body that count as another request: a renewal with a report on twenty topics."""
@@ -123,18 +123,40 @@ class Access:
             TooManyError: They asked too often; an operator never does.
         """
         try:
+            principal = self.verify(token)
+        except UnauthenticatedError:
+            if wait := self._throttle.wait(f"address {address}"):
+                raise TooManyError(wait) from None
+            raise
+        self.spend(principal)
+        return principal
+
+    def verify(self, token: str | None) -> Principal:
+        """The same without taking a request.
+
+        Raises:
+            UnauthenticatedError: Nobody we know.
+        """
+        digest = _digest(token or "")
+        try:
             principal = self._find(token)
         except UnauthenticatedError:
-            self._spend(f"address {address}")
+            self._recent.pop(digest, None)
             raise
-        if principal.robot is not None:
-            self._spend(principal.owner)
-        if token:
-            self._recent[_digest(token)] = principal, time.monotonic()
-            while len(self._recent) > _MOST_RECENT:
-                with contextlib.suppress(KeyError):  # another thread did
-                    self._recent.popitem(last=False)
+        self._recent[digest] = principal, time.monotonic()
+        while len(self._recent) > _MOST_RECENT:
+            with contextlib.suppress(KeyError):  # another thread did
+                self._recent.popitem(last=False)
         return principal
+
+    def spend(self, principal: Principal) -> None:
+        """Take a request; an operator's are free.
+
+        Raises:
+            TooManyError: They asked too often.
+        """
+        if principal.robot is not None and (wait := self._throttle.wait(principal.owner)):
+            raise TooManyError(wait, who=principal.owner)
 
     def recent(self, token: str | None) -> Principal | None:
         """Who showed this token in the last seconds, at once: for what tells nothing that matters, takes no request.
@@ -146,18 +168,13 @@ class Access:
         if principal is None or time.monotonic() - at > _RECENT:
             return None
         if principal.robot is not None and (wait := self._throttle.empty(principal.owner)):
-            raise TooManyError(wait)
+            raise TooManyError(wait, who=principal.owner)
         return principal
 
     def charge(self, principal: Principal, length: int) -> None:
         """Reckon a body's length [bytes]: a robot's large request is as much work as several small ones."""
         if principal.robot is not None:
             self._throttle.charge(principal.owner, length / _PER_REQUEST)
-
-    def _spend(self, caller: str) -> None:
-        wait = self._throttle.wait(caller)
-        if wait:
-            raise TooManyError(wait)
 
     def _find(self, token: str | None) -> Principal:
         if not token:
@@ -274,12 +291,13 @@ class Access:
     def forget(self, by: Principal, id_: str) -> None:
         """A token, and those that it was renewed by or renewed, are worth nothing from now on.
 
-        One that is gone already is no error.
+        One that is gone already is no error. The first of them names them all, also when only later ones are left: its
+        id is what an operator has noted, while a thief may have renewed it since.
 
         Raises:
             ForbiddenError: It may more than the one who asks.
         """
-        row = self._store.token(id_)
+        row = next((row for row in self._store.tokens() if id_ in (row.id, row.family)), None)
         if row is not None:
             _require_all(by, row.robot, row.scopes)
             self._store.delete_family(row.family)

@@ -11,6 +11,7 @@ from . import docs_page, problems
 from .core import Orchestrator
 from .hosts import Hosts, own_names
 from .logs import Audit
+from .pause import Pause
 from .reception import Reception
 from .routers import catalog, health, instances, robots, sites, tokens
 from .routers.deps import plain_request
@@ -35,7 +36,16 @@ def create_app(core: Orchestrator) -> FastAPI:
     problems.install(app)
     for part in (catalog, sites, instances, robots, tokens, health, docs_page):
         app.include_router(part.router)
-    app.add_middleware(Reception, doorman=core, limits=core.settings.limits, strain=core.strain)
+    pause = Pause()
+    app.add_middleware(
+        Reception,
+        doorman=core,
+        limits=core.settings.limits,
+        strain=core.strain,
+        pause=pause,
+        on_renewed=core.metrics.renewed,
+    )
+    app.add_middleware(problems.GivenUp)
     app.add_middleware(Audit)
-    app.add_middleware(Hosts, names=own_names(core.settings))
+    app.add_middleware(Hosts, names=own_names(core.settings), pause=pause)
     return app

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from skytether.guard.folder import Known
+
 log = logging.getLogger(__name__)
 
 START = "0" * 64
@@ -82,6 +84,8 @@ def _verify(file: Path, noted: str | None) -> Checked:
                 place = f"{path}, line {at}"
                 if line is None or line["hash"] != _digest({k: v for k, v in line.items() if k != "hash"}):
                     raise AuditError(f"{place}: not as it was written")
+                if text.removesuffix(b"\n") != _text(line):  # a key twice, say: the hash is of what JSON makes of it
+                    raise AuditError(f"{place}: not as it was written")
                 if not first:
                     first = line["n"]
                     if first == 1 and line["before"] != START:
@@ -122,7 +126,7 @@ class ChainFile(logging.Handler):
             if self._file.tell() >= self._most:
                 self._next()
             line = sealed(json.loads(self.format(record)), self._number + 1, self._before)
-            self._write((json.dumps(line) + "\n").encode())
+            self._write(_text(line) + b"\n")
             self._number, self._before = line["n"], line["hash"]
         except OSError as error:
             log.error("the audit file %s takes no line (%s): %s", self._path, error.strerror, record.getMessage())
@@ -234,6 +238,8 @@ class Sink(logging.Handler):
         made = socket.socket(family, socket.SOCK_DGRAM)
         made.setblocking(False)
         try:
+            if isinstance(self._address, str) and (why := Known(self._address).objection_to_listener()):
+                raise PermissionError(errno.EPERM, f"whoever listens there may not have the audit: {why}")
             made.connect(self._address)
         except OSError:
             made.close()
@@ -291,10 +297,14 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
     """A line; None: it is none of ours."""
     try:
         line = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     ours = isinstance(line, dict) and isinstance(line.get("n"), int)
     return line if ours and isinstance(line.get("hash"), str) and isinstance(line.get("before"), str) else None
+
+
+def _text(line: dict[str, Any]) -> bytes:
+    return json.dumps(line).encode()
 
 
 def _digest(line: dict[str, Any]) -> str:

@@ -39,6 +39,7 @@ def backup(state_dir: Path, to: Path) -> list[str]:
     copied = []
     try:
         if (state_dir / DATABASE).exists():
+            os.close(os.open(to / DATABASE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # whatever the umask says
             with (
                 closing(sqlite3.connect(state_dir / DATABASE)) as source,
                 closing(sqlite3.connect(to / DATABASE)) as copy,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import yaml
 from pydantic import BaseModel
@@ -56,6 +57,29 @@ def load(file: Path | None, environment: Mapping[str, str], given: Mapping[str, 
         if value is not None:
             document[key] = value
     return parse(Settings, document, str(file) if file is not None else "")
+
+
+def seen_by_others(file: Path | None, given: Mapping[str, Any]) -> str:
+    """How other users of the machine read the database's password; empty: not by what is given here."""
+    instead = "write it into a file with mode 0600 (?passfile=FILE in the address, as PostgreSQL's clients read it)"
+    if _has_password(given.get("database_url")):
+        return f"other users of this machine can read the database's password among the arguments: {instead}"
+    if (
+        file is not None
+        and file.is_file()
+        and file.stat().st_mode & 0o007
+        and _has_password(_read(file).get("database_url"))
+    ):
+        return f"other users of this machine can read the database's password in {file}: chmod 600 it, or {instead}"
+    return ""
+
+
+def _has_password(address: object) -> bool:
+    try:
+        parts = urlsplit(str(address or ""))
+    except ValueError:  # no address at all: it is refused later
+        return False
+    return bool(parts.password or parse_qs(parts.query).get("password"))
 
 
 def _read(file: Path) -> dict[str, Any]:

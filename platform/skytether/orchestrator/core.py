@@ -12,10 +12,12 @@ from sqlalchemy.exc import ProgrammingError, SQLAlchemyError
 
 from skytether.api.report_metrics import Owner
 from skytether.api.rest import GateReport, Report, ScrapeTargets
+from skytether.guard.clock import now as boottime
 
 from .access import Access, Principal
 from .accounts import Account
 from .catalogue import Catalogue
+from .clocks import SharedClock
 from .db import GONE
 from .discovery import advertised, named, targets
 from .errors import OutdatedError
@@ -36,6 +38,7 @@ from .settings import Settings
 from .sites import Sites, load_runtime
 from .stops import Stops
 from .store import Store
+from .stored import Stored
 from .strain import Strain
 from .throttle import Throttle
 
@@ -54,14 +57,14 @@ class Orchestrator:
     def __init__(
         self,
         settings: Settings,
-        clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] | None = None,
         find_runtime: Callable[[str], type[Runtime]] = load_runtime,
     ) -> None:
         """Read or make the secrets; nothing runs before ``start``.
 
         Args:
             settings: Its state folder is made if it is not there.
-            clock: Seconds since the epoch.
+            clock: Seconds since the epoch; None: the database server's, where there is one, or this machine's.
             find_runtime: Gives a runtime by its name; by entry point unless told otherwise.
 
         Raises:
@@ -69,16 +72,18 @@ class Orchestrator:
         """
         close_folder(settings.state_dir, with_database=settings.database_url is None)
         self.settings = settings
-        self._clock = clock
         self._outdated_since: float | None = None
         self._told_why = ""
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
+        self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
+        clock = self._clock = clock or self._shared_clock or time.time
         self.store.key_id = lambda: secrets.fingerprint
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
-        self.quotas = Quotas(self.store, settings.quotas)
+        self.stored = Stored(lambda: self.sites.stored(), settings.quotas)
+        self.quotas = Quotas(self.store, settings.quotas, self.stored)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.broker = Broker()
@@ -91,8 +96,9 @@ class Orchestrator:
             self._accounts,
             self._gates,
             self.quotas,
+            lambda: self.leadership.epoch,
         )
-        self.leadership = Leadership(self.store.lock(), self._elected)
+        self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
         self.catalogue = Catalogue(self.store, settings.catalog)
         self.strain = Strain()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
@@ -107,9 +113,10 @@ class Orchestrator:
             settings.weights,
             clock,
             self._wake_placer,
-            lambda: self.leadership.leads,
+            self.leadership,
             strain=self.strain,
             site_instances=settings.quotas.site_instances,
+            stored=self.stored,
         )
         self.sites = Sites(
             settings.state_dir / "sites",
@@ -164,6 +171,20 @@ class Orchestrator:
         """Who showed this token in the last seconds: see ``Access.recent``. Does not wait."""
         return None if self.refuses else self.access.recent(token)
 
+    def spend(self, caller: Principal) -> None:
+        """Take a request of who was known a moment ago: see ``Access.spend``."""
+        self.access.spend(caller)
+
+    def verify(self, token: str | None) -> Principal:
+        """As ``authenticate``, without taking a request.
+
+        Raises:
+            OutdatedError: This orchestrator has no say any more.
+        """
+        if self.refuses:
+            raise OutdatedError
+        return self.access.verify(token)
+
     def charge(self, caller: Principal, length: int) -> None:
         """Reckon what a body of this length costs whoever sent it."""
         self.access.charge(caller, length)
@@ -177,6 +198,8 @@ class Orchestrator:
         """
         self.catalogue.load(self.settings.catalogue_dir)
         self.store.migrate()
+        if self._shared_clock is not None:
+            self._shared_clock.look()
         if not self.rotation.agree():
             raise SecretFileError(
                 "the database belongs to orchestrators with another secret.key: give this one the same (--secrets-dir)"
@@ -193,7 +216,7 @@ class Orchestrator:
             self._write()
             # Another one leads, and cannot know whom this one refused.
             if not self.leadership.leads and (self.strain.felt() or self.strain.owed()):
-                self.store.extend_leases(self._clock())
+                self.store.extend_leases(self._clock(), at_least=True)
         return PERIOD
 
     def _write(self) -> None:
@@ -204,7 +227,11 @@ class Orchestrator:
         if self.look_outdated():
             self.leadership.end()
             return _SECOND
-        return self.leadership.step()
+        delay = self.leadership.step()
+        if self._shared_clock is not None:
+            with contextlib.suppress(*GONE):
+                self._shared_clock.look()
+        return delay
 
     def _unless_outdated(self, step: Callable[_Args, float]) -> Callable[_Args, float]:
         """A loop's step that waits from then on."""
@@ -242,10 +269,6 @@ class Orchestrator:
         elif not outdated:
             self._outdated_since = None
         return outdated
-
-    def _elected(self) -> None:
-        self.store.extend_leases(self._clock())  # nobody could renew while there was no orchestrator at all
-        self.sites.reopen()
 
     def stop(self) -> None:
         """Stop reconciling; with ``stop_instances`` end all instances first, otherwise they run on."""

@@ -15,7 +15,7 @@ from skytether.api.rest import GateReport, Scope, SiteCreate
 
 from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
-from .leader import Lock, lock_of
+from .leader import Lock, lock_of, look_at_fence
 from .models import facts, gates, robots, services, sites, stops, tokens
 from .security import TokenHash
 
@@ -84,6 +84,7 @@ _HOLDERS = (
     .where(tokens.c.prefix == bindparam("prefix"))
 )
 """Made once: every request asks it."""
+_SITES = select(*(column for column in sites.c if column is not sites.c.draining)).order_by(sites.c.name)
 _HEAR_GATE = text(
     "INSERT INTO gates (robot, at, report) SELECT name, :at, :report FROM robots WHERE name = :of_robot"
     " ON CONFLICT (robot) DO UPDATE SET at = excluded.at, report = excluded.report"
@@ -97,6 +98,9 @@ class Database:
     def __init__(self, url: str, name: str = NAME) -> None:
         """``name`` is what a database server lists its connections under."""
         self._engine = make_engine(url, name)
+        self._apart = reading(make_engine(url, name, tried=False) if self.served else self._engine)
+        """Connections of its own for who leads: a crowd of requests keeps those of the other waiting. Each statement is
+        one round trip, for the lead is lost where a few of them take longer than it lasts."""
         self._reader = reading(self._engine)
         self._writer = self._engine.execution_options(immediate=True)
         self._turn = threading.Lock()
@@ -112,6 +116,7 @@ class Database:
         turn = self._engine.dialect.name == "sqlite" and self._turn.acquire(timeout=SQLITE_PATIENCE)
         try:
             with self._reader.connect() if alone else self._writer.begin() as connection:
+                look_at_fence(connection)
                 yield connection
         finally:
             if turn:
@@ -123,16 +128,26 @@ class Database:
 
     def outdated(self) -> bool:
         """Whether a newer orchestrator has brought the database to a schema that this one does not know."""
-        with self._engine.connect() as connection:
+        with self._apart.connect() as connection:
             return bool(connection.scalar(text("SELECT version_num FROM alembic_version")) != self._schema)
 
     def lock(self) -> Lock:
         """The lock of whoever leads over this database."""
-        return lock_of(self._engine)
+        return lock_of(self._apart if self.served else self._engine)
+
+    @property
+    def served(self) -> bool:
+        """Whether a server has it, for orchestrators on several machines."""
+        return self._engine.dialect.name == "postgresql"
+
+    def now(self) -> float:
+        """Seconds since the epoch, by the server's clock."""
+        with self._apart.connect() as connection:
+            return float(connection.scalar(text("SELECT extract(epoch FROM clock_timestamp())")) or 0.0)
 
     def names(self) -> list[str]:
         """Of all connections to this database by this user, whoever's; none with SQLite, which has no server."""
-        if self._engine.dialect.name != "postgresql":
+        if not self.served:
             return []
         ours = "datname = current_database() AND usename = current_user"
         with self._reader.connect() as connection:
@@ -151,6 +166,7 @@ class Database:
             return connection.scalar(select(facts.c.value).where(facts.c.name == name)) == value
 
     def close(self) -> None:
+        self._apart.dispose()
         self._engine.dispose()
 
     def ping(self) -> None:
@@ -178,8 +194,18 @@ class Database:
 
     def sites(self) -> list[SiteCreate]:
         with self._reader.connect() as connection:
-            rows = connection.execute(select(sites).order_by(sites.c.name)).mappings()
+            rows = connection.execute(_SITES).mappings()
             return [SiteCreate.model_validate(dict(row)) for row in rows]
+
+    def draining_sites(self) -> set[str]:
+        """Those that are to be deleted with their last instance."""
+        with self._reader.connect() as connection:
+            return set(connection.scalars(select(sites.c.name).where(sites.c.draining)))
+
+    def drain_site(self, name: str) -> None:
+        """From now on; it cannot be taken back."""
+        with self._writing() as connection:
+            connection.execute(update(sites).where(sites.c.name == name).values(draining=True))
 
     def add_site(self, site: SiteCreate) -> bool:
         """False if there is one of that name."""

@@ -21,8 +21,8 @@ GONE = (OperationalError, InterfaceError, NoConnectionError)
 
 _LOCK_MS = 120_000
 """How long a migration waits for a table, or for another migration."""
-MIGRATING, LEADING = 0x736B7901, 0x736B7902
-"""Keys of PostgreSQL's advisory locks: who migrates, who leads."""
+MIGRATING = 0x736B7901
+"""Key of PostgreSQL's advisory lock of who migrates."""
 STATEMENT_S = 10
 """Seconds that PostgreSQL gives a statement before it ends it."""
 _POSTGRES = {
@@ -31,7 +31,7 @@ _POSTGRES = {
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
-    "options": f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout=30000"
+    "options": f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout=5000"
     " -c tcp_keepalives_idle=5 -c tcp_keepalives_interval=2 -c tcp_keepalives_count=3",
 }
 """A server that is gone is noticed within seconds, and by a server a leader that is gone; for one that hangs see
@@ -60,6 +60,8 @@ class AddressError(Exception):
 def _address(url: str) -> URL:
     try:
         address = make_url(url)
+        if "@" in (address.host or ""):  # of a password, which would be told as part of a host's name
+            raise AddressError("the database address cannot be used: write an @ of its password as %40")
         return address.set(drivername=_DRIVERS[address.get_backend_name()])
     except (SQLAlchemyError, ValueError, KeyError) as error:
         raise AddressError(
@@ -67,7 +69,7 @@ def _address(url: str) -> URL:
         ) from error
 
 
-def make_engine(url: str, name: str = NAME) -> Engine:
+def make_engine(url: str, name: str = NAME, *, tried: bool = True) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
@@ -75,7 +77,7 @@ def make_engine(url: str, name: str = NAME) -> Engine:
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
 
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
-    it under ``name``.
+    it under ``name``. Not ``tried``, a statement is answered sooner, and fails where the server was restarted.
 
     Raises:
         AddressError: It is neither's address, or the driver is not installed.
@@ -84,14 +86,15 @@ def make_engine(url: str, name: str = NAME) -> Engine:
     if address.get_backend_name() == "postgresql":
         connect_args = {**_POSTGRES, "application_name": name}
         try:
-            made = create_engine(address, pool_pre_ping=True, connect_args=connect_args, **_JSON)
-            from .postgres import Server  # its driver is an extra
+            made = create_engine(address, pool_pre_ping=tried, connect_args=connect_args, **_JSON)
+            from .postgres import Server, stood_still  # its driver is an extra
         except ImportError as error:
             raise AddressError(
                 f"PostgreSQL's driver cannot be loaded ({error}): pip install 'skytether[postgres]', or use SQLite"
             ) from error
 
         event.listen(made, "do_connect", Server().connect)
+        event.listen(made, "handle_error", stood_still)
         return made
     engine = create_engine(address, **_JSON)
     if engine.dialect.name == "sqlite":

@@ -14,13 +14,13 @@ import ipaddress
 import logging
 import math
 import socket
-import ssl
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from .certificate import LiveCertificate
 from .settings import Limits
 from .strain import Strain
 
@@ -30,8 +30,8 @@ GUEST = "skytether.guest"
 """Key of the connection's guest in an ASGI scope."""
 _SWEEP = 0.5
 """Seconds between two looks for connections that are late."""
-_AT_ONCE = 64
-"""Connections that are taken in one go, so that requests under way have their turn in between."""
+_AT_ONCE = 8
+"""Connections that are taken in one go, so that requests under way have their turn in between: some milliseconds."""
 _WITHOUT_FILES = 0.1
 """Seconds until the next attempt, when the system has no file for another connection."""
 _TAKEN_S = 30.0
@@ -144,8 +144,12 @@ class Book:
         return [guest for guest in self.guests if now >= guest.deadline or now >= guest.takes_by]
 
 
+class _AheadError(Exception):
+    """A request came before the answer to the one before."""
+
+
 class GuardedProtocol(HttpToolsProtocol):
-    """Uvicorn's, with a deadline for each part of a request, and a bound on what is not body."""
+    """Uvicorn's, with a deadline for each part of a request, a bound on what is not body, and one request at a time."""
 
     guest: Guest
     book: Book
@@ -153,6 +157,8 @@ class GuardedProtocol(HttpToolsProtocol):
     _around = 0
     _reads_body = False
     _idle = False
+    _ahead = False
+    """It has asked again before it was answered."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -164,11 +170,24 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         self._around += len(data)
+        if self._ahead:  # what comes until it is answered is thrown away, and who sends on and on is cut off
+            return self.transport.abort() if self._around > _MOST_AROUND else None
         super().data_received(data)
         if self._around > _MOST_AROUND and not self.transport.is_closing():
             self.send_400_response("The request's headers are too large.")
+        return None
+
+    def send_400_response(self, msg: str) -> None:
+        if not self._ahead:  # there is an answer under way
+            super().send_400_response(msg)
 
     def on_message_begin(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            # Thousands fit into one read, and Uvicorn keeps them all, reads on after each answer, and writes the others
+            # when nobody is there any more. So the one that is under way is answered, and the connection ends (RFC
+            # 9112, 9.3.2); the error keeps the parser from the others.
+            self._ahead, self.cycle.keep_alive = True, False
+            raise _AheadError
         self._around = 0
         super().on_message_begin()
         self.scope[GUEST] = self.guest  # type: ignore[literal-required]
@@ -228,7 +247,7 @@ class Door:
         self,
         listener: socket.socket,
         make: Callable[[], Any],
-        tls: ssl.SSLContext | None,
+        tls: LiveCertificate | None,
         limits: Limits,
         most: int,
         proxies: Iterable[str],
@@ -316,7 +335,7 @@ class Door:
             protocol.guest, protocol.book, protocol.limits = guest, self.book, self._limits
             return protocol
 
-        agreed = {"ssl": self._tls, "ssl_handshake_timeout": self._limits.head_s} if self._tls else {}
+        agreed = {"ssl": self._tls.context, "ssl_handshake_timeout": self._limits.head_s} if self._tls else {}
         try:
             await self._loop.connect_accepted_socket(make, taken, **agreed)  # type: ignore[arg-type]
         except (OSError, asyncio.CancelledError):  # it left, or what it speaks is no TLS

@@ -60,8 +60,9 @@ class OutdatedError(DomainError):
 class TooManyError(DomainError):
     """More requests than one caller may make."""
 
-    def __init__(self, wait_s: float, text: str = "") -> None:
-        """``wait_s``: until the next may be made; ``text`` instead of that they come too often."""
+    def __init__(self, wait_s: float, text: str = "", who: str = "") -> None:
+        """``wait_s``: until the next may be made; ``text`` instead of that they come too often; ``who``: it was."""
+        self.who = who
         self.retry_after = max(1, math.ceil(wait_s))
         super().__init__(text or f"too many requests: try again in {self.retry_after} s, and ask less often")
 

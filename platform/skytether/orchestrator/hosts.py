@@ -11,6 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skytether.api.hosts import is_own
 
+from .pause import Pause
 from .problems import answer
 from .settings import Settings
 
@@ -21,9 +22,10 @@ _SHOWN = 80
 class Hosts:
     """ASGI middleware: 421 for whoever asks somebody else."""
 
-    def __init__(self, app: ASGIApp, names: tuple[str, ...]) -> None:
-        """``names``: see ``own_names``."""
+    def __init__(self, app: ASGIApp, names: tuple[str, ...], pause: Pause) -> None:
+        """``names``: see ``own_names``; ``pause``: before it is refused."""
         self._app = app
+        self._pause = pause
         self._names = names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -32,6 +34,7 @@ class Hosts:
         if strange is None:
             await self._app(scope, receive, send)
             return
+        await self._pause.wait()
         text = (
             f"this orchestrator is not known as {strange[:_SHOWN]!r}: ask it by its address, or add the name to "
             "'hosts' in its configuration (SKYTETHER_HOSTS)"

@@ -125,6 +125,9 @@ class Instances:
         )
         decision = self._reconciler.weigh(record, ())  # whether it could ever run does not depend on what is there
         if decision.hopeless:
+            self._sites.refresh()  # one may have been added at another orchestrator a moment ago
+            decision = self._reconciler.weigh(record, ())
+        if decision.hopeless:
             raise self._no_site(record, decision)
         return record
 

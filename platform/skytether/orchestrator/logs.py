@@ -78,6 +78,7 @@ def set_up(logs: Logs) -> None:
     logging.basicConfig(level=logs.level.upper(), handlers=[handler], force=True)
     for chatty in _CHATTY:
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    logging.getLogger("uvicorn.error").setLevel(logging.ERROR)  # strangers make its warnings, one a request
     for sink in _sinks(logs):
         sink.setFormatter(JsonFormatter())
         audit.addHandler(sink)

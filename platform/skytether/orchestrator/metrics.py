@@ -25,6 +25,7 @@ from .runtimes.base import Capacity, Observation
 _REASON = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _MAX_REASONS = 32
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0, 30.0)
+_RENEWALS = (0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.5, 1.0, 2.0, 5.0)
 USED = {
     "instance_cpu_seconds": Described("Processor time", ("site",)),
     "instance_network_receive_bytes": Described("By the network", ("site",)),
@@ -63,6 +64,7 @@ class Metrics:
         accounts: Callable[[], Mapping[Owner, Account]] = dict,
         gates: Callable[[], Mapping[str, GateReport]] = dict,
         quotas: Quotas | None = None,
+        epoch: Callable[[], int] = int,
     ) -> None:
         """All callables are asked at each scrape.
 
@@ -74,7 +76,9 @@ class Metrics:
             accounts: What was counted, by robot and service.
             gates: What robots say of their gates now, by robot.
             quotas: What robots may have, and what was refused for that.
+            epoch: As whose leader the orchestrator acts; 0: it does not lead.
         """
+        self._epoch = epoch
         self._quotas = quotas
         self._running = running
         self._sites = sites
@@ -95,6 +99,12 @@ class Metrics:
             "One look at a site and what was done about it",
             ("site",),
             buckets=_BUCKETS,
+            registry=self._registry,
+        )
+        self._renewals = Histogram(
+            "skytether_renewal_seconds",
+            "From when the head of a robot's renewal was read until its answer began",
+            buckets=_RENEWALS,
             registry=self._registry,
         )
         self._refusals = Counter(
@@ -137,6 +147,10 @@ class Metrics:
         """One pass over a site."""
         self._passes.labels(site).observe(seconds)
 
+    def renewed(self, seconds: float) -> None:
+        """A robot's renewal was answered, and good."""
+        self._renewals.observe(seconds)
+
     def forget_site(self, site: str) -> None:
         self._passes.remove_by_labels({"site": site})
         self._start.remove_by_labels({"site": site})
@@ -166,6 +180,9 @@ class Metrics:
         }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
+        led = Sums()
+        led.put((), self._epoch())
+        yield gauge("leader_epoch", "Epoch in which this orchestrator leads; 0: another one does", (), led)
         if self._quotas is not None:
             yield from _of_quotas(self._quotas, running)
         yield _names(accounts, {robot for robot, _ in counted})
@@ -206,7 +223,15 @@ def _memory(running: Iterable[Running]) -> Family:
 
 def _of_quotas(quotas: Quotas, running: Iterable[Running]) -> Iterator[Family]:
     count, cpu, memory, streams, limits = Sums(), Sums(), Sums(), Sums(), Sums()
-    for robot, use in use_by_robot(one.record for one in running).items():
+    followed, data, there = Sums(), Sums(), Sums()
+    for robot, size in quotas.data().items():
+        data.put((robot,), size)
+    for site, size in quotas.data_at().items():
+        there.put((site,), size)
+    by_robot = use_by_robot(one.record for one in running)
+    for robot, n in (dict.fromkeys(by_robot, 0) | quotas.streams()).items():
+        followed.put((robot,), n)
+    for robot, use in by_robot.items():
         count.put((robot,), use.instances)
         cpu.put((robot,), use.cpu)
         memory.put((robot,), use.memory_mb * 2.0**20)
@@ -218,6 +243,9 @@ def _of_quotas(quotas: Quotas, running: Iterable[Running]) -> Iterator[Family]:
     yield gauge("robot_instances", "Instances that have not ended", ("robot",), count)
     yield gauge("robot_promised_cpu_cores", "Processors that they asked for", ("robot",), cpu)
     yield gauge("robot_promised_memory_bytes", "Memory that they asked for", ("robot",), memory)
+    yield gauge("robot_data_bytes", "Written by its services and left at sites", ("robot",), data)
+    yield gauge("site_data_bytes", "Written by services and left there", ("site",), there)
+    yield gauge("robot_open_streams", "Logs and events that it follows", ("robot",), followed)
     yield gauge("open_streams", "Logs and events that are followed", (), streams)
     yield gauge("quota_limit", "What one may have, in the unit of the setting", ("quota",), limits)
     yield counter("quota_refusals", "Requests refused because of a quota", ("quota",), refused)

@@ -47,6 +47,7 @@ sites = Table(
     Column("speed", Float, nullable=False, server_default="1"),
     Column("cost", Float, nullable=False, server_default="0"),
     Column("images", JSON, nullable=False, server_default='["*"]'),
+    Column("draining", Boolean, nullable=False, server_default=false()),
 )
 
 robots = Table(
@@ -187,4 +188,14 @@ facts = Table(
     Column("name", String(63), primary_key=True),
     Column("value", String(255), nullable=False),
     comment="What all orchestrators over this database must agree on",
+)
+
+leadership = Table(
+    "leadership",
+    metadata,
+    Column("one", Boolean, primary_key=True),
+    Column("epoch", BigInteger, nullable=False),
+    Column("holder", String(16), nullable=False),
+    Column("until", Float, nullable=False),
+    comment="One row: who leads, until when by the database's clock, and whose leader may still change something",
 )

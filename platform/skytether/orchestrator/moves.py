@@ -115,7 +115,7 @@ class Moves:
             manifest = catalogue.get(spare.service)
             wanted = manifest.spec.needs.standby if manifest else 0
             current = manifest is not None and _document(manifest) == spare.manifest
-            if current and self._stale(spare, now):
+            if current and (self._stale(spare, now) or self._drains(spare)):
                 current = False
             if current and kept.get(spare.service, 0) < wanted:
                 kept[spare.service] = kept.get(spare.service, 0) + 1
@@ -208,6 +208,10 @@ class Moves:
                 "%s for %s (%s) is not good enough at %s: moving it to %s",
                 *(record.service, record.robot, record.id, record.site, best.site),
             )
+
+    def _drains(self, record: Record) -> bool:
+        site = self._sites().find(record.site)
+        return site is not None and site.draining
 
     def _reachable(self, record: Record) -> bool:
         site = self._sites().find(record.site)

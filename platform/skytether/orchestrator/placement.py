@@ -18,7 +18,9 @@ from .settings import Weights
 
 NOTHING = Capacity(0.0, 0)
 UNSTARTED = "start"
-"""Reason of a refusal by a site that was tried: it stays with the instance while another one fits."""
+"""Reason of a refusal by a site that was tried: it stays with the instance while another one fits. Where others were
+tried, it is ``unfit``, which ends by itself."""
+DRAINING = "is being deleted, and takes no more instances"
 _TIER_ORDER: Mapping[Tier, int] = {"robot": 0, "edge": 1, "cloud": 2}
 """Nearer first, where nothing was measured."""
 _FULLEST = 0.95
@@ -33,8 +35,12 @@ class Candidate:
     tier: Tier
     cannot_run: str | None = None
     """Why its runtime cannot run this service at all; None: it can."""
+    draining: bool = False
+    """It is to be deleted: no instance comes to it any more, however it comes."""
     unstarted: str | None = None
     """Why this very instance could not be started there; None: it was not tried, or could."""
+    unfit: str | None = None
+    """Why no instance of this service is to be started there for a while; None: it may be."""
     unreachable: str | None = None
     """Why it does not answer; None: it does."""
     blocked: str | None = None
@@ -127,6 +133,8 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("tier", f"is of tier {site.tier}, needed is {' or '.join(needs.tiers)}")
     if site.cannot_run is not None:
         return no("runtime", site.cannot_run)
+    if site.draining:
+        return no("draining", DRAINING)
     if site.unstarted is not None:
         return no(UNSTARTED, site.unstarted)
     if image is not None and not any(fnmatchcase(image, pattern) for pattern in site.images):
@@ -142,6 +150,8 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("unreachable", site.unreachable, for_good=False)
     if site.blocked is not None:
         return no("blocked", site.blocked, for_good=False)
+    if site.unfit is not None:
+        return no("unfit", site.unfit, for_good=False)
     if site.full is not None:
         return no("instances", site.full, for_good=False)
     amounts = (

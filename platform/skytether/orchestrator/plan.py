@@ -62,7 +62,7 @@ class Crash:
     """Continues "the service ..."."""
     for_good: bool = False
     unstarted: bool = False
-    """It could not even be begun, and nothing is left of it: another site may do better."""
+    """It could not even be begun and nothing is left, or it ended before it was ready: another site may do better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,8 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
         return Ready(record, seen.host, seen.port)
     if seen.phase is Phase.EXITED:
         for_good = seen.exit_status == BAD_GRANT_STATUS
-        return Crash(record, how_it_ended(seen), for_good, seen.unstarted)
+        ended = seen.exit_status is not None and not for_good  # else something may be left that is to be cleared first
+        return Crash(record, how_it_ended(seen), for_good, seen.unstarted or ended)
     if seen.detail and seen.detail != record.reason:
         return Progress(record, seen.detail)
     if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:

@@ -7,7 +7,9 @@ from typing import Any
 
 import psycopg
 from psycopg.abc import RV, PQGen
-from psycopg.errors import ConnectionTimeout, _WaitTimeout
+from psycopg.errors import ConnectionTimeout, IdleInTransactionSessionTimeout, _WaitTimeout
+from sqlalchemy.engine import ExceptionContext
+from sqlalchemy.exc import OperationalError
 from typing_extensions import override
 
 from .db import STATEMENT_S
@@ -47,6 +49,17 @@ class Server:
         self.hangs = False
         made.server = self
         return made
+
+
+def stood_still(context: ExceptionContext) -> OperationalError | None:
+    """For SQLAlchemy's event ``handle_error``: the server ended a transaction of a program that was frozen meanwhile.
+
+    The driver files that under its own mistakes; it is a connection that is gone, as any other.
+    """
+    error = context.original_exception
+    if isinstance(error, IdleInTransactionSessionTimeout):
+        return OperationalError(context.statement, context.parameters, error)
+    return None
 
 
 class Connection(psycopg.Connection[Any]):

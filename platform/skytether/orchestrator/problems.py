@@ -12,8 +12,9 @@ from fastapi.responses import JSONResponse
 from pydantic import TypeAdapter
 from sqlalchemy.exc import ProgrammingError
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skytether.api.faults import faults
+from skytether.api.faults import MAX_FAULTS, faults
 from skytether.api.rest import Problem
 
 from .db import GONE
@@ -78,7 +79,7 @@ def install(app: FastAPI) -> None:
         if not isinstance(error, RequestValidationError):
             raise error
         schema = body_schema(request)
-        found = [_explain(one, schema) for one in error.errors()]
+        found = [_explain(one, schema) for one in error.errors()[:MAX_FAULTS]]
         detail = "; ".join(str(fault) for fault in found)
         return answer(request, 422, "Invalid input", detail, [_fault(fault) for fault in found])
 
@@ -94,6 +95,34 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, on_http)
     for kind in (ProgrammingError, *GONE, Exception):
         app.add_exception_handler(kind, answer_to)
+
+
+class GivenUp:
+    """ASGI middleware: whoever still waits when the orchestrator ends is told to ask again.
+
+    The server cancels what takes too long then, and would answer that it made a mistake (500).
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        begun = False
+
+        async def noting(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, noting)
+        except asyncio.CancelledError:
+            if begun or scope["type"] != "http":
+                raise
+            headers = {"Retry-After": _RETRY_AFTER, "Connection": "close"}
+            text = "the orchestrator ends, and has not done this in time: ask again"
+            await answer(Request(scope), 503, "Not possible now", text, headers=headers)(scope, receive, send)
 
 
 async def answer_to(request: Request, error: Exception) -> JSONResponse:

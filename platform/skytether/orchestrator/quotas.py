@@ -16,6 +16,7 @@ from .errors import Fault, InvalidError, QuotaError, TooManyError
 from .records import Record
 from .settings import Quotas as Settings
 from .store import Store
+from .stored import Stored, mb
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ class Bound:
     unit: str
     wanted: float
     most: float
+    advice: str = "let one end first"
 
     def __str__(self) -> str:
         return f"{self.whose} would have {self.wanted:g} {self.unit}, and may have {self.most:g} (quotas.{self.key})"
@@ -57,8 +59,9 @@ def use_by_robot(records: Iterable[Record]) -> dict[str, RobotUse]:
 class Quotas:
     """Refuses what is too much. Safe from any thread."""
 
-    def __init__(self, store: Store, settings: Settings) -> None:
+    def __init__(self, store: Store, settings: Settings, stored: Stored | None = None) -> None:
         self.settings = settings
+        self._stored = stored
         self._store = store
         self._admitting = threading.Lock()
         self._counting = threading.Lock()
@@ -80,7 +83,7 @@ class Quotas:
             for bound in self._bounds(record):
                 if bound.wanted > bound.most + 1e-9:
                     self._refuse(bound.key)
-                    raise QuotaError(f"{bound}: let one end first")
+                    raise QuotaError(f"{bound}: {bound.advice}")
             yield
 
     def _bounds(self, record: Record) -> Iterator[Bound]:
@@ -89,6 +92,9 @@ class Quotas:
         yield Bound("robot_instances", whose, "instances", use.instances + 1, most.robot_instances)
         yield Bound("robot_cpu", whose, "cores", use.cpu + needs.cpu, most.robot_cpu)
         yield Bound("robot_memory_mb", whose, "MiB of memory", use.memory_mb + needs.memory_mb, most.robot_memory_mb)
+        data = mb(self._stored.of(record.robot)) if self._stored is not None else 0
+        advice = "delete what is not needed"
+        yield Bound("robot_data_mb", whose, "MiB of data", data, most.robot_data_mb, advice)
         there = self._store.count_live(record.service) + 1
         yield Bound("service_instances", f"service '{record.service}'", "instances", there, most.service_instances)
 
@@ -143,6 +149,37 @@ class Quotas:
                 self._logs -= log
                 if not self._streams[owner]:
                     del self._streams[owner]
+
+    def data(self) -> Mapping[str, int]:
+        """Bytes on disk by robot, at all sites, as far as they are known."""
+        return self._stored.by_robot() if self._stored is not None else {}
+
+    def data_at(self) -> Mapping[str, int]:
+        """The same by site."""
+        return self._stored.by_site() if self._stored is not None else {}
+
+    def streams(self) -> dict[str, int]:
+        """Logs and events that robots follow here, by robot."""
+        with self._counting:
+            held = dict(self._streams)
+        return {owner.removeprefix("robot:"): n for owner, n in held.items() if owner.startswith("robot:")}
+
+    def with_rest(self, robot: str, use: RobotUse, data: Mapping[str, int]) -> RobotUse:
+        """What a robot uses, with what is no instance's: streams here, and of `data` its own."""
+        rest = {"streams": self._streams[f"robot:{robot}"], "data_mb": mb(data.get(robot, 0))}
+        return use.model_copy(update=rest)
+
+    @property
+    def of_robot(self) -> RobotUse:
+        """The most that one may have of each."""
+        most = self.settings
+        return RobotUse(
+            instances=most.robot_instances,
+            cpu=most.robot_cpu,
+            memory_mb=most.robot_memory_mb,
+            streams=most.robot_streams,
+            data_mb=most.robot_data_mb,
+        )
 
     @property
     def open_streams(self) -> int:

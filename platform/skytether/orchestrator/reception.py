@@ -6,11 +6,12 @@ sender has shown a good token, and no place is taken before all of it is there.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import re
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
 from typing import Any, Protocol
 
 from anyio import CapacityLimiter, to_thread
@@ -22,6 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from .access import Principal
 from .door import GUEST
 from .errors import TooManyError, UnauthenticatedError
+from .pause import Pause
 from .problems import answer, answer_to
 from .settings import Limits
 from .strain import Strain
@@ -33,7 +35,7 @@ RUN = "run"
 _FREE = "/healthz"
 """Costs nothing; and to take an orchestrator for dead because it has much to do would help nobody."""
 _API = "/api/"
-_NOT_FOUND, _BUSY = 404, 503
+_OK, _NOT_FOUND, _BUSY = 200, 404, 503
 _RENEWAL = re.compile(r"/api/v1/instances/[^/]+/renew")
 _ASTRAY = re.compile(r"/(\.{0,2})(/|$)|[\x00-\x1f\x7f]")
 """What some proxies and clients take for another path than we would."""
@@ -44,10 +46,8 @@ _STRANGERS = 16
 """Requests under way of those who need no token: they must not take the places of those who have one."""
 _THREADS = 8
 """For what a renewal needs of the database: others' requests are not waited for."""
-_PAUSE_S = 0.25
-"""Before a stranger's question is refused, or one of somebody who asks too often: who waits does not ask further."""
-_MOST_PAUSES = 1024
-"""At a time; whoever comes on top is refused at once."""
+_THREADS_OF_STRANGERS = 4
+"""To look tokens up that nobody has shown lately: made-up ones take no thread of those who are known."""
 
 
 class Doorman(Protocol):
@@ -61,7 +61,17 @@ class Doorman(Protocol):
         """
 
     def recent(self, token: str | None) -> Principal | None:
-        """The same at once, if it was known a moment ago. Raises as ``authenticate``."""
+        """The same at once, if it was known a moment ago; takes no request, but raises as ``authenticate``."""
+
+    def spend(self, caller: Principal) -> None:
+        """Take a request of who was known a moment ago, at once.
+
+        Raises:
+            TooManyError: They asked too often.
+        """
+
+    def verify(self, token: str | None) -> Principal:
+        """As ``authenticate``, without taking a request."""
 
     def charge(self, caller: Principal, length: int) -> None:
         """Reckon what a body of this length costs whoever sent it."""
@@ -71,7 +81,13 @@ class Reception:
     """ASGI middleware: authenticates, reads the body, and bounds the requests under way."""
 
     def __init__(
-        self, app: ASGIApp, doorman: Doorman, limits: Limits, strain: Strain, pause_s: float = _PAUSE_S
+        self,
+        app: ASGIApp,
+        doorman: Doorman,
+        limits: Limits,
+        strain: Strain,
+        pause: Pause,
+        on_renewed: Callable[[float], None] = lambda _: None,
     ) -> None:
         """Bounds are those of ``limits``.
 
@@ -80,7 +96,8 @@ class Reception:
             doorman: Knows tokens.
             limits: How much and how many.
             strain: Told when a robot that wants to renew is refused.
-            pause_s: Before some refusals [s].
+            pause: Before some refusals.
+            on_renewed: Told how long a renewal took [s].
         """
         self._app = app
         self._doorman = doorman
@@ -89,35 +106,38 @@ class Reception:
         self._places, self._strangers = _Places(), _Places()
         self._of: Counter[str] = Counter()
         self._held = 0
-        self._pause_s = pause_s
-        self._pausing = _Places()
-        self._limiter: CapacityLimiter | None = None
-        """Made where there is a loop."""
+        self._pause = pause
+        self._on_renewed = on_renewed
+        self._for_renewals = _Threads(_THREADS)
+        self._for_strangers = _Threads(_THREADS_OF_STRANGERS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
+        began = time.monotonic()
         if scope["path"] == _FREE:
             return await self._app(scope, _nothing, send)
         if not scope["path"].startswith(_API):  # whatever is open to all, or asks for a token itself, takes no body
             return await self._place(scope, b"", send, renewal=False)
         if _ASTRAY.search(scope["path"]):
             text = "a path goes down, by names: none of them is empty or made of dots"
-            await self._pause()
+            await self._pause.wait()
             return await answer(Request(scope), 404, "Not found", text)(scope, receive, send)
         renewal = scope["method"] == "POST" and _RENEWAL.fullmatch(scope["path"]) is not None
         try:
             caller = await self._who(scope, renewal)
         except Exception as error:  # whatever it is, there is one place that knows what to say of it
+            if isinstance(error, TooManyError) and error.who:
+                scope.setdefault("state", {})["who"] = error.who  # for the audit: a good token was shown
             if isinstance(error, UnauthenticatedError | TooManyError):
-                await self._pause()
+                await self._pause.wait()
             return await (await answer_to(Request(scope), error))(scope, receive, send)
         with contextlib.ExitStack() as until_answered:
             if not until_answered.enter_context(self._one_of(caller)):
                 most = self._limits.robot_requests_at_once
                 text = f"{most} requests of this robot are under way: wait for their answers"
-                await self._pause()
+                await self._pause.wait()
                 return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
             with _Body(
                 self, self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
@@ -133,28 +153,34 @@ class Reception:
                 whole = bytes(body.data)
             self._doorman.charge(caller, len(whole))
             return await self._place(
-                scope, whole, send, renewal=renewal, receive=receive, until_answered=until_answered
+                scope,
+                whole,
+                self._timed(began, send) if renewal else send,
+                renewal=renewal,
+                receive=receive,
+                until_answered=until_answered,
             )
 
     async def _who(self, scope: Scope, renewal: bool) -> Principal:
         kind, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
         given = token.strip() if kind.lower() == "bearer" else None
         address = scope["client"][0] if scope.get("client") else ""
-        run: Callable[..., Awaitable[Principal]] = self._for_renewals if renewal else to_thread.run_sync
-        # What measures a round trip is not to measure a database too.
+        run: Callable[..., Awaitable[Any]] = self._for_renewals.run if renewal else to_thread.run_sync
         recent = self._doorman.recent(given)
-        probe = recent if _PROBE.fullmatch(scope["path"]) else None
-        caller = probe or await run(self._doorman.authenticate, given, address)
+        caller: Principal
+        if recent is None:
+            caller = await self._for_strangers.run(self._doorman.authenticate, given, address)
+        elif _PROBE.fullmatch(scope["path"]):  # what measures a round trip is not to measure a database too
+            caller = recent
+        elif renewal:  # the thread that renews asks first: each change of thread waits for its turn
+            self._doorman.spend(recent)
+            caller, run = recent, partial(self._for_renewals.run, _verified, self._doorman, given)
+        else:
+            caller = await run(self._doorman.authenticate, given, address)
         scope.setdefault("state", {}).update({PRINCIPAL: caller, "who": caller.owner, RUN: run})
         if (guest := scope.get(GUEST)) is not None:
             guest.know(caller.owner)
         return caller
-
-    async def _for_renewals(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Runs a function in one of the few threads that renewals have for themselves."""
-        if self._limiter is None:
-            self._limiter = CapacityLimiter(_THREADS)
-        return await to_thread.run_sync(function, *arguments, limiter=self._limiter)
 
     @contextlib.contextmanager
     def _one_of(self, caller: Principal) -> Iterator[bool]:
@@ -211,20 +237,42 @@ class Reception:
                 if message["type"] == "http.response.start":
                     held.close()
                     if receive is None and message["status"] == _NOT_FOUND:
-                        await self._pause()
+                        await self._pause.wait()
                 await send(message)
 
             await self._app(scope, _replaying(body, receive), noting)
 
-    async def _pause(self) -> None:
-        """Let somebody wait who has nothing to ask for, or asks too often: it costs them time, and nobody work."""
-        if self._pausing.taken < _MOST_PAUSES:
-            with self._pausing.one():
-                await asyncio.sleep(self._pause_s)
+    def _timed(self, began: float, send: Send) -> Send:
+        async def timing(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] == _OK:
+                self._on_renewed(time.monotonic() - began)
+            await send(message)
+
+        return timing
 
     def _most(self, renewal: bool) -> int:
         limits = self._limits
         return limits.requests_at_once if renewal else max(1, limits.requests_at_once - limits.requests_for_renewals)
+
+
+class _Threads:
+    """A few that are kept for one kind of work."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._limiter: CapacityLimiter | None = None
+        """Made where there is a loop."""
+
+    async def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Run a function in one of them."""
+        if self._limiter is None:
+            self._limiter = CapacityLimiter(self._most)
+        return await to_thread.run_sync(function, *arguments, limiter=self._limiter)
+
+
+def _verified(doorman: Doorman, token: str | None, function: Callable[..., Any], *arguments: Any) -> Any:
+    doorman.verify(token)
+    return function(*arguments)
 
 
 class _Places:

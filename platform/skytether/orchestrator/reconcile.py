@@ -19,16 +19,18 @@ from skytether.api.rest import Measurement, Refusal, State
 from .accounts import of_instance, of_run
 from .clocks import SetClock
 from .db import GONE
+from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
 from .moves import Moves
 from .placement import NOTHING, UNSTARTED, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
-from .runtimes.base import Capacity, Launch, Observation, Phase, RuntimeFailure, SiteSilentError
+from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .security import SecretFileError, Secrets
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
 from .store import Store
+from .stored import Stored
 from .strain import Strain
 
 log = logging.getLogger(__name__)
@@ -42,6 +44,8 @@ _WHOLE = 1.0
 over the same database did."""
 _SPARE_IDLE = 86_400.0
 """Seconds that a standby waits for a robot before it ends by itself, should the orchestrator be gone for good."""
+_UNSETTLED = 2.0
+"""Seconds after the clock was set in which another orchestrator may still date leases by what it was before."""
 _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
 
@@ -65,16 +69,19 @@ class Reconciler:
         weights: Weights,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
-        leads: Callable[[], bool] = lambda: True,
+        lead: Lead = ALONE,
         steady: Callable[[], float] = time.monotonic,
         strain: Strain | None = None,
         site_instances: int = sys.maxsize,
+        stored: Stored | None = None,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
-        While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``.
+        While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``, and
+        nothing more where ``stored`` says that it is full.
         """
         self._site_instances = site_instances
+        self._stored = stored
         self._strain = strain or Strain(steady)
         self._store = store
         self._secrets = secrets
@@ -84,16 +91,23 @@ class Reconciler:
         self._weights = weights
         self._clock = clock
         self._wake_placer = wake_placer
-        self._leads = leads
+        self._lead = lead
         self._steady = steady
         self._clock_lock = threading.Lock()
         self._set_clock = SetClock(clock(), steady())
         self._times_set = 0
         """How often the clock was set: what was read before the last time is dated by another one."""
+        self._settles_at = -math.inf
+        """Steady seconds: leases that others dated until then count anew, and none runs out before."""
         self._placed_at = -math.inf
         """Steady seconds: when the placer's last whole pass ended."""
         self._pruned_at = -_PRUNE
         self._database_gone = False
+        self._owes_leases = False
+
+    def owe_leases(self) -> None:
+        """Before anything is ended for its lease, all count anew: nobody may have led, and nobody could renew."""
+        self._owes_leases = True
 
     def place_turn(self) -> float:
         """As much of a pass of the placer as is due: woken between two whole ones, it places what waits only."""
@@ -135,12 +149,16 @@ class Reconciler:
     def _with_database(self, step: Callable[[], float]) -> float:
         """Wait where the database does not answer; once it does, leases count anew: nobody could renew meanwhile."""
         try:
-            if self._database_gone and self._leads():
-                self._store.extend_leases(self._clock())
-                log.warning("the database answers again")
-            delay = step()
+            with fenced(self._lead.epoch):
+                if self._database_gone and self._leads():
+                    self._store.extend_leases(self._clock())
+                    log.warning("the database answers again")
+                delay = step()
             self._database_gone = False
             return delay
+        except LeadLostError as error:
+            log.warning("%s", error)
+            return self._timing.place
         except GONE as error:
             if not self._database_gone:
                 log.error(
@@ -149,6 +167,10 @@ class Reconciler:
                 )
             self._database_gone = True
             return self._timing.place
+
+    def _leads(self) -> bool:
+        """Whether this pass acts: it may have begun before this orchestrator led, or for an earlier lead of its own."""
+        return self._lead.leads and self._lead.epoch == fence()
 
     def _now(self) -> float:
         """The time. Was the clock set, all leases count anew first: nobody can say how old they are."""
@@ -160,8 +182,17 @@ class Reconciler:
                     self._store.extend_leases(now)
                 self.moves.clock_was_set()
                 self._times_set += 1
+                self._settles_at = steady + _UNSETTLED
                 text = "the clock was set %s by %.0f s, or this machine slept: leases and waits count anew"
                 log.warning(text, "forward" if by > 0 else "back", abs(by))
+            if -math.inf < self._settles_at <= steady:
+                self._settles_at = -math.inf
+                if self._leads():
+                    self._store.extend_leases(now)  # what is about to end has another version then
+            if self._owes_leases and self._leads():
+                self._owes_leases = False  # first: it may be owed again meanwhile
+                self._store.extend_leases(now)
+                self._times_set += 1
             if self._strain.owed() and self._leads():
                 self._store.extend_leases(now)
                 self._times_set += 1
@@ -200,6 +231,7 @@ class Reconciler:
             self.moves.keep_spares()
         if not whole:
             return self._timing.place
+        self.sites.end_drained({record.site for record in placed}, self._metrics.forget_site)
         self.moves.watch(live)
         if self._steady() - self._pruned_at >= _PRUNE:
             self._pruned_at = self._steady()
@@ -224,8 +256,20 @@ class Reconciler:
         there = Counter(other.site for other in others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
         tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
-        sites = [site.candidate(record.spec, used.get(site.name, NOTHING), tried.get(site.name)) for site in allowed]
+        now = self._steady()
+        sites = [
+            site.candidate(
+                record.spec,
+                used.get(site.name, NOTHING),
+                tried.get(site.name),
+                None if record.pinned else site.fitness.objection(record, now),
+            )
+            for site in allowed
+        ]
         most = self._site_instances
+        if self._stored is not None:
+            full = self._stored.full()
+            sites = [replace(s, full=full[s.name]) if s.name in full else s for s in sites]
         sites = [
             replace(s, full=f"{there[s.name]} instances are there, and {most} may be (quotas.site_instances)")
             if there[s.name] >= most
@@ -233,7 +277,7 @@ class Reconciler:
             for s in sites
         ]
         if runs:
-            sites = [replace(site, blocked=None) for site in sites]
+            sites = [replace(site, blocked=None, unfit=None) for site in sites]
         spec = record.spec
         return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
 
@@ -269,7 +313,10 @@ class Reconciler:
         chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site, scores=scores, start_at=0.0)
         if chosen is not None:
             self._metrics.phase(chosen, "placing", now - record.created_at)
-            self._wake_site(decision.site)
+            site = self.sites.find(decision.site)
+            if site is not None:
+                site.fitness.placed(chosen, self._steady(), now)
+                site.wake()
         return chosen
 
     def _prune(self, now: float) -> None:
@@ -279,11 +326,6 @@ class Reconciler:
             if site is not None:
                 site.ended -= {instance}  # the site's next whole pass finds it as a stranger, and removes it
 
-    def _wake_site(self, name: str) -> None:
-        site = self.sites.find(name)
-        if site is not None:
-            site.wake()
-
     # What is at a site
 
     def _site_pass(self, site: Site, whole: bool) -> float:
@@ -291,9 +333,14 @@ class Reconciler:
         site.awaited = None  # whatever ends this pass early, or is left to do
         if whole:
             site.passed_at = -math.inf
+        led = self._lead.epoch if self._leads() else 0
         # Before the look: nothing can be observed that is not in it.
         live = self._store.live_at(site.name, changing=not whole)
         try:
+            if led and site.led != led:
+                site.runtime.lead(led)
+                site.led, site.ended, site.seen_since = led, frozenset(), None
+                site.fitness.forget()
             if site.capacity is None:
                 site.capacity = site.runtime.capacity()
             ids = {record.id for record in live}
@@ -322,6 +369,7 @@ class Reconciler:
             site.seen_since = (times_set, now)
         if whole:
             site.ended = self._ended_of(looked.keys() - ids, frozenset() if due else site.ended)
+        looked = self._bounded(site, live, looked) if whole else looked
         actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
         done = [action for action in actions if self._act(site, action)]
         if due:
@@ -338,6 +386,20 @@ class Reconciler:
                 site.passed_at = site.watched_at = self._steady()
         return self._timing.observe_changing if actions or changing else self._timing.observe
 
+    def _bounded(
+        self, site: Site, live: Sequence[Record], looked: Mapping[str, Observation]
+    ) -> Mapping[str, Observation]:
+        """What was seen, with those marked that belong to a robot with too much data."""
+        if self._stored is None:
+            return looked
+        too_much = self._stored.too_much(site.name)
+        marked = {
+            r.id: replace(looked[r.id], exceeds=too_much[r.robot])
+            for r in live
+            if r.id in looked and r.robot in too_much
+        }
+        return {**looked, **marked}
+
     def _ended_of(self, strangers: Set[str], ended: frozenset[str]) -> frozenset[str]:
         """Those that have ended of what is at a site and not expected there; of some that is known already."""
         unknown = strangers - ended
@@ -352,7 +414,7 @@ class Reconciler:
                 case Progress(record, detail):
                     self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
                 case Ready(record, host, port):
-                    return self._ready(record, host, port)
+                    return self._ready(site, record, host, port)
                 case Crash():
                     self._crash(site, action)
                 case Expire(record):
@@ -383,8 +445,8 @@ class Reconciler:
             return
         try:
             site.runtime.start(self._launch(noted))
-        except SiteSilentError:
-            raise  # no fault of the service: it is started when the site answers again
+        except (SiteSilentError, OvertakenError):
+            raise  # no fault of the service: it is started when the site answers again, or by who leads
         except RuntimeFailure as error:
             self._crash(site, Crash(noted, f"could not be started: {error}", unstarted=True))
         except SecretFileError as error:  # nothing of the site's: another one has the same secrets
@@ -406,13 +468,14 @@ class Reconciler:
         )
         return Launch(record.attempt, spec, grant)
 
-    def _ready(self, record: Record, host: str | None, port: int | None) -> bool:
+    def _ready(self, site: Site, record: Record, host: str | None, port: int | None) -> bool:
         now = self._clock()
         running_at = record.running_at if record.state is State.RUNNING else now
         changes = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at, "reason": ""}
         if self._store.change(record, now, **changes) is None:
             return False
         if record.state is State.STARTING:
+            site.fitness.started(record)
             self._metrics.phase(record, "starting", now - (record.started_at or now))
             if record.attempt == 1:
                 self._metrics.phase(record, "total", now - record.created_at)
@@ -429,13 +492,11 @@ class Reconciler:
         if after.restarts:
             self._store.count(after, [of_instance(after)])
         self.moves.fail_over(after, after.reason)
-        if after.site is None:
-            self._wake_placer()
-        if after.state.final:
-            site.runtime.stop(after.id, force=True)
-            if after.spare:
+        if after.site is None or after.state.final:
+            if after.state.final and after.spare:
                 self.moves.spare_failed(after)
             self._wake_placer()
+            site.runtime.stop(after.id, force=True)  # what its main process left behind
 
     def _elsewhere(self, site: Site, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
         """What else changes where a run cannot be started: the site is refused, if that leaves another one to try.
@@ -445,6 +506,7 @@ class Reconciler:
         """
         record, refused = crash.record, list(crash.record.refused)
         if not site.runtime.blocked():
+            site.fitness.failed(record, crash.why, self._steady(), self._clock())
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
         decision = self.weigh(replace(record, refused=refused))
         if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
@@ -464,8 +526,8 @@ class Reconciler:
         }
 
     def _expire(self, record: Record) -> None:
-        if self._strain.felt():
-            return  # its robot may have been refused, or wait for its answer
+        if self._strain.felt() or self._steady() < self._settles_at:
+            return  # its robot may have been refused, or wait for its answer; or it was dated by another clock
         now = self._clock()
         reason = f"the robot did not renew its lease of {record.lease_s:g} s"
         to = State.STOPPED if record.site is None else State.STOPPING

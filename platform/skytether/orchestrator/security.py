@@ -25,6 +25,8 @@ PREFIX_LENGTH = len(TOKEN_MARK) + 8
 KEY, OPERATOR = "secret.key", "operator.token"
 OLD_KEY = "secret.key.old-"
 """Before the fingerprint, in the name of a file with a key that sessions still use."""
+_SHORTEST = 16
+"""Bytes of a secret."""
 _DATABASE = ("state.db", "state.db-wal", "state.db-shm", "state.db-journal")
 log = logging.getLogger(__name__)
 
@@ -232,7 +234,10 @@ def _kept_secret(path: Path) -> bytes:
     def missing() -> bytes:
         raise SecretFileError(f"{path} is gone: put it back, all keys of sessions are derived from it")
 
-    return secret_file(path, missing)
+    content = secret_file(path, missing)
+    if len(content) < _SHORTEST:  # a copy that was cut off; keys derived from it could be found by trying
+        raise SecretFileError(f"{path} has {len(content)} bytes, too few for a secret: put all of it back")
+    return content
 
 
 def _operator(path: Path) -> TokenHash:

@@ -10,7 +10,6 @@ import os
 import resource
 import signal
 import socket
-import ssl
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -175,24 +174,16 @@ class _Server(uvicorn.Server):
             lifespan="off",
             server_header=False,
             timeout_graceful_shutdown=_DRAIN,
-            ssl_certfile=tls.certificate,
-            ssl_keyfile=tls.key,
             proxy_headers=bool(core.settings.proxies),
             forwarded_allow_ips=list(core.settings.proxies),
         )
         super().__init__(config)
-        try:
-            config.load()  # now, rather than in the loop: a wrong certificate is found before anything is started
-        except (OSError, ssl.SSLError) as error:
-            why = getattr(error, "strerror", None) or str(error)
-            raise StartError(
-                f"the certificate {tls.certificate} with the key {tls.key} cannot be used: {why}", usage=True
-            ) from error
-        self._certificate = (
-            LiveCertificate(config.ssl, tls.certificate, tls.key)
-            if config.ssl and tls.certificate and tls.key
-            else None
-        )
+        self._certificate: LiveCertificate | None = None
+        if tls.certificate and tls.key:
+            try:
+                self._certificate = LiveCertificate(tls.certificate, tls.key)
+            except SecretFileError as error:
+                raise StartError(str(error), usage=True) from error
         self._core = core
         self._address = core.settings.state_dir / "address"
         host, port = listener.getsockname()[:2]
@@ -205,7 +196,7 @@ class _Server(uvicorn.Server):
         most = min(limits.connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
         make = partial(GuardedProtocol, config=self.config, server_state=self.server_state, app_state={})
         strain = self._core.strain
-        doors: list[Any] = [Door(one, make, self.config.ssl, limits, most, proxies, strain) for one in sockets or ()]
+        doors: list[Any] = [Door(one, make, self._certificate, limits, most, proxies, strain) for one in sockets or ()]
         self.servers = doors
         self.started = True
         draft = self._address.with_name("address.new")

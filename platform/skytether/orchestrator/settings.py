@@ -49,7 +49,9 @@ class Timing(Group):
     backoff: Seconds = 0.5
     """Wait before the second restart in a row; it doubles with each. The first comes at once: a robot waits."""
     backoff_max: Seconds = 30.0
-    """The longest wait before a restart."""
+    """The longest wait before a restart; and how long a site that failed to start a service gets no more of it."""
+    unfit_max: Seconds = 300.0
+    """That time doubles with each failure in a row up to this: so long at most until a site that was mended is used."""
     site_silent: Seconds = 10.0
     """A site whose runtime has not answered for this long is unreachable."""
     replace_after: Seconds = 10.0
@@ -85,8 +87,8 @@ class Limits(Group):
 
     body_bytes: Count = 1 << 20
     """Largest request."""
-    robot_body_bytes: Count = 1 << 18
-    """Largest request of a robot: its parameters, or all that it reports with a renewal."""
+    robot_body_bytes: Count = 1 << 19
+    """Largest request of a robot: its parameters, or all that it reports with a renewal, 320 bytes for each topic."""
     connections: Count = 8192
     """Open connections of all, at most half of the files that the system lets the program have. Of more, one that has
     shown no good token gives way, the oldest first."""
@@ -100,11 +102,12 @@ class Limits(Group):
     """By when the body has followed: 1 MB at 300 kbit/s."""
     idle_s: Seconds = 30.0
     """How long a connection is kept for another request."""
-    requests_per_s: Annotated[float, Field(gt=0, le=1e6)] = 100.0
+    requests_per_s: Annotated[float, Field(gt=0, le=1e6)] = 30.0
     """Requests that one robot's token may make, and one address without a valid token; an operator's are free. Each
     8 KiB of a robot's request count as another one."""
-    requests_burst: Count = 200
-    """Requests at once above which that rate holds."""
+    requests_burst: Count = 100
+    """Requests at once above which that rate holds: an agent whose service comes up makes some 60 in five seconds, and
+    four every second afterwards."""
     requests_at_once: Count = 256
     """Requests under way, of all callers; whoever comes beyond gets 503 and `Retry-After`, as robots take it. A request
     counts once all of it has arrived from somebody with a good token."""
@@ -135,6 +138,9 @@ class Quotas(Group):
     """MiB of memory that they need in all."""
     robot_lease_s: Annotated[float, Field(ge=1, le=86_400)] = 3600.0
     """The longest lease that a robot may ask for: so long it holds what it has after it vanished."""
+    robot_data_mb: Count = 51_200
+    """MiB that its services may have written and left, at all sites in sum: a day of lasers and two compressed cameras.
+    Beyond that nothing is started for it, and what writes is ended; each site's `data_mb` may say less."""
     robot_names: Count = 256
     """Names that a robot makes up in its reports and that get series in /metrics: topics where a manifest takes any,
     reasons, kinds of objections. They count as long as what was counted is kept; what comes under more is dropped."""
@@ -148,6 +154,9 @@ class Quotas(Group):
     """Instances of one service that have not ended."""
     site_instances: Count = 500
     """Instances at one site; more wait for another one, or for room."""
+    site_data_mb: Count = 512_000
+    """MiB of all robots' data at one site. Beyond that nothing more is started there, and of what runs those end whose
+    robots have more than they would have if all had the same."""
 
 
 class Catalog(Group):
@@ -166,7 +175,7 @@ class Tls(Group):
     certificate: Path | None = None
     """PEM file of the certificate, with those in between up to the authority's."""
     key: Path | None = None
-    """PEM file of its private key, which only the orchestrator's user may read."""
+    """PEM file of its private key, without a password, which only the orchestrator's user, or a group, may read."""
 
     @model_validator(mode="after")
     def _both(self) -> Tls:

@@ -16,10 +16,13 @@ from skytether.api.faults import known
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
+from .db import GONE
 from .errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
+from .fitness import Fitness
+from .leader import LeadLostError, fence, fenced
 from .loops import Loop
 from .placement import NOTHING, Candidate
-from .runtimes.base import Capacity, Launch, Observation, Runtime, RuntimeFailure
+from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Runtime, RuntimeFailure
 from .settings import Timing
 from .store import Store
 from .validation import parse
@@ -95,9 +98,11 @@ class Unusable(Runtime):
 class Site:
     """One site: its runtime, and what is known of it now. Read from any thread, written by its own."""
 
-    def __init__(self, asked: SiteCreate, runtime: Runtime, step: Step, silent_after: float) -> None:
+    def __init__(self, asked: SiteCreate, runtime: Runtime, step: Step, timing: Timing) -> None:
         self.asked = asked
         self.runtime = runtime
+        self.fitness = Fitness(timing.backoff_max, timing.unfit_max)
+        """What it failed to start: only the orchestrator that leads knows."""
         self.capacity: Capacity | None = None
         self.load: float | None = None
         """Share of its processors that is busy; None: not known."""
@@ -112,6 +117,8 @@ class Site:
         """Those of the observed that the store knows as ended."""
         self.awaited: Collection[str] | None = None
         """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
+        self.draining = False
+        """It takes no more instances, and is deleted with its last one."""
         self.called = False
         """Somebody started or ended an instance here since the last pass began."""
         self.passed_at = -math.inf
@@ -120,8 +127,12 @@ class Site:
         self.watched_at = -math.inf
         """The same of the last look at all that is here."""
         self.tidied_at = -math.inf
+        self.ender: threading.Thread | None = None
+        """Deletes it, once it is drained."""
+        self.led = 0
+        """Epoch of the leader as whose its runtime was last told to act; 0: nobody's."""
         self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
-        self._silent_after = silent_after
+        self._silent_after = timing.site_silent
 
     @property
     def name(self) -> str:
@@ -140,13 +151,24 @@ class Site:
             return self.failure
         return f"it has not answered for {silent:.0f} s" if self.capacity else "it has not answered yet"
 
-    def candidate(self, spec: ServiceSpec, used: Capacity, unstarted: str | None = None) -> Candidate:
-        """As placement sees it for one service; ``unstarted``: why the instance could not be started here."""
+    def candidate(
+        self, spec: ServiceSpec, used: Capacity, unstarted: str | None = None, unfit: str | None = None
+    ) -> Candidate:
+        """As placement sees it for one service.
+
+        Args:
+            spec: The service.
+            used: What the instances that are here asked for.
+            unstarted: Why this very instance could not be started here.
+            unfit: Why none of the service is to be, for a while.
+        """
         return Candidate(
             name=self.name,
             tier=self.asked.tier,
             cannot_run=self.runtime.refuses(spec),
+            draining=self.draining,
             unstarted=unstarted,
+            unfit=unfit,
             unreachable=self.unreachable or None,
             blocked=self.runtime.blocked() or None,
             total=self.capacity or NOTHING,
@@ -182,32 +204,23 @@ class Sites:
         for site in self.all():
             site.loop.wait_first(max(0.0, deadline - time.monotonic()))
 
+    def stored(self) -> dict[str, Mapping[str, int]]:
+        """By site, bytes that services have written there by robot, as far as that is known."""
+        return {site.name: site.runtime.stored() for site in self.all()}
+
     def refresh(self) -> None:
         """Open and close what another orchestrator over the same database added and deleted."""
         with self._lock:
-            wanted = {site.name: site for site in self._store.sites()}
+            wanted, draining = {site.name: site for site in self._store.sites()}, self._store.draining_sites()
             gone = [site for name, site in self._sites.items() if wanted.get(name) != site.asked]
             for site in gone:
                 del self._sites[site.name]
             for one in wanted.values():
                 if one.name not in self._sites:
                     self._open(one, self._make_usable(one))
+                self._sites[one.name].draining = one.name in draining
         for site in gone:
             self._close(site)
-
-    def reopen(self) -> None:
-        """Look at all sites anew: another orchestrator has started and stopped what is there until now.
-
-        Each stays listed until its successor is there: who asks for a service meanwhile is not told that there is none.
-        """
-        self.refresh()
-        with self._lock:
-            old = self.all()
-            _end(old)
-            for site in old:
-                self._open(site.asked, self._make_usable(site.asked))
-        for site in old:
-            site.runtime.close()
 
     def stop(self) -> None:
         """Let go of all sites; what runs there runs on."""
@@ -242,8 +255,8 @@ class Sites:
             given = sorted(kind.owner_options & asked.options.keys())
             if given and not by_owner:
                 raise ForbiddenError(
-                    f"the options {', '.join(given)} may open up the whole machine of the site: only the token in the "
-                    "orchestrator's state folder (operator.token) may give them"
+                    f"the options {', '.join(given)} may open up the whole machine of the site, or tell its engine "
+                    "passwords: only the token in the orchestrator's state folder (operator.token) may give them"
                 )
             asked = asked.model_copy(update={"options": kind.completed(asked.options)})
             self._must_be_unique(asked, kind.unique)
@@ -278,18 +291,65 @@ class Sites:
             held = [record.id for record in self._store.live_at(name)]
             if held:
                 raise ConflictError(
-                    f"site '{name}' has {len(held)} instances: delete them first ({', '.join(held[:3])})"
+                    f"site '{name}' has {len(held)} instances: delete them first ({', '.join(held[:3])}), or drain it: "
+                    "it takes no more, and is deleted with its last one"
                 )
             self._store.delete_site(name)
             del self._sites[name]
         site.loop.stop(timeout=_CLOSE_TIMEOUT)
         try:
-            for instance in site.runtime.observe():
-                site.runtime.remove(instance)
-            site.runtime.dismantle()
+            try:
+                _empty(site.runtime)
+            except OvertakenError:  # it led here once; a site is deleted by whoever was asked to
+                site.runtime.close()
+                site.runtime = self._make_usable(site.asked)
+                _empty(site.runtime)
         except RuntimeFailure as error:
             log.warning("site %s was deleted, but what it left there stays: %s", name, error)
         site.runtime.close()
+
+    def drain(self, name: str) -> bool:
+        """Let a site take no more instances, and delete it as soon as none is there; whether it is gone by now.
+
+        Raises:
+            NotFoundError: There is none of that name.
+        """
+        with self._lock:
+            site = self.get(name)
+            self._store.drain_site(name)
+            site.draining = True
+        if self._store.live_at(name):
+            return False
+        self.delete(name)
+        return True
+
+    def end_drained(self, held: Collection[str | None], forget: Callable[[str], object]) -> None:
+        """Delete what was drained; in threads of their own, for a site that does not answer takes its time.
+
+        Args:
+            held: Where instances are.
+            forget: Called with the name of each that is gone.
+        """
+        for site in self.all():
+            if site.draining and site.name not in held and (site.ender is None or not site.ender.is_alive()):
+                site.ender = threading.Thread(
+                    target=self._end_drained,
+                    args=(site.name, forget, fence()),
+                    name=f"drained-{site.name}",
+                    daemon=True,
+                )
+                site.ender.start()
+
+    def _end_drained(self, name: str, forget: Callable[[str], object], epoch: int) -> None:
+        try:
+            with fenced(epoch):
+                self.delete(name)
+        # By somebody else meanwhile; or the next pass tries.
+        except (NotFoundError, ConflictError, LeadLostError, *GONE) as error:
+            log.info("site %s is not deleted yet: %s", name, error)
+            return
+        log.info("site %s held no more instances, and was deleted", name)
+        forget(name)
 
     def get(self, name: str) -> Site:
         """One site.
@@ -332,7 +392,7 @@ class Sites:
             return Unusable(str(error))
 
     def _open(self, asked: SiteCreate, runtime: Runtime) -> Site:
-        site = Site(asked, runtime, self._step, self._timing.site_silent)
+        site = Site(asked, runtime, self._step, self._timing)
         self._sites[asked.name] = site
         site.loop.start()
         return site
@@ -340,6 +400,13 @@ class Sites:
     def _close(self, site: Site) -> None:
         site.loop.stop(timeout=_CLOSE_TIMEOUT)
         site.runtime.close()
+
+
+def _empty(runtime: Runtime) -> None:
+    """Leave nothing at a site that is no more."""
+    for instance in runtime.observe():
+        runtime.remove(instance)
+    runtime.dismantle()
 
 
 def _end(sites: Collection[Site]) -> None:

@@ -22,6 +22,7 @@ from sqlalchemy import (
     Select,
     and_,
     bindparam,
+    case,
     delete,
     exists,
     func,
@@ -110,7 +111,11 @@ _HEAR = text(
 
 @cache
 def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdate[Any]:
-    """Renews a lease, perhaps with another length, only for a robot, with new measurements; tells the successor too."""
+    """Renews a lease, perhaps with another length, only for a robot, with new measurements; tells the successor too.
+
+    One that comes late, for its orchestrator was frozen or waited for the database, does not shorten what a later one
+    gave, unless it asks for another length.
+    """
     lease_s = bindparam("length", type_=Float) if length else instances.c.lease_s
     statement = update(instances).where(instances.c.id == bindparam("instance"), _serves(instances))
     if robot:
@@ -118,7 +123,9 @@ def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdat
     if measurements:
         statement = statement.values(measurements=bindparam("measured"))
     # The version counts up, so that whoever is about to end it for its old lease has to look again.
-    ends = {"lease_s": lease_s, "lease_expires_at": bindparam("now", type_=Float) + lease_s}
+    full = bindparam("now", type_=Float) + lease_s
+    later = and_(instances.c.lease_expires_at > full, instances.c.lease_s == lease_s)
+    ends = {"lease_s": lease_s, "lease_expires_at": case((later, instances.c.lease_expires_at), else_=full)}
     return statement.values(**ends, version=instances.c.version + 1).returning(instances, _SUCCEEDS)
 
 
@@ -410,12 +417,15 @@ class Store(Database):
         with self._reader.connect() as connection:
             return {(row.robot, row.service): Account(row.account) for row in connection.execute(select(accounts))}
 
-    def extend_leases(self, now: float) -> None:
+    def extend_leases(self, now: float, *, at_least: bool = False) -> None:
         """Give every live instance its whole lease from now, no less and no more; spares keep theirs, which never ends.
 
-        For nobody could renew, or nobody can say when they did.
+        For nobody could renew, or nobody can say when they did. ``at_least``: those that last longer stay as they are;
+        for who does not lead, and may be late.
         """
-        full = now + instances.c.lease_s
+        full: ColumnElement[float] = now + instances.c.lease_s
+        if at_least:
+            full = case((instances.c.lease_expires_at > full, instances.c.lease_expires_at), else_=full)
         statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.spare.is_(False))
         with self._writing() as connection:
             connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))

@@ -13,14 +13,12 @@ from referencing import Registry
 from referencing.exceptions import Unresolvable
 from referencing.jsonschema import DRAFT202012
 
-from skytether.api.faults import Fault, explain, unknown
+from skytether.api.faults import MAX_FAULTS, Fault, explain, unknown
 
 from .errors import InvalidError
 from .patterns import PatternError, Validator, wrong_with
 
 Model = TypeVar("Model", bound=BaseModel)
-_MAX_FAULTS = 10
-"""More help nobody."""
 
 
 def parse(model: type[Model], document: Any, what: str = "", prefix: Sequence[str] = ()) -> Model:
@@ -66,7 +64,7 @@ def _check_patterns(schema: Mapping[str, Any], prefix: str) -> None:
     if len(both) > 1:
         faults.append(Fault(prefix, "unevaluatedProperties beside patternProperties: write additionalProperties"))
     if faults:
-        raise InvalidError(faults[:_MAX_FAULTS])
+        raise InvalidError(faults[:MAX_FAULTS])
 
 
 def _keywords(schema: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
@@ -106,7 +104,7 @@ def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: 
         text = "the schema refers to itself without end: correct the manifest"
         raise InvalidError([Fault("spec.params", text)], service) from None
     if errors:
-        raise InvalidError([f for e in errors for f in _params_faults(e)][:_MAX_FAULTS], f"service '{service}'")
+        raise InvalidError([f for e in errors for f in _params_faults(e)][:MAX_FAULTS], f"service '{service}'")
 
 
 def _params_faults(error: ValidationError) -> list[Fault]:

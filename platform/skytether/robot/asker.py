@@ -24,7 +24,10 @@ from .backoff import Backoff
 _log = logging.getLogger(__name__)
 
 _POLL_S = 0.03
-"""Between looks at an instance that is coming up; a start takes some hundred milliseconds."""
+"""Between looks at an instance that is coming up, at first: a start takes some hundred milliseconds."""
+_POLL_SHARE, _POLL_MOST_S = 0.05, 0.25
+"""Later this share of the time that it has taken so far, at most so many seconds: whoever waits long for an image asks
+no more than is good for the others."""
 _LOOK_S = 0.2
 """Until the first look when the link went bad: the service may have come back at another address."""
 _REFUSED_S = 10.0
@@ -32,7 +35,7 @@ _REFUSED_S = 10.0
 _IDLE_S = 0.5
 """Between looks whether the service is wanted again."""
 _MOVING_S = 0.05
-"""Between looks at an instance that is to take over."""
+"""Between looks at an instance that is to take over, at first."""
 _LONGEST = 1000
 """Characters of a trouble: the orchestrator's reasons are part of it."""
 _MOVE_S = 20.0
@@ -131,7 +134,7 @@ class Asker:
         self._keys: dict[str, str] = {}
         """Of the sessions of the instance that is held and the one that is coming, by instance."""
         self._instance: Instance | None = None
-        self._renewed_at = -math.inf
+        self._renewed_at = self._asked_at = -math.inf
         self._trouble = ""
 
     @property
@@ -176,7 +179,7 @@ class Asker:
         if self._next is not None or instance.successor or (running and self._elsewhere(instance)):
             return self._move(instance, request)
         if not running:
-            return _POLL_S
+            return _poll(_POLL_S, self._clock() - self._asked_at)
         if not self._healthy():
             return self._looks.next()
         self._looks.reset()
@@ -244,7 +247,7 @@ class Asker:
         if found.state is State.RUNNING:
             self._on_instance(found)
             self._change()
-        return _MOVING_S
+        return _poll(_MOVING_S, self._clock() - began)
 
     def _change(self) -> None:
         """Let the one before go, once another one serves."""
@@ -264,9 +267,11 @@ class Asker:
     def _exchange(self, request: InstanceCreate) -> Instance:
         now = self._clock()
         if self._instance is None:
-            self._renewed_at = now
+            self._renewed_at = self._asked_at = now
             return self._client.create_instance(request, idempotency_key=self._key)
         running = self._instance.state is State.RUNNING
+        if running:
+            self._asked_at = now  # should it have to be started again, that begins now
         # One that comes up holds its lease too: an image may take minutes to be there, and room longer.
         if running or now - self._renewed_at >= self._renew_s:
             self._renewed_at = now
@@ -303,3 +308,8 @@ class Asker:
     def _say(self, sentence: str, delay: float) -> float:
         self._trouble = sentence[:_LONGEST]
         return delay
+
+
+def _poll(first_s: float, since_s: float) -> float:
+    """Seconds until the next look at what was asked for so long ago."""
+    return min(_POLL_MOST_S, max(first_s, _POLL_SHARE * since_s))

@@ -45,7 +45,7 @@ _NAMED = {
 """Named in the log, once while it lasts. A gap is told by the hand-over; limits of acceleration are no trouble."""
 _OWES = (
     "the link is good, but the service wants to move since before the reset, and nothing moves by itself: it takes over"
-    " once it wanted a standstill; or end its work and begin it again, or stop the robot, reset and start it"
+    " once it wanted a standstill; or end its work and begin it again, or type `skytether robot start`"
 )
 _ONE_VOICE_S = neutral.NEUTRAL_S + 0.1
 """For how long the service must have been the agent's voice, for what the gate heard to be all its own [s]."""
@@ -319,8 +319,9 @@ class Driver:
             if self._spoke and not self._owed.why:
                 self._owed = neutral.require("nobody was allowed to drive")
         elif self._told.agent:
-            if self._waited and self._choice.source is Source.CLOUD and now - self._choice.since > _ONE_VOICE_S:
-                self._owed = Neutral()  # so it was the service that was neutral, or that a person let go on
+            served = self._choice.source is Source.CLOUD and now - self._choice.since > _ONE_VOICE_S
+            if self._told.started or (self._waited and served):
+                self._owed = Neutral()  # a person let the agent go on, or it was the service that was neutral
             self._waited = False
 
     def _change_over(self) -> list[LiveSession]:

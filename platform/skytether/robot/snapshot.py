@@ -79,6 +79,8 @@ def report(
         gate: What the gate says of itself; None: there is none.
     """
     present = {(topic.topic, topic.direction): topic for topic in (stats.topics if stats else ())}
+    # Those of the present session before others: of services before it there may be any number.
+    sums = sorted(tally.sums().items(), key=lambda one: one[0] not in present)[: rest.MOST_TOPICS]
     return rest.Report(
         life=tally.life,
         rtt_s=_known(rtt),
@@ -93,7 +95,7 @@ def report(
                 delay_p99_s=_known(present[key].delay_p99) if key in present else None,
                 jitter_s=_known(present[key].jitter) if key in present else None,
             )
-            for key, (priority, counts) in tally.sums().items()
+            for key, (priority, counts) in sums
         ),
         control_source=driver.source if driver else None,
         fallback_transitions=dict(driver.transition_counts) if driver else {},

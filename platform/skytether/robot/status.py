@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import json
 import logging
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from math import isfinite
-from socketserver import TCPServer
+from socketserver import TCPServer, ThreadingMixIn
 from typing import Any
 
 from skytether.api import rest
@@ -27,7 +30,9 @@ _log = logging.getLogger(__name__)
 DEFAULT_PORT = 8610
 _LOOPBACK = "127.0.0.1"
 _PATIENCE_S = 2.0
-"""For one request; the next waits as long."""
+"""For one request, from its first byte to the last of its answer."""
+_MOST = 16
+"""Connections at a time, each of which has a thread; who comes on top is closed."""
 _TRANSITIONS = 20
 """The newest that ``/status`` tells."""
 
@@ -98,7 +103,7 @@ def metrics(robot: str, service: str, status: AgentStatus, report: rest.Report) 
 
 
 class StatusServer:
-    """Answers in a thread of its own, one request after the other.
+    """Answers in threads of its own. Who asks slowly, or never ends, holds up neither the others nor the end.
 
     Attributes:
         port: Where it listens on loopback.
@@ -130,7 +135,39 @@ class StatusServer:
         self._server.server_close()
 
 
-class _Server(HTTPServer):
+class _Server(ThreadingMixIn, HTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = _MOST
+    """Come at once, too: of five, which is the default, the sixth had to knock again, a second later."""
+
+    def __init__(self, address: tuple[str, int], handler: type[_Handler]) -> None:
+        self._since: dict[Any, float] = {}
+        self.telling = threading.Lock()
+        super().__init__(address, handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if len(self._since) >= _MOST:
+            self.shutdown_request(request)
+            return
+        self._since[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        self._since.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Ten times a second: end whoever takes longer, one byte after the other, say."""
+        latest = time.monotonic() - _PATIENCE_S
+        for request, since in self._since.copy().items():
+            if since < latest:
+                with suppress(OSError):  # it has gone by itself
+                    request.shutdown(socket.SHUT_RDWR)
+
+    def handle_error(self, *_: object) -> None:
+        """Whoever goes away before the answer is not logged."""
+
     def server_bind(self) -> None:
         """Without the name of the address, for which HTTPServer asks a name server: nobody needs it."""
         TCPServer.server_bind(self)
@@ -138,6 +175,7 @@ class _Server(HTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    server: _Server
     pages: dict[str, Callable[[], tuple[str, bytes]]]
     timeout = _PATIENCE_S
 
@@ -151,7 +189,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404, "there are /status and /metrics")
             return
         try:
-            kind, body = page()
+            with self.server.telling:
+                kind, body = page()
         except Exception as error:  # whoever looks at a robot must not be able to harm it
             _log.debug("status failed", exc_info=error)
             self.send_error(500, "the status cannot be told")

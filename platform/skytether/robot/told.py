@@ -24,12 +24,14 @@ class Told:
         age_s: How long ago that was known [s].
         stopped: Why the robot stands until a person resets it; empty: it does not.
         hand: Who drives, as the gate says.
+        started: A person let the agent go on since it last had to be neutral.
     """
 
     velocity: Velocity
     age_s: float
     stopped: str = ""
     hand: str = ""
+    started: bool = False
 
     @property
     def nobody(self) -> bool:

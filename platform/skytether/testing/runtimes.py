@@ -17,7 +17,15 @@ from pydantic import Field
 from typing_extensions import override
 
 from skytether.api.manifest import ServiceSpec, Strict
-from skytether.orchestrator.runtimes.base import Capacity, Launch, Observation, Phase, Runtime, RuntimeFailure
+from skytether.orchestrator.runtimes.base import (
+    Capacity,
+    Launch,
+    Observation,
+    OvertakenError,
+    Phase,
+    Runtime,
+    RuntimeFailure,
+)
 
 
 class FakeOptions(Strict):
@@ -41,6 +49,13 @@ class FakeRun:
     log: str = ""
 
 
+class FakeWorld(dict[str, FakeRun]):
+    """The made-up machine: its runs by instance."""
+
+    epoch = 0
+    """Of the last leader that was here; 0: there was none."""
+
+
 class FakeRuntime(Runtime):
     """Every service is ready at once, runs until it is stopped, and ends when it is asked to."""
 
@@ -52,12 +67,14 @@ class FakeRuntime(Runtime):
     """Whether a run ends when it is asked to."""
 
     @override
-    def __init__(self, site: str, folder: Path, options: Strict, world: dict[str, FakeRun] | None = None) -> None:
-        """``world``: the runs of an earlier runtime, to be adopted."""
+    def __init__(self, site: str, folder: Path, options: Strict, world: FakeWorld | None = None) -> None:
+        """``world``: that of an earlier runtime, or of another orchestrator."""
         if not isinstance(options, FakeOptions):
             raise TypeError("options must be FakeOptions")
         self.site = site
-        self.world = {} if world is None else world
+        self.world = FakeWorld() if world is None else world
+        self.epoch = 0
+        """Of the leader for whom it acts; 0: of any."""
         self.silent = False
         """Set it, and the site answers no more."""
         self.started: list[tuple[str, int]] = []
@@ -72,11 +89,19 @@ class FakeRuntime(Runtime):
         self._answer()
         return Capacity(self._options.cpu, self._options.memory_mb)
 
+    @override
+    def lead(self, epoch: int) -> None:
+        self.epoch = epoch
+        self._must_lead()
+        self.world.epoch = epoch
+
     def start(self, launch: Launch) -> None:
-        self._answer()
+        self._must_lead()
         old = self.world.get(launch.instance)
         if old is not None and old.launch.attempt == launch.attempt:
             return
+        if old is not None and old.launch.attempt > launch.attempt and not old.ended:
+            raise OvertakenError(f"attempt {old.launch.attempt} of {launch.instance} runs already")
         log = f"{old.log if old else ''}run {launch.attempt} of {launch.grant.service}\n"
         self.world[launch.instance] = FakeRun(launch, old.port if old else next(self._ports), log=log)
         self.started.append((launch.instance, launch.attempt))
@@ -96,13 +121,13 @@ class FakeRuntime(Runtime):
         return Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
 
     def stop(self, instance: str, *, force: bool) -> None:
-        self._answer()
+        self._must_lead()
         run = self.world.get(instance)
         if run is not None and not run.ended and (force or self.obedient):
             run.ended, run.exit_status = True, -9 if force else 0
 
     def remove(self, instance: str) -> None:
-        self._answer()
+        self._must_lead()
         self.world.pop(instance, None)
 
     def logs(self, instance: str, lines: int) -> str:
@@ -114,6 +139,11 @@ class FakeRuntime(Runtime):
         run = self.world[instance]
         run.ended, run.exit_status, run.last_line = True, exit_status, last_line
         run.log += f"{last_line}\n" if last_line else ""
+
+    def _must_lead(self) -> None:
+        self._answer()
+        if 0 < self.epoch < self.world.epoch:
+            raise OvertakenError(f"site {self.site}: another orchestrator leads by now")
 
     def _answer(self) -> None:
         if self.silent:

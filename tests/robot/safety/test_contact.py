@@ -34,9 +34,11 @@ def floor(distance: float) -> Range:
         (CLIFF, floor(-inf), False),
         (CLIFF, floor(nan), None),
         (CLIFF, floor(0.0), None),
+        (CLIFF, floor(-1.0), None),  # as many drivers say that they failed; no floor is that near
         (CLIFF, Bool(data=True), None),
         (ContactParams(below_m=0.03), floor(0.02), True),
         (ContactParams(below_m=0.03), floor(-inf), True),
+        (ContactParams(below_m=0.03), floor(-1.0), True),
         (ContactParams(below_m=0.03), floor(0.04), False),
     ],
 )

@@ -94,6 +94,16 @@ def test_a_driver_that_starts_again_begins_from_standstill(robot):
         assert abs(first[0].velocity.linear) <= 1.0 * 0.04  # 1 m/s^2, two periods
 
 
+@pytest.mark.parametrize("seconds", [0.25, 0.35, 1.0])
+def test_a_driver_that_does_not_read_for_a_while_finds_no_jump_in_what_waits(robot, seconds):
+    """Ten datagrams find room; that there is none for the next was taken for a standstill, of wheels that turned."""
+    stage = Stage(robot)
+    robot.hardware.hang(seconds)
+    time.sleep(seconds)
+    stage.drives_on("the driver reads again")
+    check(stage)
+
+
 def test_a_killed_guard_leaves_no_jump_to_zero(robot):
     stage = Stage(robot)
     with stage.stands(stage.promised.partner, "the guard is killed"):

@@ -219,6 +219,18 @@ def test_readings_that_begin_to_come_late_are_as_old_as_they_are():
             assert motion.look(now + 2.0).measured, "a person has looked at the robot"
 
 
+def test_readings_that_are_late_from_the_first_are_as_old_as_they_are_by_our_own_clock():
+    for stamps, known in [(StampRule.AUTO, True), (StampRule.OWN, False)]:
+        motion, now = Motion(replace(PARAMS, stamps=stamps), LIMITS, 0.1), 100.0
+        for _ in range(20):
+            now += READING
+            assert motion.measure(odometry(0.2, 0.0, 5000 + now - 0.5), now, 5000 + now) == ""
+        seen = motion.look(now)
+        assert (not seen.unknown) is known
+    assert "0.5 s late by its stamp" in seen.unknown
+    assert "ahead of this computer's clock" in motion.measure(odometry(0.2, 0.0, 5001 + now), now, 5000 + now)
+
+
 def test_a_reading_that_is_stale_is_no_fault_of_the_wheels():
     motion, now = Motion(PARAMS, LIMITS, 0.1), 100.0
     for turn in range(400):

@@ -228,6 +228,16 @@ def test_a_sensor_may_be_configured_to_slow_down_only():
     assert bench.run(1.0).velocity.linear == pytest.approx(0.1)
 
 
+def test_of_two_agents_the_one_that_was_started_last_is_followed_and_the_other_named():
+    bench = Bench()
+    bench.run(0.5)
+    for sequence in range(1, 100):
+        bench.gate.command(Command(Hand.AGENT, -0.1, -0.5, 0, sequence, bench.now, 0.0, bench.now), bench.now)
+        last = bench.run(PERIOD)
+        assert last.velocity.linear > 0
+    assert "of two agents only the one that was started last is followed" in str(last.troubles)
+
+
 def test_the_joystick_goes_before_the_agent_and_gives_back():
     bench = Bench()
     bench.run(1.0)

@@ -117,6 +117,20 @@ def test_lasers_that_do_not_see_are_unknown_and_stop_the_robot(play):
         robot.go()
 
 
+def test_a_laser_that_is_late_from_its_first_scan_is_stale_by_the_robots_own_clock(play):
+    robot = play({"sensors": {"scan": {"max_age_s": 0.3, "stamps": "own"}}})
+    robot.go()
+    robot.scan = lambda: None
+    stands(robot)
+    robot.reset()  # the gate learns anew what is usual of each sensor
+    robot.scan = lambda: scan_of(np.full(RAYS, 5, dtype=np.float32), age_s=0.5)
+    robot.wait(lambda: any("by its stamp it came 0.5 s late" in said for said in robot.ask("status")["troubles"]), "it")
+    robot.start()
+    stands(robot)
+    robot.scan = robot.clear
+    robot.go()
+
+
 def test_two_old_scans_that_take_turns_are_silence(play):
     robot = play()
     robot.go()

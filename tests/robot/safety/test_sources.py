@@ -313,9 +313,14 @@ def test_after_a_lost_joystick_the_agent_does_not_go_on_by_itself_however_long_i
     assert bench.gate.start(bench.now)[1].startswith("the joystick is lost")
     bench.says["joy"], bench.held = joy(0.0, 0.0, held=False), None
     assert bench.run(2.0).velocity == STANDSTILL
+    assert not bench.gate.started
     assert bench.gate.start(bench.now) == (["agent"], "")
     bench.run(1.0)
     assert bench.wheels == pytest.approx(0.3)
+    assert bench.gate.started
+    bench.gate.engage("a test")
+    bench.gate.reset(bench.now)
+    assert not bench.gate.started
 
 
 def test_start_lets_go_on_who_speaks_now_and_nobody_who_comes_later():

@@ -117,3 +117,33 @@ def test_a_clock_of_ours_that_fails_is_overcome(now):
     assert not broken.delay <= 0.3
     assert sensor.came(10.2).wrong == ""
     assert sensor.came(10.3).delay == pytest.approx(0.0, abs=1e-2)
+
+
+def own(before: Stamps, now: float, age: float, wall: float = START):
+    return date(StampRule.OWN, before, stamp(wall + now - age), now, 0.3, wall + now)
+
+
+def test_stamps_of_our_own_clock_tell_the_age_from_the_first():
+    stamps = Stamps()
+    for i in range(100):  # always late by the same time, and slower than clocks may part
+        dated = own(stamps, 10 + i / 10, 0.2 + i * 4e-5)
+        stamps = dated.stamps
+        assert dated.delay == pytest.approx(0.2 + i * 4e-5, abs=1e-6)
+    assert own(stamps, 30.0, -0.01).delay == 0
+    assert date(StampRule.AUTO, Stamps(), stamp(START - 0.2), 10.0, 0.3).delay == 0, "of another clock nobody knows"
+
+
+def test_stamps_of_our_own_clock_that_are_ahead_of_it_or_missing_are_not_used():
+    assert own(Stamps(), 10.0, -0.2).wrong == "ahead"
+    assert date(StampRule.OWN, Stamps(), (0, 0), 10.0, 0.3, START).wrong == "unstamped"
+    assert date(StampRule.OWN, Stamps(), stamp(START), 10.0, 0.3).wrong == "ahead", "our clock is not known"
+
+
+@pytest.mark.parametrize("by", [3600.0, -3600.0, -0.03])
+def test_our_own_clock_that_is_set_is_overcome(by):
+    stamps, used = own(Stamps(), 10.0, 0.02).stamps, []
+    for i in range(1, 25):
+        dated = own(stamps, 10 + i / 10, 0.02, START + by)
+        stamps = dated.stamps
+        used.append(not dated.wrong and dated.delay == pytest.approx(0.02, abs=1e-3))
+    assert all(used) or (by == -3600.0 and not any(used[:9]) and all(used[12:]))

@@ -53,6 +53,8 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     agent = graph.skytether("robot", "run", str(gated))
     button = graph.start("rostopic", "pub", "-r", "5", "/estop", "std_msgs/Bool", "data: false")
     release(folder)
+    # The service may have been quicker than the gate and its reset, and wants to drive from its first command.
+    wait_for(lambda: ask(folder, {"do": "start"}, 30)["started"] == ["agent"], "the agent to be let go")
     drives(walker)
     levels = []
     listener = Listener(lambda data, _: levels.append(decode(Bool, data, "ros1").data))

@@ -17,10 +17,11 @@ class FakeMaster:
         self.told = []
         self.here = True
         self.known = set()
+        self.at = "http://me/"
 
     def knows(self, node):
         self.check()
-        return "http://me/" if self.known else ""
+        return self.at if self.known else ""
 
     def check(self):
         if not self.here:
@@ -80,6 +81,16 @@ def test_a_master_that_forgot_us_is_told_everything_again(master, registry, capl
     registry.step()
     assert master.told == ["+a", "+a"]
     assert "was restarted" in caplog.text
+
+
+def test_another_node_of_our_name_is_told_from_a_master_that_was_restarted(master, registry, caplog):
+    registry.want(Entry("a"))
+    registry.step()
+    master.at = "http://other/"
+    registry.step()
+    assert master.told == ["+a", "+a"]
+    assert "knows /me at http://other/: end that node; registering again" in caplog.text
+    assert "was restarted" not in caplog.text
 
 
 def test_an_absent_master_is_named_once_and_so_is_its_return(master, registry, caplog):

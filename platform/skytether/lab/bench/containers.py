@@ -1,4 +1,4 @@
-"""What the benchmarks do with the Docker engine of this machine, by its command line."""
+"""What the benchmarks do with the Docker engine of this machine, or of DOCKER_HOST, by its command line."""
 
 from __future__ import annotations
 
@@ -44,6 +44,8 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str) -> Iterator[Ser
     """
     owner = f"bench-{secrets.token_hex(4)}"
     options = {"owner": owner, "network": f"skytether-{owner}", "guard_image": f"{prefix}guard:1", "pull": "never"}
+    if "DOCKER_HOST" in os.environ:  # as the command line has it
+        options["engine"] = os.environ["DOCKER_HOST"]
     image = f"{prefix}{SERVICE}:1"
     docker("image", "inspect", image, options["guard_image"])
     try:

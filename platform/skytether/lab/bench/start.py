@@ -20,6 +20,8 @@ from skytether.robot.agent import Agent, AgentConfig
 
 _LIMIT_S = 60.0
 _LOOK_S = 0.005
+_REST_S = 3.0
+"""Before each start of a container: what the site does after the one before is over, and nothing shares the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +91,10 @@ def _docker(n: int, prefix: str) -> Iterator[_Start]:
         docker_site(orchestrator, prefix) as service,
         Client(orchestrator.url, orchestrator.operator_token) as operator,
     ):
-        for standby, took in _starts(operator, orchestrator.url, n):
+        for standby, took in _starts(operator, orchestrator.url, n, _REST_S):
             yield "docker", standby, took
             if not standby:
+                time.sleep(_REST_S)
                 yield "docker run", 0, docker_run(service)
 
 
@@ -100,8 +103,8 @@ _Start = tuple[str, int, float]
 _STARTS = {"process": _process, "docker": _docker}
 
 
-def _starts(operator: Client, url: str, n: int) -> Iterator[tuple[int, float]]:
-    """Cold starts, then as many with an instance kept warm."""
+def _starts(operator: Client, url: str, n: int, rest_s: float = 0.0) -> Iterator[tuple[int, float]]:
+    """Cold starts, each after a rest, then as many with an instance kept warm."""
     token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
     config = AgentConfig(robot=ROBOT, url=url, token=token, service=SERVICE, bind=("127.0.0.1", 0))
     for standby in (0, 1):
@@ -112,6 +115,8 @@ def _starts(operator: Client, url: str, n: int) -> Iterator[tuple[int, float]]:
         for _ in range(n):
             if standby:
                 _until_warm(operator)
+            else:
+                time.sleep(rest_s)
             with Agent(config, WalkerBase(World(Trail(), seed=1))) as agent:
                 took = _first_command(agent)
             yield standby, took

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from itertools import permutations
 
+from skytether.guard.velocity import STANDSTILL
+
 from .attacks import Attacks
 from .stage import Promised, Stage
 
@@ -84,11 +86,13 @@ def killed(role: str) -> Run:
     """One is killed."""
 
     def run(stage: Stage) -> None:
-        until = _WATCH_S if role not in ("gate", "writer") else _STARTS_AGAIN_S
         victim = stage.robot.pid(role)
         with stage.stands(_alone(role)(stage.promised), f"the {role} was killed"):
             stage.robot.kill(victim)
-            stage.sleep(until)
+            if role == "writer":  # the next one goes on from the standstill, as soon as it is there
+                stage.expect(lambda: stage.robot.velocity == STANDSTILL, "the robot stands")
+            else:
+                stage.sleep(_STARTS_AGAIN_S if role == "gate" else _WATCH_S)
         if role == "guard":
             stage.expect(lambda: not stage.robot.alive("gate"), "the gate ends without its guard")
 

@@ -14,6 +14,7 @@ from skytether.messages import Header, Joy, LaserScan, Time
 
 from .attacks import Attacks
 from .robot import RAYS, scan_of
+from .socket_hardware import SocketHardware
 from .stage import Stage
 
 _BLIND_S = 1.5
@@ -31,6 +32,13 @@ def enter(attacks: Attacks) -> None:
             f"wheels-gone-{seconds:g}",
             f"the wheels' driver is gone for {seconds:g} s",
             wheels_gone(seconds),
+            seconds=seconds + 1.5,
+        )
+    for seconds in (0.15, 0.25, 0.35, 1.0):
+        attacks.add(
+            f"wheels-hang-{seconds:g}",
+            f"the wheels' driver does not read for {seconds:g} s, and then reads all",
+            _wheels_hang(seconds),
             seconds=seconds + 1.5,
         )
     for name, what, scan in (
@@ -57,6 +65,18 @@ def wheels_gone(seconds: float) -> Callable[[Stage], None]:
         stage.sleep(seconds)
         stage.robot.hardware.appear()
         stage.drives_on(f"the robot drives on after the wheels' driver was gone for {seconds:g} s")
+
+    return run
+
+
+def _wheels_hang(seconds: float) -> Callable[[Stage], None]:
+    def run(stage: Stage) -> None:
+        wheels = stage.robot.hardware
+        if not isinstance(wheels, SocketHardware):
+            raise TypeError("the wheels of this robot are on a graph")
+        wheels.hang(seconds)
+        stage.sleep(seconds)
+        stage.drives_on(f"the robot drives on after the wheels' driver did not read for {seconds:g} s")
 
     return run
 

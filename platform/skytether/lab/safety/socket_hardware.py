@@ -6,7 +6,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +23,8 @@ _SO_TIMESTAMPNS = 35
 _TIME = struct.Struct("ll")
 _CREDENTIALS = struct.Struct("iII")
 _LOOK_S = 0.05
+_AT_ONCE_S = 0.001
+"""Two clocks that are read within this are read at the same moment."""
 
 
 class Hardware(Protocol):
@@ -63,6 +65,7 @@ class SocketHardware:
         self._folder = folder
         self._ended = threading.Event()
         self._wheels: socket.socket | None = None
+        self._hangs_until = 0.0
         self._sends = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._sends.setblocking(False)
         self._thread = threading.Thread(target=self._receive, name="wheels")
@@ -92,6 +95,10 @@ class SocketHardware:
         made.bind(str(self._folder / "wheels.sock"))
         self._wheels = made
 
+    def hang(self, seconds: float) -> None:
+        """The wheels' driver does not read what it is sent for a while [s]; then it reads all."""
+        self._hangs_until = now() + seconds
+
     def close(self) -> None:
         """Hardware: end the thread, close the sockets."""
         self._ended.set()
@@ -102,7 +109,7 @@ class SocketHardware:
     def _receive(self) -> None:
         while not self._ended.is_set():
             listens = self._wheels
-            if listens is None:
+            if listens is None or now() < self._hangs_until:
                 self._ended.wait(0.005)
                 continue
             try:
@@ -122,7 +129,22 @@ class SocketHardware:
         for _, kind, value in more:
             if kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIME.unpack(value[: _TIME.size])
-                at -= time.time() - (seconds + nanoseconds * 1e-9)
+                at = steady(seconds + nanoseconds * 1e-9)
             elif kind == socket.SCM_CREDENTIALS:
                 sender = _CREDENTIALS.unpack(value[: _CREDENTIALS.size])[0]
         self.record.add(Told(at, Velocity(twist.linear.x, twist.angular.z), sender))
+
+
+def steady(wall_s: float, clock: Callable[[], float] = now, wall_clock: Callable[[], float] = time.time) -> float:
+    """When it was that time of day [s], on the clock of everything else here [s].
+
+    Read until both clocks are read at once: a judge that lost the processor between them would take a velocity for one
+    that was told earlier than it was, and so for a jump.
+    """
+    before = clock()
+    while True:
+        ago = wall_clock() - wall_s
+        after = clock()
+        if after - before < _AT_ONCE_S:
+            return after - ago
+        before = after

@@ -164,11 +164,13 @@ async def events(
     core: Core, record: Own, last_event_id: Annotated[int, Header(ge=0)] = 0
 ) -> AsyncIterator[ServerSentEvent]:
     """All changes so far after ``Last-Event-ID``, then each as it comes; the stream ends with the instance."""
-    last = last_event_id
+    last, ended = last_event_id, False
     with core.broker.subscribe(record.id) as changed:
         while not core.broker.closed:
             changed.clear()
-            rows, ended = await to_thread.run_sync(_news, core, record.id, last)
+            rows: list[EventRow] = []
+            with contextlib.suppress(*GONE):  # the next look tells what this one could not
+                rows, ended = await to_thread.run_sync(_news, core, record.id, last)
             for row in rows:
                 last = row.id
                 event = InstanceEvent(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from fastapi import APIRouter, Response
 
 from skytether.api.rest import GateReport, Robot, RobotCreate, RobotCreated, RobotUse, StopOrder, StopRobot
@@ -18,19 +20,19 @@ router = APIRouter(prefix=f"{PREFIX}/robots", tags=["robots"], responses=says(40
 def _show(
     core: Orchestrator,
     row: RobotRow,
+    data: Mapping[str, int],
     use: RobotUse | None = None,
     stop: StopRow | None = None,
     gate: GateRow | None = None,
 ) -> Robot:
     seen = utc(row.last_seen_at) if row.last_seen_at is not None else None
-    most = core.settings.quotas
     return Robot(
         name=row.name,
         services=row.services,
         created_at=utc(row.created_at),
         last_seen_at=seen,
-        use=use or RobotUse(),
-        quota=RobotUse(instances=most.robot_instances, cpu=most.robot_cpu, memory_mb=most.robot_memory_mb),
+        use=core.quotas.with_rest(row.name, use or RobotUse(), data),
+        quota=core.quotas.of_robot,
         stop=None if stop is None else _order(stop),
         gate=None if gate is None else gate.report,
         gate_heard_at=None if gate is None else utc(gate.at),
@@ -48,8 +50,8 @@ def _order(row: StopRow) -> StopOrder:
 def list_robots(core: Core, _: Reader) -> list[Robot]:
     """All registered robots, with what they use, their last order to stop and what they said of their gates."""
     use, gates, stops = use_by_robot(core.store.live()), core.gates.all(), core.store.stops()
-    rows = core.store.robots()
-    return [_show(core, row, use.get(row.name), stops.get(row.name), gates.get(row.name)) for row in rows]
+    rows, data = core.store.robots(), core.quotas.data()
+    return [_show(core, row, data, use.get(row.name), stops.get(row.name), gates.get(row.name)) for row in rows]
 
 
 @router.post("", status_code=201, responses=says(409, 422))
@@ -57,7 +59,7 @@ def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate, response: Respo
     """Register a robot. Its token is in the answer and cannot be shown again."""
     row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s)
     made(response, "robots", row.name)
-    return RobotCreated(**_show(core, row).model_dump(), token=token)
+    return RobotCreated(**_show(core, row, core.quotas.data()).model_dump(), token=token)
 
 
 @router.delete("/{robot}", status_code=204)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
+
 from fastapi import APIRouter, Response
 
-from skytether.api.rest import Site, SiteCreate
+from skytether.api.rest import Site, SiteCreate, Unfit
 
 from ..access import Principal
 from ..core import Orchestrator
+from ..instances import utc
 from ..sites import Site as LiveSite
 from .deps import PREFIX, Caller, Core, SitesOperator, made, says
 
@@ -34,6 +37,21 @@ def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
         architecture=total.architecture if total else "",
         load=site.load,
         instances=len(core.store.live_at(asked.name)),
+        unfit=_unfit(site) if caller.robot is None else (),
+        draining=site.draining,
+    )
+
+
+def _unfit(site: LiveSite) -> tuple[Unfit, ...]:
+    return tuple(
+        Unfit(
+            service=verdict.service,
+            reason=verdict.why,
+            failures=verdict.failures,
+            robots=tuple(sorted(verdict.robots)),
+            until=utc(verdict.again_at),
+        )
+        for verdict in site.fitness.verdicts(time.monotonic())
     )
 
 
@@ -57,11 +75,20 @@ def get_site(core: Core, caller: Caller, site: str) -> Site:
     return _show(core, core.sites.get(site), caller)
 
 
-@router.delete("/{site}", status_code=204, responses=says(401, 403, 404, 409))
-def delete_site(core: Core, _: SitesOperator, site: str) -> None:
-    """Forget a site that has no instances."""
-    core.sites.delete(site)
+@router.delete(
+    "/{site}", status_code=204, responses={202: {"description": "It is being drained"}, **says(401, 403, 404, 409)}
+)
+def delete_site(core: Core, _: SitesOperator, site: str, drain: bool = False) -> Response:
+    """Forget a site that has no instances.
+
+    With ``drain`` one that has some takes no more (202), and is forgotten when the last of them has ended or was moved.
+    """
+    if not drain:
+        core.sites.delete(site)
+    elif not core.sites.drain(site):
+        return Response(status_code=202)
     core.metrics.forget_site(site)
+    return Response(status_code=204)
 
 
 @router.get("/{site}/probe", status_code=204, responses=says(401, 403, 404))

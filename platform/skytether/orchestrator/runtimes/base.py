@@ -5,6 +5,10 @@ for an end, what to do with strangers is the reconciler's. All calls come from t
 ``refuses`` and ``blocked``, which may come from any. No call waits for a service: what takes long is begun, and
 ``observe`` tells how far it is.
 
+Several orchestrators may have the same site open, and for a short time two of them may believe that they lead: one was
+frozen, or has lost its database. So a runtime never trusts its memory about what is at the site, and refuses what it is
+asked on behalf of a leader that another one has followed (``lead``).
+
 A runtime is found by its entry point in group ``skytether.runtimes``; ``tests/contracts`` is the suite each must
 pass.
 """
@@ -112,6 +116,15 @@ class SiteSilentError(RuntimeFailure):
     """The site does not answer: nothing is known of what runs there, and no service is to blame."""
 
 
+class OvertakenError(RuntimeFailure):
+    """Another orchestrator leads by now, or has begun a later run: nothing was done, and no service is to blame."""
+
+    @classmethod
+    def by_leader(cls, told: object) -> OvertakenError:
+        """Of a later epoch; ``told``: the file or object that says so."""
+        return cls(f"another orchestrator leads by now, says {told}: this one does nothing here any more")
+
+
 class Runtime(ABC):
     """One site's runtime."""
 
@@ -126,7 +139,8 @@ class Runtime(ABC):
     there, or with which variables, is that user. Such a site is made by the operator of the state folder alone."""
 
     owner_options: ClassVar[frozenset[str]] = frozenset()
-    """Options with which whoever chooses them has the site's machine; the operator of the state folder alone does."""
+    """Options with which whoever chooses them has the site's machine, or secrets of ours; the operator of the state
+    folder alone does."""
 
     @abstractmethod
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
@@ -166,11 +180,28 @@ class Runtime(ABC):
             RuntimeFailure: The site does not answer.
         """
 
-    @abstractmethod
-    def start(self, launch: Launch) -> None:
-        """Begin a run. Nothing happens if this very attempt was begun before; what is left of earlier ones is ended.
+    def lead(self, epoch: int) -> None:  # noqa: B027 (where a site is of one orchestrator alone, there is no other)
+        """From now on act for the leader of this epoch, and let nobody act here for an earlier one.
+
+        Called before the first look of a leader at the site, again until it succeeds. Until then a runtime acts for
+        whoever asks, as tools and single orchestrators do. Whatever an earlier leader begins after this is refused with
+        ``OvertakenError`` and does nothing; what it had begun before is seen by ``observe``, now or when it is done.
+
+        Args:
+            epoch: Of the leader, above 0; each new leader has a higher one than all before.
 
         Raises:
+            OvertakenError: A leader of a later epoch was here.
+            RuntimeFailure: The site does not answer, so nobody was told; do nothing here.
+        """
+
+    @abstractmethod
+    def start(self, launch: Launch) -> None:
+        """Begin a run. Nothing happens if this very attempt was begun before, by whomever; earlier ones are ended.
+
+        Raises:
+            OvertakenError: Another orchestrator leads by now, or a later attempt runs.
+            SiteSilentError: The site does not answer, or another orchestrator is just acting on this instance.
             RuntimeFailure: It cannot be started; nothing of it is left running.
         """
 
@@ -195,11 +226,20 @@ class Runtime(ABC):
         """Ask a run to end, or with ``force`` end it now with all it started. May be called again and again.
 
         An instance that is unknown or has ended is left as it is; so is an exit that is under way.
+
+        Raises:
+            OvertakenError: Another orchestrator leads by now.
+            RuntimeFailure: The site does not answer, or another orchestrator is just acting on this instance.
         """
 
     @abstractmethod
     def remove(self, instance: str) -> None:
-        """Forget an instance and its log; end it first if it runs. May be called again. Its data stays."""
+        """Forget an instance and its log; end it first if it runs. May be called again. Its data stays.
+
+        Raises:
+            OvertakenError: Another orchestrator leads by now.
+            RuntimeFailure: The site does not answer, or another orchestrator is just acting on this instance.
+        """
 
     @abstractmethod
     def logs(self, instance: str, lines: int) -> str:
@@ -229,8 +269,17 @@ class Runtime(ABC):
         """
         return None
 
+    def stored(self) -> Mapping[str, int]:
+        """Bytes that services have written and left here, by robot, as far as they were weighed. From any thread."""
+        return {}
+
     def tidy(self) -> None:  # noqa: B027 (most need none)
-        """Keep what grows within bounds (logs). Called about once a second."""
+        """Keep what grows within bounds (logs). Called about once a second.
+
+        Raises:
+            OvertakenError: Another orchestrator leads by now.
+            RuntimeFailure: The site does not answer.
+        """
 
     def dismantle(self) -> None:  # noqa: B027 (most make none)
         """Remove what was made for the site as such; before ``close``, when it is deleted and nothing runs there.

@@ -9,6 +9,7 @@ ends all processes of a user.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -21,7 +22,8 @@ from typing import Any
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _CLONE_NEWNS, _CLONE_NEWIPC = 0x0002_0000, 0x0800_0000
-_MS_RDONLY, _MS_NOSUID, _MS_NODEV, _MS_REMOUNT, _MS_BIND, _MS_REC, _MS_PRIVATE = 1, 2, 4, 32, 4096, 16384, 1 << 18
+_MS_RDONLY, _MS_NOSUID, _MS_NODEV, _MS_NOEXEC, _MS_REMOUNT = 1, 2, 4, 8, 32
+_MS_BIND, _MS_REC, _MS_PRIVATE = 4096, 16384, 1 << 18
 _PR_CAPBSET_DROP, _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 24, 38, 22, 2
 _CAPABILITIES = 64
 _ENDER = 65_520
@@ -145,9 +147,11 @@ def landlock_version() -> int:
 
 
 def own_mounts() -> None:
-    """Mounts, and shared memory, that nobody else sees."""
+    """Mounts, and shared memory, that nobody else sees; and of processes it sees its own only."""
     _checked(_LIBC.unshare(_CLONE_NEWNS | _CLONE_NEWIPC), "mounts of its own")
     _checked(_LIBC.mount(b"none", b"/", None, ctypes.c_ulong(_MS_REC | _MS_PRIVATE), None), "mounts of its own")
+    with contextlib.suppress(OSError):  # in a container, where some of /proc is covered, it is not given anew
+        _mount("proc", "/proc", "proc", _MS_NOSUID | _MS_NODEV | _MS_NOEXEC, "hidepid=2")
 
 
 def _mount(source: str, target: str, kind: str | None, flags: int, options: str | None = None) -> None:
@@ -287,13 +291,15 @@ def _no_emptying_open(column: int) -> list[tuple[int, int, int, int]]:
 
 def probe() -> dict[str, Any]:
     """What of all this the machine has; undone by the end of this process."""
-    has: dict[str, Any] = {"landlock": landlock_version(), "seccomp": False, "user": False}
+    has: dict[str, Any] = {"landlock": landlock_version(), "seccomp": False, "user": False, "hidden": False}
     try:
         if os.geteuid() == 0:
             own_mounts()
             _mount("none", "/tmp", "tmpfs", _MS_NOSUID | _MS_NODEV)  # noqa: S108
             become(65_534, [])
             has["user"] = True
+            # Before Linux 5.8 every mount of /proc has the options of the first.
+            has["hidden"] = not os.path.exists(f"/proc/{os.getppid()}")
     except OSError as error:
         has["why"] = str(error)
     if platform.machine() in _ARCHITECTURES:
@@ -326,6 +332,7 @@ def main() -> None:
         write += [folder for folder in asked["cover"] if folder in _SCRATCH]
     drop_capabilities()
     if user is not None:
+        resource.setrlimit(resource.RLIMIT_NPROC, (asked["pids"],) * 2)  # of a user: all of the instance's
         become(user, asked["groups"])
     _checked(_LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "no new privileges")
     if asked["landlock"]:

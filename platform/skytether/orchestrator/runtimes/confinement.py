@@ -45,11 +45,14 @@ class Machine:
     """Each instance can be another user, with mounts of its own."""
     why: str = ""
     """Why it cannot."""
+    hidden: bool = False
+    """An instance sees no processes but its own."""
 
     def holds(self) -> tuple[str, ...]:
         """In words for people."""
         landlock = f"Landlock {self.landlock}"
-        found = ("own user", self.user), ("own mounts", self.user), (landlock, self.landlock), ("seccomp", self.seccomp)
+        users = ("own user", self.user), ("own mounts", self.user), ("own processes", self.hidden)
+        found = *users, (landlock, self.landlock), ("seccomp", self.seccomp)
         return tuple(name for name, there in found if there)
 
     def lacks(self) -> str:
@@ -77,7 +80,7 @@ def this_machine() -> Machine:
         has = json.loads(done.stdout)
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         return Machine(0, seccomp=False, user=False, why=str(error))
-    return Machine(has["landlock"], has["seccomp"], has["user"], has.get("why", ""))
+    return Machine(has["landlock"], has["seccomp"], has["user"], has.get("why", ""), has["hidden"])
 
 
 def readable(more: Collection[Path], secret: Path) -> list[str]:
@@ -146,6 +149,7 @@ def confined(
     write: Sequence[str],
     user: int | None,
     groups: Sequence[int],
+    pids: int,
 ) -> list[str]:
     """The command that gives up rights, then becomes this one.
 
@@ -156,6 +160,7 @@ def confined(
         write: May be written, too; the last one is where it starts.
         user: Who it becomes; None: nobody else.
         groups: Of that user, by number.
+        pids: Processes and threads that a user of its own may have at most.
     """
     asked = {
         "command": list(command),
@@ -165,6 +170,7 @@ def confined(
         "cover": covers([*read, *write]) if user is not None else [],
         "user": user,
         "groups": list(groups),
+        "pids": pids,
         "landlock": machine.landlock,
         "seccomp": machine.seccomp,
         # Without mounts of its own, every socket in the file system that the orchestrator's user may use is in its

@@ -18,7 +18,6 @@ import math
 import os
 import platform
 import secrets
-import shutil
 import signal
 import socket
 import subprocess
@@ -26,7 +25,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,25 +35,33 @@ from typing_extensions import override
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec, Strict
 
-from .base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
+from .base import (
+    ARCHITECTURES,
+    Capacity,
+    Launch,
+    LogStream,
+    Observation,
+    OvertakenError,
+    Phase,
+    Runtime,
+    RuntimeFailure,
+)
 from .confinement import confined, launch_file, opened, readable, this_machine
-from .disk import MOST_FILES, size_of
+from .disk import MOST_FILES, folders_in, remove_tree, size_of
+from .fence import Fence
 from .file_log import FileLog, keep_newer_half, last_line
 from .hosts import AdvertisedHost, BindHost, check_advertised
-from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, find_by_environment, session_members, stat_of
-from .users import end_all_of, give_user_back, hand_over, keep_user, noted_user, take_user
+from .notes import noted_port, read_json, write_private
+from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, stat_of
+from .runs import OWN, Run, Runs
+from .users import give_user_back, hand_over, noted_user, take_user
 
 log = logging.getLogger(__name__)
 
 _PASSED_ON = ("LANG", "LC_ALL", "PATH", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
-_OWN = "own"
 _OWN_MB = 64
 """MiB that a run may have in its own folder, which is also its home and has its temporary files."""
-_NOTE_BYTES = 64 << 10
-"""Of a ready file or note that are read; they have some hundred."""
-_PASSES = 20
-"""Looks at a session that is being ended: whoever forks meanwhile is in the next one."""
 _WEIGH = 2.0
 """Seconds between two looks at how much robots' services have written."""
 _MEASURE = 2.0
@@ -112,41 +118,6 @@ class ProcessOptions(Strict):
         return self
 
 
-@dataclass
-class _Run:
-    """The latest run of one instance."""
-
-    attempt: int
-    process: ProcessId | None
-    folder: str
-    """Of the instance; all that is looked at again and again is named by text, for paths are slow to put together."""
-    data: str = ""
-    """Folder for what the service produces."""
-    ready_file: str = ""
-    user: int | None = None
-    """Whose process it is, where it has one of its own."""
-    child: subprocess.Popen[bytes] | None = None
-    """None for one that an earlier orchestrator started."""
-    asked_to_end: bool = False
-    exceeds: str = ""
-    """What it took more of than it may."""
-    seen: Observation | None = None
-    """As it was when it was read last."""
-    ready: tuple[tuple[int, int, int], int] | None = None
-    """Which ready file was read (inode, time of change [ns], size), and its port."""
-
-    @property
-    def ended(self) -> Observation | None:
-        """Its end, which cannot change any more; nothing on the machine does. None: it has not."""
-        return self.seen if self.seen and self.seen.phase is Phase.EXITED else None
-
-    def runs_on(self, all_run: bool) -> bool:
-        """A child that was running, and has not ended since: one system call tells, or that no child has ended."""
-        if not (self.seen and self.seen.phase is Phase.RUNNING and self.child):
-            return False
-        return (self.child.returncode if all_run else self.child.poll()) is None
-
-
 class ProcessRuntime(Runtime):
     """Runs ``python -m ENTRYPOINT`` with the same interpreter."""
 
@@ -178,29 +149,18 @@ class ProcessRuntime(Runtime):
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._measured_at = -math.inf
         self._weighed_at = -_WEIGH
-        self._runs = {path.name: self._adopt(path) for path in self._folder.iterdir() if path.is_dir()}
+        self._stored: dict[str, int] = {}
+        """By robot, as weighed last."""
+        self._unweighed: list[str] = []
+        """Robots' folders that are still to be weighed, before all of them are again."""
+        self._fence = Fence(folder)
+        self._runs = Runs(self._folder, self._fence)
+        self._runs.all()
 
     @override
     @classmethod
     def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
         return {"owner": secrets.token_hex(6), **options} if options.get("folder") else options
-
-    def _adopt(self, folder: Path) -> _Run:
-        note = folder / "run.json"
-        noted = _read_json(note)
-        process = user = None
-        if noted.get("boot") == BOOT_ID:
-            if "process" in noted:
-                process = ProcessId(*noted["process"])
-            else:
-                # The orchestrator was killed between launch and note: the process is known by its grant.
-                process = find_by_environment(GRANT_VARIABLE, str(folder / _OWN / "grant.json"))
-                if process is not None:
-                    _write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-        ready = str(noted.get("ready", folder / "ready.json"))
-        if process is not None:
-            user = keep_user(str(folder), noted_user(noted.get("user")))
-        return _Run(int(noted.get("attempt", 0)), process, str(folder), str(noted.get("data", "")), ready, user)
 
     @override
     def isolation(self) -> tuple[str, ...]:
@@ -219,14 +179,25 @@ class ProcessRuntime(Runtime):
     def load(self) -> float | None:
         return psutil.cpu_percent() / 100
 
+    @override
+    def lead(self, epoch: int) -> None:
+        self._fence.lead(epoch)
+        self._runs.read_anew()
+
     def start(self, launch: Launch) -> None:
-        old = self._runs.get(launch.instance)
-        if old is not None:
-            if old.attempt == launch.attempt and old.process is not None:
+        with self._fence.acting(launch.instance):
+            old = self._runs.find(launch.instance, acting=True)
+            if old is not None and old.attempt == launch.attempt and old.process is not None:
                 return
-            _kill_all(old)
-            if old.child is not None:
-                old.child.wait()
+            if old is not None and old.attempt > launch.attempt and old.lives:
+                raise OvertakenError(
+                    f"attempt {old.attempt} of {launch.instance} runs: attempt {launch.attempt} is not begun any more"
+                )
+            if old is not None:
+                old.end()
+            self._begin(launch, anew=old is None)
+
+    def _begin(self, launch: Launch, *, anew: bool) -> None:
         folder = self._folder / launch.instance
         data = self._data / launch.grant.robot / launch.grant.service / launch.instance
         if full := self._full(launch.grant.robot):
@@ -235,21 +206,22 @@ class ProcessRuntime(Runtime):
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
-            noted = _read_json(folder / "run.json")
-            port = _port(Path(noted.get("ready", ""))) or _port(folder / "run.json")
+            noted = read_json(folder / "run.json")
+            port = noted_port(Path(noted.get("ready", ""))) or noted_port(folder / "run.json")
             user = self._user_for(folder, noted)
             ready = self._prepare(launch, folder, data, port, user)
             note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port, "ready": ready}
             note["user"] = user
-            _write_private(folder / "run.json", json.dumps(note))
-            child = self._spawn(str(launch.spec.entrypoint), read, folder, data, user)
+            write_private(folder / "run.json", json.dumps(note))
+            child = self._spawn(launch.spec, read, folder, data, user)
             process = ProcessId(child.pid, _start_time(child.pid))
-            _write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
+            write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
-            if old is None:
+            if anew:
                 give_user_back(str(folder))
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
-        self._runs[launch.instance] = _Run(launch.attempt, process, str(folder), str(data), ready, user, child)
+        run = Run(launch.attempt, process, str(folder), str(data), ready, user, child)
+        self._runs.keep(launch.instance, run)
 
     def _read_by(self, spec: ServiceSpec) -> list[str]:
         if not (self._machine and spec.launch and spec.launch.startswith("/")):
@@ -265,8 +237,8 @@ class ProcessRuntime(Runtime):
 
     def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None, user: int | None) -> str:
         """Make the run's own folder, with the grant in it; returns the path of the ready file."""
-        own = folder / _OWN
-        shutil.rmtree(own, ignore_errors=True)
+        own = folder / OWN
+        remove_tree(str(own))
         own.mkdir(mode=0o700)
         ready = str(own / "ready.json")
         grant = launch.grant.model_copy(
@@ -277,7 +249,7 @@ class ProcessRuntime(Runtime):
                 "data_dir": str(data),
             }
         )
-        _write_private(own / "grant.json", grant.model_dump_json())
+        write_private(own / "grant.json", grant.model_dump_json())
         if user is not None:
             hand_over(str(own), user)
             if data.lstat().st_uid != user:  # new, or from when it had no user of its own
@@ -285,19 +257,19 @@ class ProcessRuntime(Runtime):
         return ready
 
     def _spawn(
-        self, entrypoint: str, read: Sequence[str], folder: Path, data: Path, user: int | None
+        self, spec: ServiceSpec, read: Sequence[str], folder: Path, data: Path, user: int | None
     ) -> subprocess.Popen[bytes]:
-        own = str(folder / _OWN)
+        own = str(folder / OWN)
         environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
         environment |= {"PYTHONUNBUFFERED": "1", "HOME": own, "TMPDIR": own, **self._options.environment}
         if self._options.python_path:
             environment["PYTHONPATH"] = os.pathsep.join(self._options.python_path)
         environment[GRANT_VARIABLE] = f"{own}/grant.json"
         # -P: what a service writes into its data folder must not be importable.
-        command = [sys.executable, "-P", "-m", entrypoint]
+        command = [sys.executable, "-P", "-m", str(spec.entrypoint)]
         if self._machine:
             write = [*map(str, self._options.writable), own, str(data)]
-            command = confined(command, self._machine, read, write, user, self._options.groups)
+            command = confined(command, self._machine, read, write, user, self._options.groups, spec.limits.pids)
         with open(os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab") as output:
             return subprocess.Popen(
                 command,
@@ -313,21 +285,23 @@ class ProcessRuntime(Runtime):
         now = time.monotonic()
         if measure := now - self._measured_at >= _MEASURE:
             self._measured_at = now
+        runs = self._runs.all()
         all_run = all_children_run()
-        runs = self._runs.items()
-        return {i: seen for i, run in runs if (seen := self._seen(run, measure=measure, all_run=all_run))}
+        return {i: seen for i, run in runs.items() if (seen := self._seen(run, measure=measure, all_run=all_run))}
 
     @override
     def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
-        runs = ((instance, self._runs.get(instance)) for instance in instances)
+        runs = ((instance, self._runs.find(instance)) for instance in instances)
         return {i: seen for i, run in runs if run and (seen := self._seen(run))}
 
-    def _seen(self, run: _Run, *, measure: bool = False, all_run: bool = False) -> Observation | None:
+    def _seen(self, run: Run, *, measure: bool = False, all_run: bool = False) -> Observation | None:
         if not run.ended and (measure or not run.runs_on(all_run)):
             run.seen = self._look(run)
         return run.seen
 
-    def _look(self, run: _Run) -> Observation:
+    def _look(self, run: Run) -> Observation:
+        if run.beginning:
+            return Observation(run.attempt, Phase.STARTING)
         stat = run.process and stat_of(run.process)
         if not stat or stat.zombie:
             status = run.child.poll() if run.child else None
@@ -336,35 +310,35 @@ class ProcessRuntime(Runtime):
             return Observation(
                 run.attempt, Phase.EXITED, exit_status=status, last_line=last_line(Path(run.folder, "log"))
             )
-        port = _ready_port(run)
+        port = run.port()
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
         used = stat.memory_bytes
         return Observation(run.attempt, phase, host, port, exceeds=run.exceeds, cpu_s=stat.cpu_s, memory_bytes=used)
 
     def stop(self, instance: str, *, force: bool) -> None:
-        run = self._runs.get(instance)
-        if run is None or run.process is None:
-            return
-        if force:
-            _kill_all(run)
-        elif not run.asked_to_end and stat_of(run.process):
-            # Once only: services may take a second signal for impatience.
-            run.asked_to_end = True
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(run.process.pid, signal.SIGTERM)
+        with self._fence.acting(instance):
+            run = self._runs.find(instance, acting=True)
+            if run is None or run.process is None:
+                return
+            if force:
+                run.kill()
+            elif not run.asked_to_end and stat_of(run.process):
+                # Once only: services may take a second signal for impatience.
+                run.asked_to_end = True
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(run.process.pid, signal.SIGTERM)
 
     def remove(self, instance: str) -> None:
-        run = self._runs.pop(instance, None)
-        if run is None:
-            return
-        _kill_all(run)
-        if run.child is not None:
-            run.child.wait()
-        shutil.rmtree(run.folder, ignore_errors=True)
-        give_user_back(run.folder)
-        with contextlib.suppress(OSError):  # not empty: then it is worth keeping
-            os.removedirs(run.data)
+        with self._fence.acting(instance):
+            run = self._runs.find(instance, acting=True)
+            if run is None:
+                return
+            run.end()
+            remove_tree(run.folder)
+            self._runs.forget(instance)
+            with contextlib.suppress(OSError):  # not empty: then it is worth keeping
+                os.removedirs(run.data)
 
     def logs(self, instance: str, lines: int) -> str:
         with contextlib.suppress(FileNotFoundError), self._log(instance).open("rb") as file:
@@ -374,73 +348,71 @@ class ProcessRuntime(Runtime):
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
-        path, run = self._log(instance), self._runs.get(instance)
+        path = self._log(instance)
 
         def ended() -> bool:
-            # Of what another orchestrator began this one may know an older run only.
-            return (run is not None and run.child is not None and run.ended is not None) or not path.exists()
+            run = self._runs.find(instance)
+            return not path.exists() or (run is not None and not run.beginning and not run.lives)
 
         return None if ended() else FileLog(path, lines, ended)
 
     def _log(self, instance: str) -> Path:
-        """Of a run that another orchestrator of this machine may have begun, which this one does not know."""
         # Ids come from the store; the check keeps a mistake elsewhere from reading other folders.
         return self._folder / Path(instance).name / "log"
 
     def close(self) -> None:
-        _left_running.extend(run.child for run in self._runs.values() if run.child and run.child.poll() is None)
+        _left_running.extend(self._runs.living_children())
 
     def _full(self, robot: str) -> str:
         """Why a robot may write no more here; empty: it may."""
         most, folder = self._options.data_mb, self._data / robot
         size = size_of(str(folder), most << 20)
+        self._stored = {**self._stored, robot: most << 20 if size is None else size}
         if size is None:
-            return f"has more than {MOST_FILES} files in {folder}: delete what is not needed"
+            return f"has more than {MOST_FILES} files, or too deep ones, in {folder}: delete what is not needed"
         if size > most << 20:
             return f"has more than {most} MiB in {folder} (the site's data_mb): delete what is not needed"
         return ""
 
+    def stored(self) -> Mapping[str, int]:
+        return self._stored
+
+    def _weigh_one(self) -> None:
+        """One more of the robots of which nothing runs; all at once would keep those waiting that run."""
+        if not self._unweighed:
+            self._unweighed = folders_in(self._data)
+            self._stored = {robot: size for robot, size in self._stored.items() if robot in self._unweighed}
+        if self._unweighed:
+            self._full(self._unweighed.pop())
+
     def _weigh(self) -> None:
         """Mark the runs of robots that wrote too much."""
-        running = [run for run in self._runs.values() if not run.ended and run.data]
+        running = [run for run in self._runs.all().values() if not run.ended and run.data]
         full = {robot: self._full(robot) for robot in {Path(run.data).parents[1].name for run in running}}
         for run in running:
             run.exceeds = full[Path(run.data).parents[1].name]
-            if (size_of(f"{run.folder}/{_OWN}", _OWN_MB << 20) or 0) > _OWN_MB << 20:
-                run.exceeds = f"has more than {_OWN_MB} MiB in its temporary folder"
+            own = size_of(f"{run.folder}/{OWN}", _OWN_MB << 20)
+            if own is None or own > _OWN_MB << 20:
+                run.exceeds = f"has more than {_OWN_MB} MiB, {MOST_FILES} files or too deep ones in its own folder"
             if run.exceeds:
                 run.seen = self._look(run)
 
     def tidy(self) -> None:
+        self._fence.must_lead()
         if time.monotonic() - self._weighed_at >= _WEIGH:
             self._weigh()
+            self._weigh_one()
             self._weighed_at = time.monotonic()
-        for run in self._runs.values():
+        for instance, run in self._runs.all().items():
             path = f"{run.folder}/log"
             with contextlib.suppress(FileNotFoundError):
                 if os.stat(path).st_size > self._options.log_bytes:
-                    keep_newer_half(Path(path), self._options.log_bytes // 2)
+                    with self._fence.acting(instance):
+                        keep_newer_half(Path(path), self._options.log_bytes // 2)
 
 
 _left_running: list[subprocess.Popen[bytes]] = []
 """Children that outlive the runtime that started them: the standard library warns of one that is dropped."""
-
-
-def _kill_all(run: _Run) -> None:
-    """End a run and everything in its session, and of its own user: it may have left the session."""
-    if run.process is None:
-        return
-    ended: set[int] = set()
-    for _ in range(_PASSES):
-        found = {*session_members(run.process)} - ended
-        if not found:
-            break
-        ended |= found
-        for pid in found:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-    if run.user is not None:  # last: a run that was just being started was root until then
-        end_all_of(run.user)
 
 
 def _start_time(pid: int) -> int:
@@ -459,42 +431,3 @@ def _free_or_zero(host: str, port: int | None) -> int:
         except OSError:
             return 0
     return port
-
-
-def _ready_port(run: _Run) -> int | None:
-    """Where a run listens; its ready file is read again where it was written again."""
-    path = run.ready_file
-    try:
-        stat = os.stat(path, follow_symlinks=False)
-    except OSError:
-        return None
-    written = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
-    if run.ready is None or run.ready[0] != written:
-        port = _port(Path(path))
-        run.ready = None if port is None else (written, port)
-    return run.ready[1] if run.ready else None
-
-
-def _port(path: Path) -> int | None:
-    """The port that a document names; None if it names none: services write what they like into their folders."""
-    port = _read_json(path).get("port")
-    return port if type(port) is int and 0 < port < 65536 else None
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Empty if it is not there, or not (yet) such a document."""
-    try:
-        # The service may have put a link or a pipe there: neither is followed, and neither holds up whoever reads.
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-            document = json.loads(file.read(_NOTE_BYTES))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) else {}
-
-
-def _write_private(path: Path, content: str) -> None:
-    """Mode 0600, complete or not at all; several orchestrators may write it at once."""
-    draft = path.with_name(f"{path.name}.{os.getpid()}.new")
-    with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-        file.write(content)
-    draft.replace(path)

@@ -59,4 +59,4 @@ class GatedBase:
         age = self._link.now() - state.at
         if not 0 <= age <= _FRESH_S:
             return None
-        return Told(state.told, age, state.stopped, state.hand)
+        return Told(state.told, age, state.stopped, state.hand, state.started)

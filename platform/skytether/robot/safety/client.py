@@ -7,12 +7,13 @@ import json
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from skytether.guard.clock import now as boottime
 from skytether.guard.descriptors import receive, refuse
-from skytether.guard.folder import objection, peer, sender, trusted
+from skytether.guard.folder import ROOM, objection, peer, sender, trusted
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.requests import readable
 from skytether.guard.velocity import Velocity
@@ -24,8 +25,6 @@ _LONGEST_REASON = 500
 """Characters that are sent; fewer are kept. Whatever they are, the request is smaller than what guard and gate read."""
 _GUARD_S = 1.0
 _LARGEST_STATE = 512
-_ANCILLARY = socket.CMSG_SPACE(12)
-"""Of a sender's credentials."""
 _MOST_STATES = 600
 """Taken in one call; the kernel keeps as many as net.unix.max_dgram_qlen says, 10 or 512."""
 
@@ -80,11 +79,11 @@ class GateLink:
         """The newest that the gate answered; None: nothing yet. Its ``at`` says how old it is. Never waits."""
         for _ in range(_MOST_STATES):
             try:
-                data, ancillary, name = receive(self._socket, _LARGEST_STATE, _ANCILLARY)
+                data, ancillary, name = receive(self._socket, _LARGEST_STATE, ROOM)
             except OSError:  # nothing waits
                 break
             # The name of our socket is open to everybody; the gate's is not, but for who has folders of his own.
-            if name == self._address and sender(ancillary) in self._trusted:
+            if name == self._address and sender(ancillary)[0] in self._trusted:
                 self._state = unpack_state(data) or self._state
         return self._state
 
@@ -193,7 +192,8 @@ def _ask(path: Path, request: dict[str, Any], timeout: float) -> dict[str, Any]:
             link.connect(str(path))
             if why := _stranger(path.parent, link):
                 raise GateError(f"whoever listens at {path} may not be the gate: {why}")
-            link.send(json.dumps(request).encode())
+            with suppress(BrokenPipeError):  # it may have refused us already, and said why
+                link.send(json.dumps(request).encode())
             return _checked(path, link.recv(_LARGEST_ANSWER))
     except (OSError, ValueError) as error:
         raise _explained(path, error) from error

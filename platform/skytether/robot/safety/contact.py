@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from math import isnan
+from math import inf, isnan
 
 from skytether.messages import Bool, Message, Range
 
@@ -58,6 +58,8 @@ def feels(params: ContactParams, message: Message) -> bool | None:
         return None
     value = float(message.range)
     if isnan(value) or value == 0:  # no reading; drivers write a zero for "no echo" and for errors alike
+        return None
+    if params.below_m is None and -inf < value < 0:  # an error of the driver; a near floor is -inf at most (REP 117)
         return None
     near = params.below_m is not None and value < params.below_m
     return near or (params.above_m is not None and value > params.above_m)

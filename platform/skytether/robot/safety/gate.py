@@ -23,6 +23,7 @@ from skytether.guard import privileges
 from skytether.guard.board import Board
 from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
+from skytether.guard.folder import Known
 from skytether.guard.latch import LATCH_FILE, Keeper, boot_id, lasting_file
 from skytether.guard.mailbox import bind
 from skytether.guard.requests import Requests
@@ -37,7 +38,7 @@ from .config import SafetyConfig
 from .control import Control
 from .display.feed import Feed
 from .display.snapshot import snapshot
-from .hardware import Sensors, Wheels, receive_from
+from .hardware import Sensors, Wheels, receive_known
 from .heartbeat import Heartbeat
 from .process import SWITCH_S, log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
@@ -97,6 +98,7 @@ class GateLoop:
         self._heir = Heir(str(folder), guard)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
+        self._known = Known.of(self._commands)
         self._notices = Notices(_log)
         self._feed = None
         if config.display is not None:
@@ -143,8 +145,9 @@ class GateLoop:
             self._gate.sense(topic, message, now)
         self._control.turn(now)
         agent = self._take_commands(now)
+        wall = time.time()
         for topic, message in self._sensors.read():
-            self._gate.sense(topic, message, now)
+            self._gate.sense(topic, message, now, wall)
         if (told := self._heartbeat.differs(self._said, now)) is not None:
             self._gate.rebase(*told)
         decision = self._gate.step(now)
@@ -175,7 +178,9 @@ class GateLoop:
     def _take_commands(self, now: float) -> Any:
         """Take in what the agent wants; the address of the agent, None: it said nothing."""
         agent = None
-        arrived = receive_from(self._commands, 256, _COMMANDS_EACH_TURN)
+        arrived, strange = receive_known(self._commands, self._known, 256, _COMMANDS_EACH_TURN)
+        if strange:
+            self._trouble("sender", strange, now)
         if len(arrived) > _MANY_COMMANDS:
             sentence = f"more than {_MANY_COMMANDS} commands came within one turn; the newest counts"
             self._trouble("rate", sentence, now)
@@ -208,7 +213,7 @@ class GateLoop:
 
     def _tell_agent(self, agent: Any, decision: Decision, now: float) -> None:
         told = self._heartbeat.told(now)
-        state = GateState(now, told.velocity, told.at, self._stopped, decision.hand)
+        state = GateState(now, told.velocity, told.at, self._stopped, decision.hand, self._gate.started)
         with suppress(OSError):  # it is gone, or does not read; it asks again
             self._commands.sendto(pack_state(state), agent)
 

@@ -12,6 +12,7 @@ from typing import Protocol
 
 from skytether.guard import teller, wheels
 from skytether.guard.descriptors import receive as receive_one
+from skytether.guard.folder import ROOM, Known, sender
 from skytether.guard.mailbox import bind
 from skytether.messages import Message, PointCloud2
 
@@ -113,6 +114,7 @@ class SocketSensors:
         except OSError:
             self._readings.close()
             raise
+        self._known = {source: Known.of(source) for source in (self._readings, self._stops)}
 
     def stops(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what waits in the socket for stops, all of it."""
@@ -130,7 +132,10 @@ class SocketSensors:
         self._stops.close()
 
     def _fill(self, source: socket.socket, most: int, *, stops: bool) -> None:
-        for data in receive(source, self._largest, most):
+        found, why = receive_known(source, self._known[source], self._largest, most)
+        if why:
+            self._trouble("sensors:sender", why)
+        for data, _ in found:
             name, _, payload = data.partition(b"\0")
             topic = name[:64].decode("utf-8", errors="replace")
             if topic not in self._topics.kinds:
@@ -143,20 +148,32 @@ class SocketSensors:
                 self._inbox.put(topic, payload)
 
 
-def receive_from(source: socket.socket, largest: int, most: int) -> list[tuple[bytes, object]]:
-    """What waits in a socket that never waits, and who sent it, at most so many."""
+def receive_known(
+    source: socket.socket, known: Known | None, largest: int, most: int
+) -> tuple[list[tuple[bytes, object]], str]:
+    """What waits in a socket that never waits, at most so many.
+
+    Args:
+        source: Whose senders are told, as `mailbox.bind` makes it.
+        known: Who may send; None: everybody who can.
+        largest: Bytes of each.
+        most: So many, those included that are not used.
+
+    Returns:
+        Each with the address of its sender, who may send here; and what is to be said of others.
+    """
     found: list[tuple[bytes, object]] = []
-    while len(found) < most:
+    wrong = ""
+    for _ in range(most):
         try:
-            data, _, sender = receive_one(source, largest)
-            found.append((data, sender))
+            data, ancillary, where = receive_one(source, largest, ROOM if known else 0)
         except BlockingIOError:
             break
         except OSError:  # what was sent before found nobody
             continue
-    return found
-
-
-def receive(source: socket.socket, largest: int, most: int) -> list[bytes]:
-    """What waits in a socket that never waits, at most so many."""
-    return [data for data, _ in receive_from(source, largest, most)]
+        why = known.objection(*sender(ancillary)) if known else ""
+        if why:
+            wrong = f"what comes to {source.getsockname()} from another user is not used: {why}"
+        else:
+            found.append((data, where))
+    return found, wrong

@@ -148,11 +148,11 @@ class Motion:
         while len(self._told) > 1 and self._told[0].until < now - self._params.window_s:
             self._told.popleft()
 
-    def measure(self, message: Message, now: float) -> str:
+    def measure(self, message: Message, now: float, wall: float = nan) -> str:
         """Take a reading in: Odometry, TwistStamped or Twist in the robot's base frame.
 
         One that comes later than the quickest so far is that much older; one that is stale by that is no fault of the
-        wheels, which were told something else when it was made.
+        wheels, which were told something else when it was made. ``wall``: see `stamps.date`.
 
         Returns:
             What is wrong with it; empty: nothing.
@@ -160,7 +160,7 @@ class Motion:
         twist, stamp = twist_of(message), _stamp(message)
         if twist is None:
             return f"a {message.TYPE} is no odometry"
-        dated = date(self._params.stamps, self._stamps, stamp, now, self._params.max_age_s)
+        dated = date(self._params.stamps, self._stamps, stamp, now, self._params.max_age_s, wall)
         self._stamps = dated.stamps
         if dated.wrong:
             return f"{_NOT_NEWER[dated.wrong]}, which counts as silence"
@@ -251,7 +251,8 @@ def _stamp(message: Message) -> Stamp:
 _NOT_NEWER: Mapping[str, str] = {
     "repeated": "sends the same reading again",
     "older": "sends a reading that is older than one before",
-    "unstamped": "sends a reading without a stamp, and had stamps before",
+    "unstamped": "sends a reading without a stamp",
+    "ahead": "sends a reading with a stamp that is ahead of this computer's clock",
 }
 """What is wrong with a reading's stamp, by the kind that `stamps.date` tells."""
 _SAYS: Mapping[Fault, str] = {

@@ -41,8 +41,8 @@ class OdometryConfig(Numbers):
     """How long the wheels may stand when they are told to move."""
     max_age_s: Annotated[float, Field(ge=0.02, le=5)] = 0.3
     """Silence after which the real motion is not known."""
-    stamps: Literal["auto", "required", "order"] = "auto"
-    """What is asked of its stamps: used if the first has one; needed; only their order (simulators)."""
+    stamps: Literal["auto", "required", "order", "own"] = "auto"
+    """What is asked of its stamps: used if the first has one; needed; only their order (simulators); of our clock."""
     on_unknown: Literal["stop", "slow", "free"] = "stop"
     """When it is silent, late, or reports what is no number."""
     on_fault: Literal["latch", "name"] = "latch"

@@ -15,8 +15,8 @@ from skytether.robot.command import Command
 
 _COMMAND = struct.Struct("<4sQQddd?")
 _MAGIC = b"SkG2"
-_STATE = struct.Struct("<4sdddd16s")
-_STATE_MAGIC = b"SkS1"
+_STATE = struct.Struct("<4sdddd16s?")
+_STATE_MAGIC = b"SkS2"
 _REASON_BYTES = 200
 """Of a reason; the rest is cut off."""
 COMMAND_SOCKET = "command.sock"
@@ -40,6 +40,7 @@ class GateState:
         told_at: When they were [s].
         stopped: Why the robot stands until a person resets it; empty: it does not.
         hand: Who drives: ``agent``, ``joystick``, ``nobody``.
+        started: A person let the agent go on since it last had to be neutral.
     """
 
     at: float
@@ -47,11 +48,12 @@ class GateState:
     told_at: float
     stopped: str
     hand: str
+    started: bool = False
 
 
 def pack_state(state: GateState) -> bytes:
     """For the agent."""
-    head = _STATE.pack(_STATE_MAGIC, state.at, *state.told, state.told_at, state.hand.encode())
+    head = _STATE.pack(_STATE_MAGIC, state.at, *state.told, state.told_at, state.hand.encode(), state.started)
     return head + state.stopped.encode()[:_REASON_BYTES]
 
 
@@ -59,9 +61,10 @@ def unpack_state(data: bytes) -> GateState | None:
     """From the gate; None: the bytes are none."""
     if not _STATE.size <= len(data) <= _STATE.size + _REASON_BYTES or data[:4] != _STATE_MAGIC:
         return None
-    _, at, linear, angular, told_at, hand = _STATE.unpack_from(data)
+    _, at, linear, angular, told_at, hand, started = _STATE.unpack_from(data)
     reason = data[_STATE.size :].decode(errors="replace")
-    return GateState(at, Velocity(linear, angular), told_at, reason, hand.rstrip(b"\0").decode(errors="replace"))
+    name = hand.rstrip(b"\0").decode(errors="replace")
+    return GateState(at, Velocity(linear, angular), told_at, reason, name, started)
 
 
 def pack_command(epoch: int, sequence: int, sent_at: float, velocity: Velocity, decided: bool = True) -> bytes:

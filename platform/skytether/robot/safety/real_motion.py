@@ -114,9 +114,9 @@ class RealMotion:
         """What the wheels are told from now on."""
         self._motion.told(velocity, now)
 
-    def measure(self, message: Message, now: float) -> str:
-        """Take a reading in; what is wrong with it (empty: nothing)."""
-        return self._motion.measure(message, now)
+    def measure(self, message: Message, now: float, wall: float) -> str:
+        """Take a reading in; what is wrong with it (empty: nothing). ``wall``: see `stamps.date`."""
+        return self._motion.measure(message, now, wall)
 
     def relearn(self) -> None:
         """See `Motion.relearn`."""

@@ -6,7 +6,7 @@ import fcntl
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import IO
 
@@ -27,6 +27,8 @@ _READINGS = 20_000
 _LAST_STOPS = 10
 _START_S = 10.0
 """For odometry and button to be heard."""
+_UNREAD_S = 1.0
+"""A driver may pause for so long: what it was told last waits in its socket, and the drives have a watchdog."""
 
 
 class HardwareRig:
@@ -34,21 +36,31 @@ class HardwareRig:
 
     Args:
         config: The section of robot.yaml, with odometry.
+        clock: Seconds since the machine was started.
+        sleep: Waits for so many seconds.
 
     Raises:
         CommissionError: A gate runs, or the wheels or sensors cannot be had, or are silent.
     """
 
-    def __init__(self, config: SafetyConfig) -> None:
+    def __init__(
+        self,
+        config: SafetyConfig,
+        clock: Callable[[], float] = boottime,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
         if config.odometry is None:
             raise CommissionError("safety.odometry is not configured: nothing could be measured")
         self._config, self._odometry = config, config.odometry
+        self._clock, self._sleep = clock, sleep
         self._period = 1 / config.rate_hz
         self._lock = _take_folder(config)
         self._refuse_a_stopped_robot()
         self._motion: deque[tuple[float, Velocity]] = deque(maxlen=_READINGS)
         self._button: tuple[bool, float] | None = None
         self._on, self._high = True, False
+        self._full_since: dict[str, float] = {}
+        """By what is then said: since when nobody reads, and no more can be sent."""
         self._line: Line | None = None
         self._wheels, self._sensors = None, None
         try:
@@ -66,7 +78,7 @@ class HardwareRig:
 
     def now(self) -> float:
         """Rig: seconds since the machine was started."""
-        return boottime()
+        return self._clock()
 
     def tell(self, velocity: Velocity | None, seconds: float) -> None:
         """Rig: write at the gate's rate; see the protocol."""
@@ -75,7 +87,7 @@ class HardwareRig:
             if velocity is not None:
                 self._write(velocity)
             self._toggle()
-            time.sleep(self._period)
+            self._sleep(self._period)
             self._read()
             if velocity is not None and velocity != STANDSTILL:
                 self._check()
@@ -106,7 +118,7 @@ class HardwareRig:
             for _ in range(_LAST_STOPS):
                 with suppress(Exception):
                     self._wheels.write(STANDSTILL)
-                time.sleep(self._period)
+                self._sleep(self._period)
         for part in (self._wheels, self._sensors, self._line, self._lock):
             if part is not None:
                 part.close()
@@ -149,23 +161,30 @@ class HardwareRig:
             raise CommissionError("the emergency stop button is pressed, or not heard; the wheels are told to stand")
 
     def _write(self, velocity: Velocity) -> None:
-        try:
-            if self._wheels is not None:
-                self._wheels.write(velocity)
-        except OSError as error:
-            raise CommissionError(f"the wheels cannot be told anything: {error}") from error
+        wheels = self._wheels
+        if wheels is not None:
+            self._send("the wheels cannot be told anything", lambda: wheels.write(velocity))
 
     def _toggle(self) -> None:
         if self._config.enable is None:
             return
-        self._high = self._on and not self._high
+        self._high = high = self._on and not self._high
+        line, wheels = self._line, self._wheels
+        if line is not None:
+            self._send("the enable signal cannot be set", lambda: line.write(high))
+        elif wheels is not None:
+            self._send("the enable signal cannot be set", lambda: wheels.enable(high))
+
+    def _send(self, trouble: str, send: Callable[[], None]) -> None:
         try:
-            if self._line is not None:
-                self._line.write(self._high)
-            elif self._wheels is not None:
-                self._wheels.enable(self._high)
+            send()
+            self._full_since.pop(trouble, None)
+        except BlockingIOError as error:  # the same driver is there, and may read yet
+            if self.now() - self._full_since.setdefault(trouble, self.now()) > _UNREAD_S:
+                silent = f"{trouble}: whoever listens has read nothing for {_UNREAD_S:g} s"
+                raise CommissionError(silent) from error
         except OSError as error:
-            raise CommissionError(f"the enable signal cannot be set: {error}") from error
+            raise CommissionError(f"{trouble}: {error}") from error
 
 
 def _take_folder(config: SafetyConfig) -> IO[bytes]:

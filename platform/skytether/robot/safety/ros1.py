@@ -59,6 +59,10 @@ class Ros1Wheels:
         if self._enable is not None:
             self._enable.publish(encode(Bool(data=level), "ros1"), boottime() + self._fresh_s)
 
+    def full(self) -> bool:
+        """Wheels: never; what nobody takes in time is thrown away."""
+        return False
+
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""
         return frozenset(self._publication.subscribers)

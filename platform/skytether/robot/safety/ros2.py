@@ -61,6 +61,10 @@ class Ros2Wheels:
         if self._enable is not None:
             self._enable.put(encode(Bool(data=level)))
 
+    def full(self) -> bool:
+        """Wheels: never; what nobody takes in time is thrown away."""
+        return False
+
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""
         return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import inf, isfinite
+from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Message, String
@@ -141,10 +141,17 @@ class Gate:
         """Take a velocity in that the agent wants; its ``source`` must be `Hand.AGENT`."""
         return self._admit(command, now)
 
-    def sense(self, topic: str, message: Message, now: float) -> None:
-        """Take a message in from one of the robot's own sensors. Never raises for what it holds."""
+    def sense(self, topic: str, message: Message, now: float, wall: float = nan) -> None:
+        """Take a message in from one of the robot's own sensors. Never raises for what it holds.
+
+        Args:
+            topic: As it is configured.
+            message: What came.
+            now: When it came, monotonic seconds.
+            wall: The same by the clock that stamps are of [s]; nan: no sensor is known to use that (`StampRule.OWN`).
+        """
         if topic in self._rules.sensors:
-            wrong = self._sensing.look(topic, message, now)
+            wrong = self._sensing.look(topic, message, now, wall)
             if wrong is not None:
                 self._event(*wrong)
         elif topic in self._rules.contacts and isinstance(message, self._rules.contacts[topic].message):
@@ -157,7 +164,7 @@ class Gate:
         elif self._sources.expects(topic, message):
             self._hear(topic, message, now)
         elif self._motion is not None and self._rules.odometry is not None and topic == self._rules.odometry.topic:
-            if wrong_reading := self._motion.measure(message, now):
+            if wrong_reading := self._motion.measure(message, now, wall):
                 self._event("odometry:message", f"{topic}: {wrong_reading}")
         else:
             self._event(f"topic:{topic[:64]}", f"{topic[:64]}: a {message.TYPE} is not expected there and not used")
@@ -189,6 +196,11 @@ class Gate:
     def start(self, now: float) -> tuple[list[str], str]:
         """A person says that those who want to drive now may; see `Sources.start`."""
         return self._sources.start(now)
+
+    @property
+    def started(self) -> bool:
+        """A person let the agent go on since it last had to be neutral."""
+        return self._sources.agent_started
 
     @property
     def waiting(self) -> Mapping[str, str]:
@@ -312,7 +324,10 @@ class Gate:
 _SAYS: Mapping[Objection, str] = {
     Objection.NOT_FINITE: "its velocity is NaN or infinite",
     Objection.UNUSED_AXES: f"it wants to move along {UNUSED_AXES}, which these wheels do not have",
-    Objection.SEQUENCE: "it is not newer than one that was taken before",
+    Objection.SEQUENCE: (
+        "it is not newer than one that was taken before; of two agents only the one that was started last is followed, "
+        "also when it has ended: end both and start one"
+    ),
     Objection.STALE: "it was made too long ago",
     Objection.GAP: "the last valid command is too old; the robot stops",
     Objection.FUTURE: "it claims to come from the future",

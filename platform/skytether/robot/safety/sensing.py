@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import inf, nan
 
 import numpy as np
 
@@ -140,8 +140,8 @@ class Sensing:
         self._tolerance = min(tolerance_s, _MOST_TOLERANCE_S)
         self._known: dict[str, _Known] = {}
 
-    def look(self, topic: str, message: Message, now: float) -> tuple[str, str] | None:
-        """Take a message of one of the sensors in. Never raises for what it holds.
+    def look(self, topic: str, message: Message, now: float, wall: float = nan) -> tuple[str, str] | None:
+        """Take a message of one of the sensors in. Never raises for what it holds. ``wall``: see `stamps.date`.
 
         Returns:
             Kind and sentence of what is wrong with it; None: it is used.
@@ -155,7 +155,7 @@ class Sensing:
                 f"{topic}: its frame_id is '{frame[:64]}', not '{expected[:64]}': not used, which counts as silence"
             )
         stamp = (header.stamp.sec, header.stamp.nanosec)
-        dated = date(sensor.stamps, before.stamps, stamp, now, sensor.max_age_s)
+        dated = date(sensor.stamps, before.stamps, stamp, now, sensor.max_age_s, wall)
         if dated.wrong:
             self._known[topic] = replace(before, stamps=dated.stamps)
             return f"sensor:{topic}:{dated.wrong}", f"{topic}: {_SAYS[dated.wrong]}, which counts as silence"
@@ -222,4 +222,5 @@ _SAYS: Mapping[str, str] = {
     "repeated": "sends the same reading again",
     "older": "sends a reading older than one before, or its clock was set back",
     "unstamped": "sends a reading without a stamp",
+    "ahead": "sends a reading with a stamp that is ahead of this computer's clock",
 }

@@ -79,8 +79,8 @@ class SensorConfig(Numbers):
     """NaN and zero mean that nothing is there (lasers outdoors); never where all readings are such."""
     frame_id: Annotated[str, Field(max_length=255)] = ""
     """Of its messages; others are not used. Empty: that of the first."""
-    stamps: Literal["auto", "required", "order"] = "auto"
-    """What is asked of their stamps: used if the first has one; needed; only their order (simulators)."""
+    stamps: Literal["auto", "required", "order", "own"] = "auto"
+    """What is asked of their stamps: used if the first has one; needed; only their order (simulators); of our clock."""
     max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.3
     """Age of the newest measurement at which it is stale."""
     on_unknown: Literal["stop", "slow"] = "stop"

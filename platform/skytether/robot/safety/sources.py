@@ -113,6 +113,8 @@ class _Source:
     priority: int
     timeout_s: float
     neutral: Neutral
+    started: bool = False
+    """A person let it go on since it last had to be neutral."""
     wanted: Velocity = STANDSTILL
     heard_at: float = nan
     sequence: int = 0
@@ -159,6 +161,11 @@ class Sources:
         """Sources that must be neutral before they may drive, and after what."""
         return {name: source.neutral.why for name, source in self._sources.items() if source.neutral.why}
 
+    @property
+    def agent_started(self) -> bool:
+        """A person let the agent go on since it last had to be neutral."""
+        return self._sources[Hand.AGENT].started
+
     def engage(self, reason: str) -> None:
         """Emergency stop, until `reset`."""
         self._latch = latch.engage(self._latch, reason)
@@ -196,7 +203,7 @@ class Sources:
             return [], "the joystick is lost, or its button was not let go; let it go first"
         may = [name for name, source in self._sources.items() if source.speaks(now)]
         for name in may:
-            self._sources[name] = replace(self._sources[name], neutral=Neutral())
+            self._sources[name] = replace(self._sources[name], neutral=Neutral(), started=True)
         return may, ""
 
     def refuses_reset(self, now: float) -> str:
@@ -338,7 +345,7 @@ class Sources:
         """All sources of a lower priority must be neutral before they drive again."""
         for name, source in self._sources.items():
             if source.priority < below:
-                self._sources[name] = replace(source, neutral=neutral.require(why))
+                self._sources[name] = replace(source, neutral=neutral.require(why), started=False)
 
     def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> tuple[Command | None, str]:
         self._joystick, wrong = joystick.hear(params, self._joystick, message, now)

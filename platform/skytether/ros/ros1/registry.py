@@ -94,8 +94,9 @@ class Registry:
     def step(self) -> None:
         """One round."""
         try:
-            if self._done and self._master.knows(self._node) != self._uri():
-                _log.warning("the ROS master at %s was restarted; registering again", self._master.uri)
+            if self._done and (known := self._master.knows(self._node)) != self._uri():
+                why = f"knows {self._node} at {known[:200]}: end that node" if known else "was restarted"
+                _log.warning("the ROS master at %s %s; registering again", self._master.uri, why)
                 self._done.clear()
             wrong = self._settle()
         except MasterError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import shlex
 import shutil
@@ -21,7 +22,10 @@ from docker import APIClient
 from docker.errors import APIError, DockerException
 from docker.tls import TLSConfig
 
+from skytether.guard.folder import objection_to
+
 from ..base import RuntimeFailure, SiteSilentError
+from .client import Client
 from .options import LOCAL_SOCKET, DockerOptions
 
 log = logging.getLogger(__name__)
@@ -32,6 +36,8 @@ _OLDEST = "1.41"
 """Version of the engine's interface with which its newest is asked for: Docker 20.10's."""
 _PROBE_S = 5.0
 """An engine that is stopped lets its queue of connections fill up; then even this takes time."""
+_MOST_WORDS = 2000
+"""Characters of what an engine says is wrong: they are kept, logged and told."""
 _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 
@@ -76,12 +82,12 @@ class Engine:
             pair = (tls.cert, tls.key)
             arguments["tls"] = TLSConfig(client_cert=pair, ca_cert=tls.ca, verify=True)
             address = address.replace("tcp://", "https://", 1)
-        first = _plain(APIClient(address, version=_OLDEST, **arguments))
+        first = Client(address, version=_OLDEST, **arguments)
         try:
             version = str(first.version(api_version=False)["ApiVersion"])
         finally:
             first.close()
-        return _plain(APIClient(address, version=version, **arguments))
+        return Client(address, version=version, **arguments)
 
     def drop(self) -> None:
         """Let go of all connections; the next call makes new ones."""
@@ -114,22 +120,18 @@ def _probe(path: str) -> None:
     """See whether anybody listens on a socket: the SDK leaves one open that does not connect.
 
     Raises:
-        OSError: Nobody does.
+        OSError: Nobody does, or somebody who may not: an engine has all that runs there, and grants of instances.
     """
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(_PROBE_S)
         probe.connect(path)
-
-
-def _plain(client: APIClient) -> APIClient:
-    """Without what the environment says of proxies and authorities: it is meant for the Internet, not for an engine."""
-    client.trust_env = False
-    return client
+        if why := objection_to(probe, path):
+            raise PermissionError(errno.EPERM, f"whoever listens at {path} may not be the engine: {why}")
 
 
 def explain(error: APIError) -> str:
-    """What the engine said."""
-    return str(error.explanation or error).strip().rstrip(".")
+    """What the engine said, in so many words."""
+    return str(error.explanation or error)[:_MOST_WORDS].strip().rstrip(".")
 
 
 def status_of(error: BaseException) -> int | None:
@@ -146,7 +148,7 @@ def root_cause(error: BaseException) -> str:
         error = next((a for a in inner if isinstance(a, BaseException)), error)
     if isinstance(error, TimeoutError):
         return "timed out"
-    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).strip()
+    return str(getattr(error, "strerror", None) or error or type(error).__name__)[:_MOST_WORDS].strip()
 
 
 class Tunnel:
@@ -160,8 +162,8 @@ class Tunnel:
         self._folder: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
-    def command(self, here: Path) -> list[str]:
-        """What is run."""
+    def command(self, here: Path, said: Path) -> list[str]:
+        """What is run; what it has to say itself goes into a file, and nothing that the other machine sends."""
         address, ssh = self._options.address, self._options.ssh
         settings = {
             "BatchMode": "yes",  # nobody is there to answer a question
@@ -179,7 +181,7 @@ class Tunnel:
         if ssh.known_hosts is not None:
             settings["UserKnownHostsFile"] = shlex.quote(ssh.known_hosts)
             settings["GlobalKnownHostsFile"] = "/dev/null"  # this file says who it is, and no other
-        command = ["ssh", "-T"]
+        command = ["ssh", "-T", "-E", str(said)]
         for key, value in settings.items():
             command += ["-o", f"{key}={value}"]
         if ssh.identity is not None:
@@ -206,14 +208,14 @@ class Tunnel:
         here.unlink(missing_ok=True)  # always the same path: clients that are made stay good
         if shutil.which("ssh") is None:
             raise OSError("the program 'ssh' is missing: install openssh-client")
-        with said.open("wb") as file:
-            self._process = subprocess.Popen(
-                self.command(here), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=file
-            )
+        said.unlink(missing_ok=True)
+        none = subprocess.DEVNULL  # what is sent from there could fill the disk
+        self._process = subprocess.Popen(self.command(here, said), stdin=subprocess.PIPE, stdout=none, stderr=none)
         deadline = time.monotonic() + _SSH_TIMEOUT
         while not here.exists():
             if self._process.poll() is not None or time.monotonic() > deadline:
-                lines = [line for line in said.read_text(errors="replace").splitlines() if line.strip()]
+                text = said.read_text(errors="replace") if said.exists() else ""
+                lines = [line for line in text.splitlines() if line.strip()]
                 self._end()
                 raise OSError(f"ssh: {lines[-1].strip() if lines else 'no connection'}")
             time.sleep(0.01)

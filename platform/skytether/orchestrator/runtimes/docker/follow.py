@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -20,9 +21,9 @@ import urllib3
 from docker.errors import NotFound
 
 from ..base import RuntimeFailure
-from .engine import Engine, EngineGoneError
+from .engine import Engine, EngineGoneError, root_cause
 from .meter import Meter
-from .objects import OWNER, READY, Seen, carried_over, last_line, parse
+from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, last_line, parse, parse_helper
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +31,8 @@ _QUIET_S = 10.0
 """A stream without events for so long at most is opened anew: an engine that went away in silence is noticed then."""
 _AGAIN_S = 1.0
 """Between two attempts to reach an engine that does not answer."""
+_SHORT_S = 0.1
+"""A stream that was shorter is not opened anew at once."""
 _READY_S = 0.02
 """Between two looks for the ready file of a container that starts; each costs the engine some 3 ms."""
 _TAIL = 20
@@ -45,11 +48,12 @@ class Follower:
     def __init__(self, engine: Engine, owner: str, on_connect: Callable[[], None], timeout_s: float) -> None:
         """``on_connect`` is called with each new connection; it must not wait. ``timeout_s``: the engine's patience."""
         self._engine = engine
-        self._quiet_s = min(_QUIET_S, timeout_s)
+        self._quiet_s = min(_QUIET_S, 5 * timeout_s)  # not oftener than a busy engine can bear
         self._owner = owner
         self._on_connect = on_connect
         self._lock = threading.Lock()
         self._seen: dict[str, Seen] = {}
+        self._helpers: dict[str, Helper] = {}
         self._awaited: set[str] = set()
         self._failure: RuntimeFailure | None = None
         self._connected = False
@@ -104,11 +108,17 @@ class Follower:
         with self._lock:
             return sorted((s for s in self._seen.values() if s.instance == instance), key=lambda seen: seen.attempt)
 
+    def helpers(self) -> dict[str, Helper]:
+        """Those of our containers that are no services, by id."""
+        with self._lock:
+            return dict(self._helpers)
+
     def forget(self, container: str) -> None:
         """It is gone."""
         self.meter.forget(container)
         with self._lock:
             self._seen.pop(container, None)
+            self._helpers.pop(container, None)
 
     def look(self, container: str) -> Seen | None:
         """Look at one container now; None: it is not there, or not ours.
@@ -118,9 +128,10 @@ class Follower:
         """
         with self._engine.asked():
             try:
-                seen = parse(self._engine.api().inspect_container(container))
+                inspected = self._engine.api().inspect_container(container)
+                seen, helper = parse(inspected), parse_helper(inspected)
             except NotFound:
-                seen = None
+                seen = helper = None
         with self._lock:
             old = self._seen.get(container)
         if seen is not None:
@@ -128,10 +139,12 @@ class Follower:
             if seen.ended and (old is None or not old.ended):
                 seen = replace(seen, last_line=self._last_line(container))
         with self._lock:
-            if seen is None:
-                self._seen.pop(container, None)
-            else:
+            self._seen.pop(container, None)
+            self._helpers.pop(container, None)
+            if seen is not None:
                 self._seen[container] = seen
+            if helper is not None:
+                self._helpers[container] = helper
         if seen is None or not seen.runs:
             self.meter.forget(container)
             return seen
@@ -150,14 +163,19 @@ class Follower:
 
     def _run(self) -> None:
         while not self._closing.is_set():
+            begun = time.monotonic()
             try:
                 self._follow()
+                if time.monotonic() < begun + _SHORT_S:  # an engine that ends each stream at once
+                    self._closing.wait(_SHORT_S)
             except RuntimeFailure as error:
                 self._lost(error)
             except Exception as error:
                 # Whatever it is, the next look sees everything anew; a dead thread would see nothing ever.
-                log.exception("following the engine failed")
-                self._lost(RuntimeFailure(f"the Docker engine's answer is not understood: {error}"))
+                failure = RuntimeFailure(f"the Docker engine's answer is not understood: {root_cause(error)}")
+                if str(failure) != str(self._failure):  # once, though it is asked every second
+                    log.exception("following the engine failed")
+                self._lost(failure)
 
     def _lost(self, error: RuntimeFailure) -> None:
         self._failure, self._connected = error, False
@@ -167,19 +185,26 @@ class Follower:
 
     def _follow(self) -> None:
         mine = {"label": [f"{OWNER}={self._owner}"]}
+        with self._lock:
+            before = self._seen.keys() | self._helpers.keys()
         with self._engine.asked():
             api = self._engine.api()
             self._info = api.info()
             # By the engine's clock: events from before the list are looked at again, and none is missed.
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
             quiet = self._engine.api(self._quiet_s)
-            there = {row["Id"] for row in api.containers(all=True, filters=mine)}
-        self._look_at_all(there)
+            rows = api.containers(all=True, filters=mine)
+        # What holds a network comes before who is in there, whose network would seem to be gone.
+        there = [row["Id"] for row in sorted(rows, key=lambda row: INSTANCE in (row["Labels"] or ()))]
+        for container in before - set(there):  # and not what a start has made and looked at since
+            self.forget(container)
+        self._look_at_all(there if not self._connected else self._changed(rows, there))
         self._failure = None
         self._looked.set()
         if not self._connected:
             self._connected = True
             self._on_connect()
+            self._await_all()
         try:
             # Podman answers with the first event only, so that silence until then says nothing of the engine.
             with self._engine.asked(), suppress(requests.ReadTimeout):
@@ -188,12 +213,17 @@ class Follower:
         finally:
             self._end_stream()
 
-    def _look_at_all(self, there: set[str]) -> None:
+    def _changed(self, rows: Sequence[Mapping[str, Any]], there: Sequence[str]) -> list[str]:
+        """Those of a list that are not as they were seen last: events say the rest."""
+        listed = {row["Id"]: (row.get("State"), "unhealthy" in str(row.get("Status"))) for row in rows}
         with self._lock:
-            gone = self._seen.keys() - there
-            for container in gone:
-                del self._seen[container]
-                self.meter.forget(container)
+            seen = {one.id: (one.status, bool(one.ill)) for one in self._seen.values()}
+            run = [one.id for one in self._seen.values() if one.runs]
+        for container in run:
+            self.meter.follow(container)
+        return [container for container in there if listed[container] != seen.get(container)]
+
+    def _look_at_all(self, there: Sequence[str]) -> None:
         for container in there:
             seen = self.look(container)
             if not self._connected and seen is not None and seen.runs and not seen.ready:
@@ -218,6 +248,13 @@ class Follower:
 
     # Readiness
 
+    def _await_all(self) -> None:
+        """What was seen before this connection and starts yet: the engine need not have anything more to tell of it."""
+        with self._lock:
+            starting = [seen.id for seen in self._seen.values() if seen.runs and not seen.ready]
+        for container in starting:
+            self._await_ready(container)
+
     def _await_ready(self, container: str) -> None:
         with self._lock:
             if container in self._awaited or not self._connected:
@@ -226,18 +263,15 @@ class Follower:
         threading.Thread(target=self._watch_ready, args=(container,), name="docker-ready", daemon=True).start()
 
     def _watch_ready(self, container: str) -> None:
-        try:
-            while not self._closing.is_set():
-                with self._lock:
-                    seen = self._seen.get(container)
-                if seen is None or not seen.runs or seen.ready:
-                    return
-                with suppress(RuntimeFailure):
-                    self._look_ready(container)
-                self._closing.wait(_READY_S)
-        finally:
+        while True:
             with self._lock:
-                self._awaited.discard(container)
+                seen = self._seen.get(container)
+                if self._closing.is_set() or seen is None or not seen.runs or seen.ready:
+                    self._awaited.discard(container)  # at once: whoever sees it run again has it watched again
+                    return
+            with suppress(RuntimeFailure):
+                self._look_ready(container)
+            self._closing.wait(_READY_S)
 
     def _look_ready(self, container: str) -> None:
         with self._engine.asked():

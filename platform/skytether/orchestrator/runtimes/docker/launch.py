@@ -7,18 +7,21 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from http import HTTPStatus
 from typing import Protocol
 
 from docker.errors import APIError, NotFound
 
 from skytether.api.manifest import Opening
 
-from ..base import Launch, RuntimeFailure
+from ..base import Launch, OvertakenError, RuntimeFailure
 from .engine import Engine, EngineGoneError, explain
+from .fence import Fence
 from .follow import Follower
 from .images import ensure_image
+from .namespaces import Namespaces
 from .network import close_off, guard_image, is_ours, resolve
-from .objects import Seen, advised, container, free_gpus, free_port, grant_archive, name_of
+from .objects import OWNER, Namespace, Seen, advised, container, free_gpus, free_port, grant_archive, name_of, parse
 from .options import DockerOptions
 
 log = logging.getLogger(__name__)
@@ -27,6 +30,8 @@ _KEPT = 2
 """Earlier runs whose containers stay, for their logs."""
 _END_S = 10.0
 """Seconds that a killed container gets to be gone."""
+_AGAIN_S = 0.05
+"""Between two attempts to have a name that a container which is just removed still has."""
 _TAKEN = ("port is already allocated", "address already in use")
 """What an engine says when a port is."""
 _CHOOSING = threading.Lock()
@@ -61,6 +66,8 @@ class Job:
         owner: str,
         follower: Follower,
         prepare: Prepare,
+        namespaces: Namespaces,
+        fence: Fence,
         before: Job | None,
     ) -> None:
         """``before`` is an earlier start of the instance."""
@@ -68,15 +75,21 @@ class Job:
         self.failure = ""
         """Why nothing runs, when it has ended that way."""
         self.unanswered = False
-        """It came to nothing, or nobody knows to what, because the engine did not answer: to be started again."""
+        """It came to nothing, or nobody knows to what: the engine did not answer, or another orchestrator led. To be
+        started again, by who leads."""
         self.unstarted = False
         """It came to nothing, and nothing of earlier runs is left either."""
         self.detail = ""
+        self.given_up: set[str] = before.given_up if before is not None else set()
+        """Containers that this start or one before has ended, or tried to: the engine may do either much later."""
         self._engine = engine
         self._options = options
         self._owner = owner
         self._follower = follower
         self._prepare = prepare
+        self._namespaces = namespaces
+        self._fence = fence
+        self._epoch = fence.epoch
         self._before = before
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="docker-start", daemon=True)
@@ -106,9 +119,13 @@ class Job:
                 self._before.cancel()
                 self._before.join(_END_S + 2 * self._options.timeout_s)
                 self._before = None
-            self._clear()
+            begun = self._clear()
             cleared = True
-            self._launch()
+            if not begun:
+                self._launch()
+        except OvertakenError as error:
+            log.info("start of %s: %s", self.launch.instance, error)
+            self.unanswered = True
         except StoppedError:
             self.failure = "was stopped before it ran"
         except EngineGoneError as error:
@@ -148,14 +165,32 @@ class Job:
                 kill(self._engine, made.id, "KILL")
             self._follower.look(made.id)
 
-    def _clear(self) -> None:
-        """End what is left of earlier runs; of most, forget it too."""
-        for seen in self._follower.of(self.launch.instance):
+    def _clear(self) -> bool:
+        """End what is left of earlier runs; of most, forget it too. Whether this very run was begun meanwhile."""
+        there = self._follower.of(self.launch.instance)
+        self._must_lead()  # after the look: nothing of it was begun by a later leader
+        for seen in there:
+            if seen.runs and seen.attempt > self.attempt:
+                raise OvertakenError(later_runs(seen))
+            if self._is_this(seen):
+                return True
+        for seen in there:
             if seen.runs:
                 kill(self._engine, seen.id, "KILL")
                 self._wait_for_end(seen)
+            if seen.namespace in self._follower.helpers():
+                self._namespaces.remove(seen.namespace)  # its port is the next run's
             if seen.attempt < self.attempt - _KEPT or seen.attempt >= self.attempt or not (seen.runs or seen.ended):
                 remove(self._engine, self._follower, seen.id)
+        return False
+
+    def _must_lead(self) -> None:
+        self._fence.must_lead(self._epoch)
+
+    def _is_this(self, seen: Seen) -> bool:
+        """Whether a container is this very run, and was begun."""
+        begun = seen.runs or seen.status == "exited"
+        return begun and seen.attempt == self.attempt and seen.id not in self.given_up
 
     def _wait_for_end(self, seen: Seen) -> None:
         deadline = time.monotonic() + _END_S
@@ -166,6 +201,7 @@ class Job:
 
     def _create(self, image: str, openings: Openings) -> Seen:
         refused: set[int] = set()
+        deadline = time.monotonic() + _END_S
         while True:
             with self._chosen(refused) as (port, gpus):
                 try:
@@ -175,6 +211,33 @@ class Job:
                         raise RuntimeFailure(str(error)) from error
                     log.warning("UDP port %d of the engine's machine is taken by another program", port)
                     refused.add(port)
+                except _NameTakenError as error:
+                    begun = self._begun_by_another()
+                    if begun is not None:
+                        return begun
+                    if time.monotonic() > deadline:
+                        raise RuntimeFailure(str(error)) from error
+                    time.sleep(_AGAIN_S)
+
+    def _begun_by_another(self) -> Seen | None:
+        """This run as another orchestrator has begun it, by its container's name; None: there is none any more.
+
+        One that was made only is removed: if whoever made it is still at it, it finds nothing to begin.
+        """
+        name = name_of(self._owner, self.launch.instance, self.attempt)
+        with self._engine.asked():
+            try:
+                inspected = self._engine.api().inspect_container(name)
+            except NotFound:
+                return None
+        seen = parse(inspected)
+        if seen is None or inspected["Config"]["Labels"].get(OWNER) != self._owner:
+            raise RuntimeFailure(f"there is a container {name} that is not of this site: remove it")
+        self._must_lead()
+        if self._is_this(seen):
+            return self._follower.look(seen.id)
+        remove(self._engine, self._follower, seen.id)
+        return None
 
     @contextmanager
     def _chosen(self, refused: Iterable[int]) -> Iterator[tuple[int | None, tuple[int, ...]]]:
@@ -210,23 +273,56 @@ class Job:
             raise RuntimeFailure(f"every UDP port from {first} to {last} is taken (option 'ports')") from None
 
     def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], openings: Openings) -> Seen:
-        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
+        """In a network that is prepared, if any may do: what opens something, or has to have a port, needs its own."""
+        guard = guard_image(self._engine, self._options) if is_ours(self._engine, self._options.network) else None
+        if guard is not None and port is None and not openings:
+            with self._namespaces.taken() as namespace:
+                if namespace is not None:
+                    try:
+                        return self._run_in(image, port, gpus, openings, None, namespace)
+                    except (EngineGoneError, OvertakenError):
+                        raise
+                    except RuntimeFailure as error:  # whoever removed that network, or whatever else it is
+                        log.info("start of %s in a prepared network: %s", self.launch.instance, error)
+        return self._run_in(image, port, gpus, openings, guard)
+
+    def _run_in(
+        self,
+        image: str,
+        port: int | None,
+        gpus: tuple[int, ...],
+        openings: Openings,
+        guard: str | None,
+        namespace: Namespace | None = None,
+    ) -> Seen:
+        """``guard`` is the image that closes the network off; None: it is closed off already, or is not to be."""
         network = self._options.network
+        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
         hosts = {to.host: found for to, found in openings.items() if not any("/" in address for address in found)}
-        body = container(self.launch, self._options, self._owner, image, port, gpus, cores, hosts)
         name = name_of(self._owner, self.launch.instance, self.attempt)
-        guard = guard_image(self._engine, self._options) if is_ours(self._engine, network) else None
         with self._engine.asked():
             api = self._engine.api()
-            made = str(api.create_container_from_config(body, name)["Id"])
+            volumes = api.inspect_image(image)["Config"].get("Volumes") or ()
+            asked = self.launch, self._options, self._owner, image, port, gpus, cores, hosts, namespace
+            body = container(*asked, epoch=self._epoch, volumes=volumes)
+            try:
+                made = str(api.create_container_from_config(body, name)["Id"])
+            except APIError as error:
+                if error.status_code == HTTPStatus.CONFLICT:
+                    raise _NameTakenError(explain(error)) from error
+                raise
             try:
                 api.put_archive(made, *grant_archive(self.launch))
                 if guard is not None:
                     api.disconnect_container_from_network(made, network)
+                self._must_lead()  # now that it is there for a later leader to see
                 api.start(made)
+                seen = self._follower.look(made)
                 if guard is not None:
                     self._connect(guard, made, openings)
+                    seen = self._follower.look(made)
             except BaseException as error:
+                self.given_up.add(made)
                 remove(self._engine, self._follower, made)
                 said = explain(error) if isinstance(error, APIError) else ""
                 if any(words in said for words in _TAKEN):
@@ -234,7 +330,6 @@ class Job:
                 if said == f"network {network} not found":
                     raise _NetworkGoneError(said) from error
                 raise
-        seen = self._follower.look(made)
         if seen is None:
             raise RuntimeFailure("its container was removed by somebody else")
         return seen
@@ -242,7 +337,7 @@ class Job:
     def _connect(self, guard: str, made: str, openings: Openings) -> None:
         """Let it have the network, closed off; one that has ended meanwhile needs none."""
         try:
-            close_off(self._engine, self._options, guard, made, openings)
+            close_off(self._engine, self._options, self._owner, guard, made, openings)
             self._engine.api().connect_container_to_network(made, self._options.network)
         except (APIError, RuntimeFailure):
             seen = self._follower.look(made)
@@ -254,8 +349,17 @@ class _NetworkGoneError(RuntimeFailure):
     """Somebody removed the network while no container was in it: ``docker system prune`` does."""
 
 
+class _NameTakenError(Exception):
+    """There is a container for this run."""
+
+
 class _PortTakenError(Exception):
     """Another program on the engine's machine has the port."""
+
+
+def later_runs(seen: Seen) -> str:
+    """Why an earlier attempt is not begun."""
+    return f"attempt {seen.attempt} of {seen.instance} runs: an earlier one is not begun any more"
 
 
 def kill(engine: Engine, container_id: str, signal: str) -> None:

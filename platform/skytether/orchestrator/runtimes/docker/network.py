@@ -1,7 +1,7 @@
 """The instances' network: robots reach them through published ports, and they reach nobody but what their site opens.
 
 What an instance may begin is filtered in its own network namespace, where no reload of the machine's firewall gets to,
-and which it has no right to configure. It is started without a network; a container of the guard's image, which shares
+and which it has no right to configure. That is made without a network; a container of the guard's image, which shares
 that namespace and nothing else with the machine, sets the filter and ends; then the network is connected. So nothing
 has any right to the machine's own network, and an instance whose filter could not be set has none.
 """
@@ -14,9 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 
-from docker import APIClient
 from docker.errors import APIError, NotFound
 
 from skytether.api.manifest import Opening
@@ -25,6 +23,7 @@ from ..base import RuntimeFailure
 from .egress import network_of
 from .engine import Engine, explain, status_of
 from .images import ensure_image
+from .objects import guard
 from .options import DockerOptions
 
 log = logging.getLogger(__name__)
@@ -32,13 +31,22 @@ log = logging.getLogger(__name__)
 _OURS = "skytether.io/network"
 _FILTERED = "filtered"
 """The label's value; networks of earlier releases have another, and a filter on the engine's machine."""
-_GUARD = "skytether.io/guard"
+_OLD_GUARD = "skytether.io/guard"
 _GUARD_TIMEOUT_S = 30
-_LEFT_S = 2 * _GUARD_TIMEOUT_S
-"""A container of a guard that is older than another one by so much was left behind: its orchestrator was killed."""
 _TABLE = "inet skytether"
 _LOOK_UP_S = 15.0
 """For all names of one start; what is asked for again is in the name server's memory then."""
+
+
+def remove_old_guards(engine: Engine) -> None:
+    """Remove what guards of earlier releases left, whose labels name no owner, where a killed orchestrator began them.
+
+    Raises:
+        RuntimeFailure: The engine does not answer, or is just removing what it does not need.
+    """
+    with engine.asked():
+        # An orchestrator of such a release may have another one at work.
+        engine.api().prune_containers({"label": [_OLD_GUARD], "until": f"{2 * _GUARD_TIMEOUT_S}s"})
 
 
 def bridge_of(network: str) -> str:
@@ -212,7 +220,12 @@ def guard_image(engine: Engine, options: DockerOptions) -> str:
 
 
 def close_off(
-    engine: Engine, options: DockerOptions, image: str, container: str, openings: Mapping[Opening, Iterable[str]]
+    engine: Engine,
+    options: DockerOptions,
+    owner: str,
+    image: str,
+    container: str,
+    openings: Mapping[Opening, Iterable[str]],
 ) -> None:
     """Set the filter of a container that runs, and is not connected to any network yet.
 
@@ -220,47 +233,15 @@ def close_off(
         EngineGoneError: The engine does not answer.
         RuntimeFailure: It was not set.
     """
-    said, status = _run_guard(engine, image, container, rules(openings), options.security)
-    if status:
-        raise RuntimeFailure(f"the network of the instances cannot be closed off: {said.strip() or f'status {status}'}")
-
-
-def _run_guard(engine: Engine, image: str, container: str, script: str, security: list[str]) -> tuple[str, int]:
-    """Let nftables do what a script says in a container's network; returns what it said, and its status."""
-    body = {
-        "Image": image,
-        "Entrypoint": ["/usr/sbin/nft"],
-        "Cmd": [script],
-        "User": "0:0",  # the right below is root's alone; it goes for the network of that container only
-        "HostConfig": {
-            "NetworkMode": f"container:{container}",
-            "ReadonlyRootfs": True,
-            "PidsLimit": 16,
-            "Memory": 64 << 20,
-            "IpcMode": "none",
-            "CapDrop": ["ALL"],
-            "CapAdd": ["NET_ADMIN"],
-            "SecurityOpt": security,
-        },
-        "Labels": {_GUARD: "", "app.kubernetes.io/managed-by": "skytether"},
-    }
+    body = guard(options, owner, image, container, rules(openings))
     with engine.asked():
         api = engine.api()
         made = api.create_container_from_config(body)["Id"]
         try:
-            _remove_left(api, made)
             api.start(made)
             status = int(api.wait(made, timeout=_GUARD_TIMEOUT_S)["StatusCode"])
-            return api.logs(made).decode(errors="replace") if status else "", status
+            said = api.logs(made).decode(errors="replace") if status else ""
         finally:
             api.remove_container(made, force=True)
-
-
-def _remove_left(api: APIClient, made: str) -> None:
-    """Remove what others left behind, and not what another orchestrator is just about to start."""
-    rows = api.containers(all=True, filters={"label": [_GUARD]})
-    latest = max((row["Created"] for row in rows if row["Id"] == made), default=0) - _LEFT_S
-    for row in rows:
-        if row["Created"] < latest:
-            with suppress(APIError):  # somebody else is at it
-                api.remove_container(row["Id"], force=True)
+    if status:
+        raise RuntimeFailure(f"the network of the instances cannot be closed off: {said.strip() or f'status {status}'}")

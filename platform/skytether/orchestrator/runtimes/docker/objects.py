@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import posixpath
 import tarfile
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -28,13 +30,25 @@ READY = f"{_ROOT}/{_OWN}/ready.json"
 _DATA = "data"
 _LOG = {"max-size": "2m", "max-file": "2"}
 """The engine keeps at most this of each run's log."""
+_TMP = "/tmp"  # noqa: S108 (the container's own)
 _TMPFS = "size=64m,mode=1777,nosuid,nodev"
 """Of /tmp; it counts as memory of the container."""
 _PREFIX = "skytether.io"
 OWNER = f"{_PREFIX}/owner"
-_INSTANCE, _ATTEMPT, _GPUS = f"{_PREFIX}/instance", f"{_PREFIX}/attempt", f"{_PREFIX}/gpus"
+INSTANCE, _ATTEMPT, _GPUS = f"{_PREFIX}/instance", f"{_PREFIX}/attempt", f"{_PREFIX}/gpus"
+_NAMESPACE, _PORT = f"{_PREFIX}/namespace", f"{_PREFIX}/port"
+"""Of an instance in a network that was prepared: the container that holds it, and the UDP port published there."""
+EPOCH = f"{_PREFIX}/epoch"
+"""Of containers: of the leader who had them made. Of volumes: who led here last."""
+_HELPER = f"{_PREFIX}/helper"
+"""Of the other containers of ours: whom a guard closes off, and nobody where it holds a network namespace."""
 _SIGNALLED, _SIGNALS = 128, 64
 """An exit status above the first means the signal that is left, as far as there are any: 255 is a program's own -1."""
+_INNER = f"{INNER_PORT}/udp"
+_EXPOSED: dict[str, dict[str, str]] = {_INNER: {}}
+_MANAGED = {"app.kubernetes.io/managed-by": "skytether"}
+_HELPS = {"ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode": "none"}
+"""Of whom no service is asked."""
 _LEAST_CORES = 0.01
 """The kernel gives no less."""
 _ADVICE = (
@@ -43,6 +57,28 @@ _ADVICE = (
     ("cannot assign requested address", "the site's option 'bind_host' is no address of the engine's machine"),
 )
 """What to do about what an engine says."""
+
+
+@dataclass(frozen=True, slots=True)
+class Namespace:
+    """A network namespace that is closed off already."""
+
+    id: str
+    """Of the container that holds it."""
+    name: str
+    """Of that container."""
+    port: int
+    """Published UDP port."""
+
+
+@dataclass(frozen=True, slots=True)
+class Helper:
+    """A container of ours that is no service."""
+
+    name: str
+    runs: bool
+    target: str
+    """The container that this guard closes off; empty: it is no guard, and holds a network namespace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +100,9 @@ class Seen:
     gpus: frozenset[int] = frozenset()
     volume: str = ""
     """That of its data."""
+    other_volumes: tuple[str, ...] = ()
+    namespace: str = ""
+    """The container that holds its network; empty: it does itself."""
     ready: bool = False
     """Its ready file was seen."""
     last_line: str = ""
@@ -91,6 +130,21 @@ def data_volume(owner: str, launch: Launch) -> str:
     """
     robot, service = launch.grant.robot, launch.grant.service
     return f"skytether-{owner}-data-{robot}{'.' if '-' in robot + service else '-'}{service}"
+
+
+def epoch_volume(owner: str, epoch: int) -> tuple[str, dict[str, str]]:
+    """Name and labels of the volume that says who leads."""
+    return f"skytether-{owner}-epoch-{epoch}", {OWNER: owner, EPOCH: str(epoch), **_MANAGED}
+
+
+def stored_by_robot(owner: str, sizes: Mapping[str, int]) -> dict[str, int]:
+    """Bytes by robot, of the data volumes among an engine's: see `data_volume`."""
+    before, found = f"skytether-{owner}-data-", Counter[str]()
+    for volume, size in sizes.items():
+        rest = volume.removeprefix(before)
+        if rest != volume:
+            found[rest.partition("." if "." in rest else "-")[0]] += size
+    return dict(found)
 
 
 def refusal(spec: ServiceSpec, options: DockerOptions) -> str | None:
@@ -139,6 +193,10 @@ def container(
     gpus: tuple[int, ...],
     cores: float,
     hosts: Mapping[str, Iterable[str]],
+    namespace: Namespace | None = None,
+    *,
+    epoch: int = 0,
+    volumes: Iterable[str] = (),
 ) -> dict[str, Any]:
     """The body of the engine's call that creates a container.
 
@@ -151,33 +209,34 @@ def container(
         gpus: Numbers of its GPUs.
         cores: Of the engine's machine, which refuses a limit above them.
         hosts: Addresses of the names that it may connect to.
+        namespace: The network that it is to join, which says what is published; None: one of its own.
+        epoch: Of the leader; 0: there is none.
+        volumes: Paths that the image declares to be volumes.
     """
     spec, grant = launch.spec, launch.grant
-    inner = f"{INNER_PORT}/udp"
     memory = (spec.limits.memory_mb or spec.needs.memory_mb) << 20
     limit = max(_LEAST_CORES, min(spec.limits.cpu or max(1.0, spec.needs.cpu), cores))
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
+    whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
+    paths = {posixpath.normpath(path) for path in volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
     return {
         "Image": image,
         "User": f"{USER}:{USER}",
         "Env": [f"{key}={value}" for key, value in environment.items()],
-        "ExposedPorts": {inner: {}},
+        **({} if namespace else {"ExposedPorts": _EXPOSED}),
         "Labels": {
             OWNER: owner,
-            _INSTANCE: grant.instance,
+            **({_NAMESPACE: namespace.id, _PORT: str(namespace.port)} if namespace else {}),
+            INSTANCE: grant.instance,
             _ATTEMPT: str(launch.attempt),
             _GPUS: ",".join(map(str, gpus)),
-            f"{_PREFIX}/robot": grant.robot,
-            f"{_PREFIX}/service": grant.service,
+            **({EPOCH: str(epoch)} if epoch else {}),
             "app.kubernetes.io/name": grant.service,
             "app.kubernetes.io/instance": grant.instance,
-            "app.kubernetes.io/managed-by": "skytether",
+            **whose,
         },
         "HostConfig": {
-            "NetworkMode": options.network,
-            "PortBindings": {inner: [{"HostIp": options.bound, "HostPort": str(port or "")}]},
-            "Dns": ["127.0.0.1"],  # nobody to ask: names would be a way out
-            "ExtraHosts": [f"{name}:{address}" for name, addresses in hosts.items() for address in addresses],
+            **({"NetworkMode": f"container:{namespace.id}"} if namespace else _reached(options, port, hosts)),
             "Init": True,  # as process 1, a service that has no handler yet could not be ended
             "ReadonlyRootfs": True,
             "CapDrop": ["ALL"],
@@ -187,10 +246,14 @@ def container(
             "NanoCpus": int(limit * 1e9),
             "CpuShares": max(2, int(spec.needs.cpu * 1024)),
             "PidsLimit": spec.limits.pids,
-            "Tmpfs": {"/tmp": _TMPFS},  # noqa: S108 (the container's own)
+            "Tmpfs": {_TMP: _TMPFS},
             "Mounts": [
-                {"Type": "volume", "Target": _ROOT},
-                {"Type": "volume", "Source": data_volume(owner, launch), "Target": f"{_ROOT}/{_DATA}"},
+                # By their labels they are found, should somebody remove the container without them.
+                *(
+                    _volume(path, {OWNER: owner, INSTANCE: grant.instance, **_MANAGED})
+                    for path in [_ROOT, *sorted(paths)]
+                ),
+                _volume(f"{_ROOT}/{_DATA}", {OWNER: owner, **whose}, data_volume(owner, launch)),
             ],
             "Devices": [
                 {"PathOnHost": device, "PathInContainer": device, "CgroupPermissions": "rw"}
@@ -200,6 +263,53 @@ def container(
             "DeviceRequests": _gpu_requests(gpus),
             "LogConfig": {"Type": "json-file", "Config": _LOG},
         },
+    }
+
+
+def _volume(path: str, labels: Mapping[str, str], name: str | None = None) -> dict[str, Any]:
+    """``name``: of one that stays; None: it goes with its container."""
+    named = {"Source": name} if name else {}
+    return {"Type": "volume", **named, "Target": path, "VolumeOptions": {"Labels": dict(labels)}}
+
+
+def _reached(options: DockerOptions, port: int | None, hosts: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+    """How a container is reached, and whom it knows by name."""
+    return {
+        "NetworkMode": options.network,
+        "PortBindings": {_INNER: [{"HostIp": options.bound, "HostPort": str(port or "")}]},
+        "Dns": ["127.0.0.1"],  # nobody to ask: names would be a way out
+        "ExtraHosts": [f"{name}:{address}" for name, addresses in hosts.items() for address in addresses],
+    }
+
+
+def holder(options: DockerOptions, owner: str, image: str) -> dict[str, Any]:
+    """The body of the call that creates a container which holds a network namespace, sleeps, and has no right."""
+    return {
+        "Image": image,
+        "Entrypoint": ["/bin/sleep"],
+        "Cmd": ["infinity"],
+        "User": f"{USER}:{USER}",
+        "ExposedPorts": _EXPOSED,
+        "HostConfig": {**_reached(options, None, {}), **_HELPS, "CapDrop": ["ALL"], "SecurityOpt": options.security},
+        "Labels": {OWNER: owner, _HELPER: "", **_MANAGED},
+    }
+
+
+def guard(options: DockerOptions, owner: str, image: str, target: str, script: str) -> dict[str, Any]:
+    """The body of the call that creates a container in which nftables does what a script says in another's network."""
+    return {
+        "Image": image,
+        "Entrypoint": ["/usr/sbin/nft"],
+        "Cmd": [script],
+        "User": "0:0",  # the right below is root's alone; it goes for the network of that container only
+        "HostConfig": {
+            "NetworkMode": f"container:{target}",
+            **_HELPS,
+            "CapDrop": ["ALL"],
+            "CapAdd": ["NET_ADMIN"],
+            "SecurityOpt": options.security,
+        },
+        "Labels": {OWNER: owner, _HELPER: target, **_MANAGED},
     }
 
 
@@ -236,30 +346,49 @@ def _owned(path: str, mode: int, kind: bytes) -> tarfile.TarInfo:
 def parse(inspected: Mapping[str, Any]) -> Seen | None:
     """A container out of the engine's description; None: it is not one of ours."""
     labels = inspected["Config"].get("Labels") or {}
-    if _INSTANCE not in labels or not labels.get(_ATTEMPT, "").isdecimal():
+    if INSTANCE not in labels or not labels.get(_ATTEMPT, "").isdecimal():
         return None
     state = inspected["State"]
-    published = (inspected["NetworkSettings"].get("Ports") or {}).get(f"{INNER_PORT}/udp") or []
+    port = published_port(inspected)
     health = state.get("Health") or {}
-    mounts = inspected.get("Mounts") or ()
+    volumes = {mount.get("Destination"): str(mount.get("Name", "")) for mount in inspected.get("Mounts") or ()}
     return Seen(
         id=inspected["Id"],
-        instance=labels[_INSTANCE],
+        instance=labels[INSTANCE],
         attempt=int(labels[_ATTEMPT]),
         status=state["Status"],
         exit_code=state["ExitCode"],
         out_of_memory=state["OOMKilled"],
         memory_limit=inspected["HostConfig"]["Memory"],
-        host_port=int(published[0]["HostPort"]) if published else None,
-        ill=_complaint(health) if health.get("Status") == "unhealthy" else "",
+        host_port=port or (int(labels[_PORT]) if labels.get(_PORT, "").isdecimal() else None),
+        ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
         gpus=frozenset(int(number) for number in labels.get(_GPUS, "").split(",") if number.isdecimal()),
-        volume=next((str(m.get("Name", "")) for m in mounts if m.get("Destination") == f"{_ROOT}/{_DATA}"), ""),
+        volume=volumes.pop(f"{_ROOT}/{_DATA}", ""),
+        other_volumes=tuple(volumes.values()),
+        namespace=labels.get(_NAMESPACE, ""),
     )
 
 
-def _complaint(health: Mapping[str, Any]) -> str:
-    outputs = [entry.get("Output", "").strip() for entry in health.get("Log") or []]
-    return last_line(outputs[-1]) if outputs and outputs[-1] else "its health check fails"
+def published_port(inspected: Mapping[str, Any]) -> int | None:
+    """Where a container is reached on its engine's machine; None: nowhere, or its network is another's."""
+    published = (inspected["NetworkSettings"].get("Ports") or {}).get(_INNER) or []
+    return int(published[0]["HostPort"]) if published else None
+
+
+def parse_helper(inspected: Mapping[str, Any]) -> Helper | None:
+    """A guard, or what holds a network; None: it is neither."""
+    target = (inspected["Config"].get("Labels") or {}).get(_HELPER)
+    if target is None:
+        return None
+    return Helper(inspected["Name"].removeprefix("/"), inspected["State"]["Status"] in ("running", "paused"), target)
+
+
+def _complaint(log: Sequence[Mapping[str, Any]]) -> str:
+    """What the last check said; empty: it did not end in time, for which a busy machine is enough."""
+    if log and log[-1].get("ExitCode", 0) < 0:
+        return ""
+    said = last_line(str(log[-1].get("Output", ""))) if log else ""
+    return said or "its health check fails"
 
 
 def last_line(text: str) -> str:
@@ -283,8 +412,10 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
     )
 
 
-def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None, exceeds: str = "") -> Observation:
-    """What the contract calls it; ``exceeds``: what it wrote too much of."""
+def observation(
+    seen: Seen, options: DockerOptions, usage: Usage | None = None, exceeds: str = "", *, cut_off: bool = False
+) -> Observation:
+    """What the contract calls it; ``exceeds``: what it wrote too much of; ``cut_off``: its network is held no more."""
     if seen.ended:
         signalled = _SIGNALLED < seen.exit_code <= _SIGNALLED + _SIGNALS
         return Observation(
@@ -297,7 +428,8 @@ def observation(seen: Seen, options: DockerOptions, usage: Usage | None = None, 
     if seen.runs and seen.ready and seen.host_port is not None:
         used = asdict(usage) if usage is not None else {}
         where = options.advertised, seen.host_port
-        return Observation(seen.attempt, Phase.RUNNING, *where, detail=seen.ill, exceeds=exceeds, **used)
+        ill = "the container that held its network has ended" if cut_off else seen.ill
+        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, **used)
     return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds)
 
 

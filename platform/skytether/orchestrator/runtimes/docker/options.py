@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
+from string import ascii_letters, digits
 from typing import Annotated, Literal
 from urllib.parse import SplitResult, urlsplit
 
@@ -21,6 +22,8 @@ _NO_NETWORKS = ("host", "none", "default")
 """Words of the engine that are no bridges: with the machine's network, a service could reach all of it."""
 
 
+_PLAIN = frozenset(ascii_letters + digits + "._:-")
+"""Characters of a host and of a user; the colon is an IPv6 address's."""
 _OURS = str(Path(__file__).with_name("seccomp.json"))
 
 
@@ -100,11 +103,17 @@ class DockerOptions(Strict):
     """Patterns of what manifests may open (``needs.egress``), such as ``*.example.org:443/tcp``; ``*`` is everything,
     this machine and its neighbours included."""
     guard_image: Annotated[str, Field(min_length=1)] = "skytether/guard:1"
-    """Runs once for each start, to close the instance's own network off, with no right to any other. Never pulled,
-    unless it is named with its digest."""
+    """Runs once for each instance's network, to close that off, with no right to any other; and sleeps, with no right
+    at all, in those that are ``prepared``. Never pulled, unless it is named with its digest."""
+    prepared: Annotated[int, Field(ge=0, le=16)] = 1
+    """Networks that are closed off before anybody asks, each held by a container that sleeps. A start that finds one
+    waits for no guard; one whose service opens something, or that gets one of ``ports``, makes its own."""
     seccomp: str | None = None
     """File with another profile of the calls that services may make, as ``docker run`` takes it; ``default``: the
     engine's own; None: ours (``seccomp.json``), which lets through less."""
+    without_limits: bool = False
+    """Use an engine that holds no limits of memory, processor or processes, as rootless ones do without cgroup 2: one
+    service could starve all others."""
     environment: dict[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], str] = {}
     """More variables for the services. No secrets: whoever may ask the engine sees them."""
     owner: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")] | None = None
@@ -151,8 +160,12 @@ class DockerOptions(Strict):
             raise ValueError(f"engine: {error}") from None
         if address.scheme not in ("unix", "ssh", "tcp") or not complete:
             raise ValueError("engine must be unix:///PATH, ssh://[USER@]HOST[:PORT] or tcp://HOST:PORT")
-        if (address.username and address.username.startswith("-")) or (address.hostname or "").startswith("-"):
-            raise ValueError("engine: neither user nor host may begin with '-'")
+        for what in (address.username, address.hostname):
+            # The SSH client may put them into a shell's command of ~/.ssh/config (ProxyCommand, Match exec).
+            if what and (what.startswith("-") or not set(what) <= _PLAIN):
+                raise ValueError(
+                    "engine: user and host have letters, digits and . _ : - only, and do not begin with '-'"
+                )
         if address.password:
             raise ValueError("engine: no password belongs into the address; use a key, see ssh.identity")
         if (address.scheme == "tcp") != (self.tls is not None):

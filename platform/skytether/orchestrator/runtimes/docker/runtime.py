@@ -7,8 +7,8 @@ import math
 import secrets
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +17,37 @@ from typing_extensions import override
 
 from skytether.api.manifest import ServiceSpec, Strict
 
-from ..base import ARCHITECTURES, Capacity, Launch, LogStream, Observation, Phase, Runtime, RuntimeFailure
+from ..base import (
+    ARCHITECTURES,
+    Capacity,
+    Launch,
+    LogStream,
+    Observation,
+    OvertakenError,
+    Phase,
+    Runtime,
+    RuntimeFailure,
+)
 from .engine import Engine, EngineGoneError
+from .fence import Fence
 from .follow import Follower
 from .images import check_credentials
-from .launch import Job, kill, remove
+from .launch import Job, kill, later_runs, remove
 from .logs import ContainerLog
-from .network import ensure_network, remove_network
+from .namespaces import Namespaces
+from .network import ensure_network, remove_network, remove_old_guards
 from .objects import USER, Seen, data_volume, observation, refusal
 from .options import DockerOptions
-from .volumes import Scales
+from .volumes import Scales, remove_left
 
 log = logging.getLogger(__name__)
 
 _HOLDS = {"userns": "user namespace", "rootless": "rootless engine", "seccomp": "seccomp", "apparmor": "AppArmor"}
 """In words for people, what an engine says of its own security."""
+_LIMITS = {"MemoryLimit": "memory", "CpuCfsQuota": "processor time", "PidsLimit": "processes"}
+"""In words for people, what an engine says that it can limit."""
+_SWEEP_S = 10.0
+"""Seconds between two looks for volumes whose containers somebody has removed."""
 _AGAIN_S = 10.0
 """Seconds between two attempts to make the network of a site ready that could not be."""
 
@@ -46,7 +62,9 @@ class DockerRuntime(Runtime):
     Options = DockerOptions
     unique = "owner"
     runs_as_us = False
-    owner_options = frozenset({"devices", "groups", "guard_image", "network", "egress", "seccomp"})
+    owner_options = frozenset(
+        {"devices", "groups", "guard_image", "network", "egress", "registry_auth", "seccomp", "without_limits"}
+    )
 
     @override
     def __init__(self, site: str, folder: Path, options: Strict) -> None:
@@ -62,7 +80,8 @@ class DockerRuntime(Runtime):
         self._options = options
         self._owner = options.owner or _kept_owner(folder)
         self._engine = Engine(options)
-        self._scales = Scales(self._engine, options.data_mb)
+        self._fence = Fence(self._engine, self._owner)
+        self._scales = Scales(self._engine, self._owner, options.data_mb)
         self._lock = threading.Lock()
         self._jobs: dict[str, Job] = {}
         self._asked: set[str] = set()
@@ -70,10 +89,14 @@ class DockerRuntime(Runtime):
         self._network_lock = threading.Lock()
         self._network_ready = False
         self._blocked = ""
-        """Why the network cannot be made ready, as far as is known."""
+        """Why nothing can be started here, as far as is known."""
         self._tried_at = -math.inf
+        self._swept_at = -math.inf
         self._early: threading.Thread | None = None
         self._follower = Follower(self._engine, self._owner, self._on_connect, options.timeout_s)
+        self._namespaces = Namespaces(
+            self._engine, options, self._owner, self._follower, self._prepare, self._fence.must_lead
+        )
         self._follower.start()
 
     @override
@@ -93,12 +116,15 @@ class DockerRuntime(Runtime):
     def _prepare_early(self) -> None:
         with suppress(RuntimeFailure):  # each start tries again, and says it to who asked
             self._prepare()
+        with suppress(RuntimeFailure):  # they only take room
+            remove_old_guards(self._engine)
 
     def _prepare(self, *, anew: bool = False) -> None:
         with self._network_lock:
             if anew or not self._network_ready:
                 self._network_ready = False
                 try:
+                    self._must_hold_limits()
                     ensure_network(self._engine, self._options)
                 except EngineGoneError:
                     raise
@@ -108,6 +134,17 @@ class DockerRuntime(Runtime):
                     self._blocked = str(error)
                     raise
                 self._network_ready, self._blocked = True, ""
+
+    def _must_hold_limits(self) -> None:
+        told = self._follower.info(self._options.timeout_s)
+        # Podman says what the machine has, and ignores the limits where cgroups are of version 1 and it is not root.
+        none = told.get("Rootless", False) and told.get("CgroupVersion") == "1"
+        lacking = [what for key, what in _LIMITS.items() if none or not told.get(key, True)]
+        if lacking and not self._options.without_limits:
+            raise RuntimeFailure(
+                f"the engine holds no limit of {' and '.join(lacking)}, so one service could starve all others: give it"
+                " cgroup 2 with these controllers (docs/docker.md), or the site the option without_limits"
+            )
 
     @override
     def blocked(self) -> str:
@@ -132,18 +169,46 @@ class DockerRuntime(Runtime):
         memory = options.memory_mb or int(info["MemTotal"]) >> 20
         return Capacity(cpu, memory, options.gpu, ARCHITECTURES.get(machine, machine))
 
+    @override
+    def lead(self, epoch: int) -> None:
+        self._fence.lead(epoch)
+        with self._lock:
+            # What came of starts for an earlier leader is seen; those that are under way are refused where they are.
+            self._jobs = {instance: job for instance, job in self._jobs.items() if not job.ended}
+
+    def _must_lead(self) -> None:
+        with self._doubting():
+            self._fence.must_lead()
+
+    @contextmanager
+    def _doubting(self) -> Iterator[None]:
+        """Around a call that waits for the engine: if that is silent, the next look says so, and waits for nothing."""
+        try:
+            yield
+        except EngineGoneError as error:
+            self._follower.doubt(error)
+            raise
+
     def start(self, launch: Launch) -> None:
         self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
+        self._must_lead()
         full = self._scales.exceeds(data_volume(self._owner, launch))
         if full:
             raise RuntimeFailure(full)
         with self._lock:
             job, newest = self._jobs.get(launch.instance), self._newest(launch.instance)
+            if newest is not None and newest.runs and newest.attempt > launch.attempt:
+                raise OvertakenError(later_runs(newest))
+            there = newest is not None and newest.attempt == launch.attempt
             if job is not None and job.attempt == launch.attempt and not job.unanswered:
+                if there or job.failure or not job.ended:
+                    return  # or it was begun, and somebody has removed its container
+            elif (
+                newest is not None and there and newest.status != "created" and not (job and newest.id in job.given_up)
+            ):
                 return
-            if newest is not None and newest.attempt == launch.attempt and newest.status != "created":
-                return
-            job = Job(launch, self._engine, self._options, self._owner, self._follower, self._prepare, job)
+            site = self._engine, self._options, self._owner, self._follower
+            job = Job(launch, *site, self._prepare, self._namespaces, self._fence, job)
             self._jobs[launch.instance] = job
             job.start()
 
@@ -152,19 +217,32 @@ class DockerRuntime(Runtime):
         return seen[-1] if seen else None
 
     def observe(self) -> Mapping[str, Observation]:
+        with self._lock:
+            jobs = dict(self._jobs)
+        begun = {
+            instance for instance, job in jobs.items() if job.ended
+        }  # before the look, which shows what came of it
         newest: dict[str, Seen] = {}
         for seen in self._follower.seen(self._options.timeout_s):
+            # What a start has given up is no run, however it looks: an engine that answers late still ends it.
+            if seen.instance in jobs and seen.id in jobs[seen.instance].given_up:
+                continue
             if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
                 newest[seen.instance] = seen
         # One that was made and not begun is no run: the orchestrator was killed in between, or a job is just at it.
         meter = self._follower.meter
+        helpers = self._follower.helpers()
         found = {
-            instance: observation(seen, self._options, meter.usage(seen.id), self._scales.exceeds(seen.volume))
+            instance: observation(
+                seen,
+                self._options,
+                meter.usage(seen.id),
+                self._scales.exceeds(seen.volume, seen.other_volumes),
+                cut_off=bool(seen.namespace) and not (seen.namespace in helpers and helpers[seen.namespace].runs),
+            )
             for instance, seen in newest.items()
             if seen.status != "created"
         }
-        with self._lock:
-            jobs = dict(self._jobs)
         for instance, job in jobs.items():
             # One that a start ends again, for it could not be closed off, is no run that crashed.
             told = found.get(instance)
@@ -172,6 +250,8 @@ class DockerRuntime(Runtime):
                 continue
             if job.unanswered:
                 continue  # as if it had not been begun: it is, once the engine answers
+            if instance in begun and not told and not job.failure:
+                continue  # its container was removed, by somebody else
             if job.failure:
                 found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure, unstarted=job.unstarted)
             else:
@@ -184,7 +264,7 @@ class DockerRuntime(Runtime):
         newest = self._newest(instance)
         if job is not None and not job.ended and (newest is None or newest.attempt < job.attempt or not newest.runs):
             job.cancel()
-        for seen in self._follower.of(instance):
+        for seen in self._to_be_ended(instance):
             if not seen.runs or (not force and seen.id in self._asked):
                 continue
             kill(self._engine, seen.id, "KILL" if force else "TERM")
@@ -197,9 +277,16 @@ class DockerRuntime(Runtime):
         if job is not None:
             job.cancel()
             job.join(self._options.timeout_s)
-        for seen in self._follower.of(instance):
+        for seen in self._to_be_ended(instance):
             remove(self._engine, self._follower, seen.id)
             self._asked.discard(seen.id)
+
+    def _to_be_ended(self, instance: str) -> list[Seen]:
+        """All its containers, none of which a later leader has begun."""
+        self._follower.seen(self._options.timeout_s)  # or it could not be known what is there
+        there = self._follower.of(instance)
+        self._must_lead()  # after the look
+        return there
 
     def logs(self, instance: str, lines: int) -> str:
         self._follower.seen(self._options.timeout_s)  # who asks an engine that is away need not wait for it
@@ -224,25 +311,59 @@ class DockerRuntime(Runtime):
         return ContainerLog(self._engine, newest.id, lines) if newest is not None and newest.runs else None
 
     @override
+    def stored(self) -> Mapping[str, int]:
+        return self._scales.by_robot
+
+    @override
     def tidy(self) -> None:
         """Remove what was begun by halves, and see whether what the network lacked is there by now."""
+        if self._fence.epoch:
+            with self._doubting():
+                self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
         self._remove_unbegun()
+        if time.monotonic() - self._swept_at >= _SWEEP_S:
+            self._swept_at = time.monotonic()
+            remove_left(self._engine, self._owner)
         self._scales.begin()
+        with self._lock:
+            starting = any(not job.ended for job in self._jobs.values())
+        starting |= any(seen.runs and not seen.ready for seen in self._follower.seen(self._options.timeout_s))
+        self._namespaces.begin(resting=not starting and not self._blocked)
         trying = self._early is not None and self._early.is_alive()
         if self._blocked and not trying and time.monotonic() - self._tried_at >= _AGAIN_S:
             self._begin_early()
 
     def _remove_unbegun(self) -> None:
-        """What was made and never begun: an orchestrator was killed, or an engine answered too late."""
+        """What was made and never begun, or given up: an orchestrator was killed, or an engine answered too late.
+
+        And end what a leader that was followed has begun beside a later run. Nobody else is told of these, so nobody
+        else asks for their end.
+        """
         with self._lock:
             busy = {instance for instance, job in self._jobs.items() if not job.ended}
-        for seen in self._follower.seen(self._options.timeout_s):
-            if seen.status == "created" and seen.instance not in busy:
-                remove(self._engine, self._follower, seen.id)
+            given_up = {container for job in self._jobs.values() if job.ended for container in job.given_up}
+        there = self._follower.seen(self._options.timeout_s)
+        latest: dict[str, int] = {}
+        for seen in there:
+            if seen.runs:
+                latest[seen.instance] = max(seen.attempt, latest.get(seen.instance, 0))
+        unbegun = [s for s in there if s.id in given_up or (s.status == "created" and s.instance not in busy)]
+        doubled = [s for s in there if s.runs and s.attempt < latest[s.instance] and s.instance not in busy]
+        if unbegun or doubled:
+            self._must_lead()  # after the look: nothing of it was made by a later leader
+        for seen in unbegun:
+            remove(self._engine, self._follower, seen.id)
+        for seen in doubled:
+            kill(self._engine, seen.id, "KILL")
 
     @override
     def dismantle(self) -> None:
+        if self._early is not None:
+            self._early.join(self._options.timeout_s)  # or it makes the network again
         self._remove_unbegun()
+        self._namespaces.clear()
+        remove_left(self._engine, self._owner)
+        self._fence.clear()
         remove_network(self._engine, self._options)
 
     @override
@@ -250,6 +371,7 @@ class DockerRuntime(Runtime):
         with self._lock:
             for job in self._jobs.values():
                 job.cancel()
+        self._namespaces.close()
         self._follower.close()
         if self._early is not None:
             self._early.join(self._options.timeout_s)  # or it leaves its container behind

@@ -1,11 +1,11 @@
-"""How much services have written into their data volumes: asked of the engine, in a thread, for it takes its time."""
+"""How much services have written into their volumes: asked of the engine, in a thread, for it takes its time."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import requests
@@ -13,10 +13,15 @@ from docker.errors import create_api_error_from_http_exception
 
 from ..base import RuntimeFailure
 from .engine import Engine
+from .fence import remove_volume
+from .objects import INSTANCE, OWNER, stored_by_robot
 
 log = logging.getLogger(__name__)
 
 _EVERY_S = 30.0
+_OWN_MB = 64
+"""MiB in each other volume: of the grant, where a service writes its ready file, and those that an image declares. As
+much as in the own folder of a process."""
 _PATIENCE_S = 120.0
 """The engine looks at every file of its volumes."""
 _TOLERATED = 3
@@ -34,26 +39,43 @@ def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
     return found
 
 
-class Scales:
-    """Knows which data volumes hold more than they may. Safe from any thread."""
+def remove_left(engine: Engine, owner: str) -> None:
+    """Remove the volumes of containers that somebody removed without them: one of each holds a session's key.
 
-    def __init__(self, engine: Engine, data_mb: int, clock: Callable[[], float] = time.monotonic) -> None:
+    Raises:
+        RuntimeFailure: The engine does not answer.
+    """
+    with engine.asked():
+        wanted = {"label": [f"{OWNER}={owner}", INSTANCE], "dangling": True}
+        for volume in engine.api().volumes(wanted)["Volumes"] or ():
+            remove_volume(engine, volume["Name"])
+
+
+class Scales:
+    """Knows which volumes hold more than they may. Safe from any thread."""
+
+    def __init__(self, engine: Engine, owner: str, data_mb: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._engine = engine
+        self._owner = owner
         self._data_mb = data_mb
         self._clock = clock
         self._weighed_at = -_EVERY_S
         self._thread: threading.Thread | None = None
-        self._full: frozenset[str] = frozenset()
+        self.sizes: Mapping[str, int] = {}
+        """Bytes by volume, as weighed last; of the whole engine."""
+        self.by_robot: Mapping[str, int] = {}
+        """Bytes in this owner's volumes of data: summed up once, for each pass over each site asks."""
         self._failures = 0
         """In a row."""
 
-    def exceeds(self, volume: str) -> str:
-        """Why nobody may write to it any more; empty: they may."""
-        if volume not in self._full:
-            return ""
-        return (
-            f"has more than {self._data_mb} MiB in the volume {volume} (the site's data_mb): delete what is not needed"
-        )
+    def exceeds(self, data: str, others: Iterable[str] = ()) -> str:
+        """Why who writes to a volume of data, and to others of its container, may do so no more; empty: it may."""
+        if self.sizes.get(data, 0) > self._data_mb << 20:
+            most = f"{self._data_mb} MiB in the volume {data} (the site's data_mb)"
+            return f"has more than {most}: delete what is not needed"
+        if any(self.sizes.get(name, 0) > _OWN_MB << 20 for name in others):
+            return f"has more than {_OWN_MB} MiB in a volume that is not for data"
+        return ""
 
     def begin(self) -> None:
         """Weigh them, unless that is under way or was done a moment ago. Does not wait."""
@@ -91,5 +113,5 @@ class Scales:
             except requests.HTTPError as error:
                 create_api_error_from_http_exception(error)
             answer = said.json()
-        most = self._data_mb << 20
-        self._full = frozenset(name for name, size in sizes(answer).items() if size > most)
+        self.sizes = sizes(answer)
+        self.by_robot = stored_by_robot(self._owner, self.sizes)

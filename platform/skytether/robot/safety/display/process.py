@@ -17,13 +17,14 @@ from contextlib import suppress
 from math import inf
 
 from skytether.guard.clock import now as boottime
+from skytether.guard.folder import Known
 from skytether.guard.mailbox import bind
 from skytether.guard.settings import thaw
 from skytether.messages import MarkerArray, Message, warm
 from skytether.robot.notices import Notices
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.display_config import DisplayConfig
-from skytether.robot.safety.hardware import receive
+from skytether.robot.safety.hardware import receive_known
 from skytether.robot.safety.modes import Envelope, Modes
 from skytether.robot.safety.places import Places
 from skytether.robot.safety.process import log_without_waiting
@@ -76,6 +77,7 @@ class Display:
         self._clock = clock
         self._notices = Notices(_log)
         self._feed = bind(str(config.place() / DISPLAY_SOCKET), 0o600)
+        self._senders = Known.of(self._feed)
         self._heard_at = clock()
         self._lived_at = -inf
 
@@ -90,10 +92,10 @@ class Display:
     def turn(self) -> None:
         """Draw the newest of what came."""
         now = self._clock()
-        came = receive(self._feed, LARGEST, _WAITING)
+        came, _ = receive_known(self._feed, self._senders, LARGEST, _WAITING)
         if came:
             self._heard_at = now
-            self._draw(came[-1], now)
+            self._draw(came[-1][0], now)
         elif now - self._heard_at > _SILENCE_S:
             self._publish(silence(self._frame, self._lasts))
         if now - self._lived_at > _SILENCE_S / 2:

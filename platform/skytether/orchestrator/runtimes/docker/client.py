@@ -1,0 +1,101 @@
+"""The SDK's client, for an engine that may be slow, broken or somebody else's: no answer is without an end."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from collections.abc import Iterator
+from http import HTTPStatus
+from typing import Any
+
+import requests
+from docker import APIClient
+from typing_extensions import override
+
+_MOST = 32 << 20
+"""Bytes of an answer: a container's whole log has 4 MiB, a list of a thousand containers some."""
+_MOST_MESSAGE = 1 << 20
+"""Bytes of one message of a stream."""
+_PIECE = 1 << 16
+_FRAME = struct.Struct(">4xL")
+"""Before each piece of a log: which stream it is of, and how long."""
+
+
+class Client(APIClient):
+    """Reads no more than `_MOST` bytes and for no longer than the call's time-out, whatever is sent; is led nowhere."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """As the SDK's; ``timeout`` [s] of each call, and of the gaps in a stream."""
+        super().__init__(*arguments, **options)
+        # What the environment says of proxies and authorities is meant for the Internet, not for an engine.
+        self.trust_env = False
+
+    @override
+    def send(self, request: requests.PreparedRequest, **options: Any) -> requests.Response:
+        # The SDK waits for events without end: one that says nothing for so long may be gone.
+        patience = options.get("timeout") or self.timeout
+        answer = super().send(request, **{**options, "timeout": patience, "stream": True})
+        if answer.status_code >= HTTPStatus.BAD_REQUEST or not options.get("stream"):
+            _read(answer, patience)
+        return answer
+
+    @override
+    def get_redirect_target(self, resp: requests.Response) -> str | None:
+        """An engine is where the site says; whom it names may be anybody."""
+        return None
+
+    def _stream_helper(self, response: requests.Response, decode: bool = False) -> Iterator[Any]:
+        if response.raw.chunked and decode:
+            for line in _lines(response):
+                yield json.loads(line)
+            return
+        if not response.raw.chunked:
+            _read(response, self.timeout)
+        yield from super()._stream_helper(response, decode)  # type: ignore[misc]
+
+    def _multiplexed_response_stream_helper(self, response: requests.Response) -> Iterator[bytes]:
+        # As the SDK's, which takes as much at once as is announced: up to 4 GiB.
+        self._disable_socket_timeout(self._get_raw_response_socket(response))  # type: ignore[attr-defined]
+        while header := response.raw.read(_FRAME.size):
+            (left,) = _FRAME.unpack(header)
+            while left:
+                piece = response.raw.read(min(left, _PIECE))
+                if not piece:
+                    return
+                left -= len(piece)
+                yield piece
+
+
+def _read(answer: requests.Response, patience: float) -> None:
+    """Take all of an answer, as the library does it, within ``patience`` [s].
+
+    Raises:
+        requests.RequestException: It has no end.
+    """
+    pieces, size, until = [], 0, time.monotonic() + patience
+    for piece in answer.iter_content(_PIECE):
+        pieces.append(piece)
+        size += len(piece)
+        if size > _MOST or time.monotonic() > until:
+            answer.close()
+            why = f"more than {_MOST >> 20} MiB" if size > _MOST else "without an end in time"
+            raise requests.ConnectionError(f"an answer of {why}")
+    answer._content = b"".join(pieces)  # noqa: SLF001 (it has no other way to be given it)
+
+
+def _lines(answer: requests.Response) -> Iterator[bytes]:
+    """Messages of a stream, one a line.
+
+    Raises:
+        requests.RequestException: One has no end.
+    """
+    rest = b""
+    for piece in answer.raw.stream(_PIECE):
+        *lines, rest = (rest + piece).split(b"\n")
+        yield from (line for line in lines if line.strip())
+        if len(rest) > _MOST_MESSAGE:
+            answer.close()
+            raise requests.ConnectionError("a message without an end")
+    if rest.strip():
+        yield rest

@@ -1,0 +1,148 @@
+"""What an engine may answer that is broken, or somebody else's."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import requests
+import urllib3
+
+from skytether.orchestrator.runtimes.base import SiteSilentError
+from skytether.orchestrator.runtimes.docker import client as clients
+from skytether.orchestrator.runtimes.docker.client import Client
+from skytether.orchestrator.runtimes.docker.engine import Engine
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
+
+CHUNKED = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
+Answer = Callable[[bytes], Iterator[bytes]]
+
+
+@pytest.fixture
+def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Client]]:
+    """A client of an engine that answers each request with these pieces, and is silent then."""
+    monkeypatch.setattr(clients, "_MOST", 1 << 20)
+    opened: list[socket.socket] = []
+    made: list[Client] = []
+    monkeypatch.chdir(tmp_path)
+
+    def make(answer: Answer, timeout_s: float = 10.0) -> Client:
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind("engine.sock")
+        listener.listen()
+        opened.append(listener)
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken, _ = listener.accept()
+                    opened.append(taken)
+                    asked = taken.recv(65_536)
+                    with contextlib.suppress(OSError):
+                        for piece in answer(asked):
+                            taken.sendall(piece)
+
+        threading.Thread(target=serve, daemon=True).start()
+        made.append(Client(f"unix://{tmp_path}/engine.sock", version="1.41", timeout=timeout_s))
+        return made[-1]
+
+    yield make
+    for client in made:
+        client.close()
+    for one in opened:
+        with contextlib.suppress(OSError):
+            one.shutdown(socket.SHUT_RDWR)
+        one.close()
+
+
+def chunks(piece: bytes, pause_s: float = 0.0) -> Iterator[bytes]:
+    for _ in range(10_000):
+        yield b"%x\r\n%s\r\n" % (len(piece), piece)
+        time.sleep(pause_s)
+
+
+@pytest.mark.parametrize("status", [b"200 OK", b"500 No"])
+def test_an_answer_that_never_ends_costs_no_memory(engine: Callable[..., Client], status: bytes) -> None:
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED.replace(b"200 OK", status)
+        yield from chunks(b" " * 65_536)
+
+    with pytest.raises(requests.ConnectionError, match="an answer of more than 1 MiB"):
+        engine(answer).info()
+
+
+def test_an_answer_that_comes_in_drops_takes_no_longer_than_its_call_may(
+    engine: Callable[..., Client],
+) -> None:
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        yield from chunks(b" ", 0.02)
+
+    with pytest.raises(requests.ConnectionError, match="without an end in time"):
+        engine(answer, 0.5).info()
+
+
+def test_nobody_is_asked_whom_an_engine_names(engine: Callable[..., Client]) -> None:
+    asked = []
+
+    def answer(request: bytes) -> Iterator[bytes]:
+        asked.append(request.split()[1])
+        yield b"HTTP/1.1 302 Found\r\nLocation: /elsewhere\r\nContent-Length: 2\r\n\r\n{}"
+
+    assert engine(answer).info() == {}
+    assert asked == [b"/v1.41/info"]
+
+
+def test_events_come_one_by_one_and_their_silence_has_an_end(engine: Callable[..., Client]) -> None:
+    """The library waits for them without end: of a stream that was cut in silence nobody would know."""
+
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        yield b'b\r\n{"a": 1}\n{"\r\n9\r\na": 2}\r\n\n\r\n'
+
+    events = engine(answer, 1.0).events(decode=True)
+    assert [next(events), next(events)] == [{"a": 1}, {"a": 2}]
+    with pytest.raises((urllib3.exceptions.HTTPError, OSError)):
+        next(events)
+
+
+def test_a_message_that_never_ends_costs_no_memory(
+    engine: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clients, "_MOST_MESSAGE", 1 << 18)
+
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        yield from chunks(b"[" * 65_536)
+
+    assert list(engine(answer).events(decode=True)) == []
+
+
+def test_of_a_log_no_more_is_taken_at_once_than_a_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_get_raw_response_socket", "_disable_socket_timeout"):
+        monkeypatch.setattr(Client, name, lambda *_: None)
+    sent = b"\1\0\0\0\0\0\0\3one" + b"\2\0\0\0\0\0\0\3two" + b"\1\0\0\0\xff\xff\xff\xff" + b"x" * 200_000
+    answer: Any = SimpleNamespace(raw=io.BytesIO(sent))
+    with contextlib.closing(Client("unix:///nowhere", version="1.41", timeout=1)) as client:
+        pieces = list(client._multiplexed_response_stream_helper(answer))
+    assert pieces[:2] == [b"one", b"two"]
+    assert [len(piece) for piece in pieces[2:]] == [65_536, 65_536, 65_536, 200_000 - 3 * 65_536]
+
+
+def test_a_long_story_is_cut(engine: Callable[..., Client], tmp_path: Path) -> None:
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n" + b"X: " + b"y" * 100_000 + b"\r\n\r\n"
+
+    engine(answer)
+    ours = Engine(DockerOptions(engine=f"unix://{tmp_path}/engine.sock"))
+    with pytest.raises(SiteSilentError) as told:
+        ours.api()
+    assert len(str(told.value)) < 3000

@@ -1,0 +1,151 @@
+"""Following an engine that is staged: no engine needed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from queue import Queue
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from skytether.orchestrator.runtimes.docker.follow import Follower
+from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER
+
+PATIENCE = 10.0
+
+
+class Stream:
+    """Events until it is closed."""
+
+    def __init__(self) -> None:
+        self._queue: Queue[dict[str, Any] | None] = Queue()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return iter(self._queue.get, None)
+
+    def close(self) -> None:
+        self._queue.put(None)
+
+
+class StagedEngine:
+    """One container, which runs and is not ready until ``ready`` is set; nothing ever happens that is told."""
+
+    base_url, api_version, timeout = "http://engine", "1.41", 1.0
+
+    def __init__(self) -> None:
+        self.ready = threading.Event()
+        self.looks = Queue[bool]()
+        self.streams: list[Stream] = []
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        yield
+
+    def api(self, _timeout_s: float | None = None) -> StagedEngine:
+        return self
+
+    def drop(self) -> None:
+        """No connection is held."""
+
+    def info(self) -> dict[str, Any]:
+        return {"SystemTime": "2026-07-24T12:00:00.000000000Z"}
+
+    def containers(self, **_: Any) -> list[dict[str, Any]]:
+        return [{"Id": "c1", "Labels": {INSTANCE: "i1"}}]
+
+    def inspect_container(self, _container: str) -> dict[str, Any]:
+        labels = {INSTANCE: "i1", OWNER: "me", "skytether.io/attempt": "1"}
+        state = {"Status": "running", "ExitCode": 0, "OOMKilled": False}
+        return {
+            "Id": "c1",
+            "Config": {"Labels": labels},
+            "HostConfig": {"Memory": 0},
+            "NetworkSettings": {"Ports": {}},
+            "Mounts": [],
+            "State": state,
+        }
+
+    def events(self, **_: Any) -> Stream:
+        self.streams.append(Stream())
+        return self.streams[-1]
+
+    def stats(self, *_: Any, **__: Any) -> list[Any]:
+        return []
+
+    def head(self, *_: Any, **__: Any) -> Any:
+        ready = self.ready.is_set()
+        self.looks.put(ready)
+        return SimpleNamespace(status_code=HTTPStatus.OK if ready else HTTPStatus.NOT_FOUND)
+
+
+@pytest.fixture
+def engine() -> StagedEngine:
+    return StagedEngine()
+
+
+@pytest.fixture
+def follower(engine: StagedEngine) -> Iterator[Follower]:
+    staged: Any = engine
+    made = Follower(staged, "me", lambda: None, 5.0)
+    yield made
+    made.close()
+
+
+def test_what_was_started_before_and_is_not_ready_yet_is_seen_to_be_as_soon_as_it_is(
+    engine: StagedEngine, follower: Follower
+) -> None:
+    follower.start()
+    assert [seen.ready for seen in follower.seen(PATIENCE)] == [False]
+    engine.looks.get(timeout=PATIENCE)  # while it was connected to
+    engine.looks.get(timeout=PATIENCE)  # and on, though no event says anything
+    engine.ready.set()
+    while not engine.looks.get(timeout=PATIENCE):
+        pass
+    end = time.monotonic() + PATIENCE
+    while not follower.seen(PATIENCE)[0].ready:
+        assert time.monotonic() < end
+
+
+def test_what_a_silent_stream_has_not_told_is_found_by_the_next_list_and_only_that_is_looked_at(
+    engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[str] = []
+    state = {"State": "running", "Status": "Up 2 minutes"}
+    rows = [{"Id": "c1", "Labels": {INSTANCE: "i1"}, **state}]
+    inspect = engine.inspect_container
+
+    def inspected(container: str) -> dict[str, Any]:
+        looks.append(container)
+        found = inspect(container)
+        found["State"]["Status"] = rows[0]["State"]
+        return found
+
+    monkeypatch.setattr(engine, "containers", lambda **_: rows)
+    monkeypatch.setattr(engine, "inspect_container", inspected)
+    monkeypatch.setattr(engine, "logs", lambda *_, **__: b"", raising=False)
+    engine.ready.set()
+    follower.start()
+    assert [seen.status for seen in follower.seen(PATIENCE)] == ["running"]
+
+    def silent(times: int) -> None:
+        end = time.monotonic() + PATIENCE
+        while len(engine.streams) < times:
+            assert time.monotonic() < end
+            time.sleep(0.005)
+        engine.streams[-1].close()
+
+    silent(1)
+    silent(2)
+    assert looks == ["c1"]
+    rows[0] = {**rows[0], "State": "exited", "Status": "Exited (1)"}
+    silent(3)
+    end = time.monotonic() + PATIENCE
+    while follower.seen(PATIENCE)[0].status != "exited":
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    assert looks == ["c1", "c1"]
