@@ -132,6 +132,21 @@ def test_we_as_late_joiner_get_their_latched_messages(stage):
     stage.until(lambda: got[-1] == stage.cdr_string("four"), "a later publisher was not heard")
 
 
+def test_who_has_joined_knows_the_graph_on_a_busy_machine_too(stage, monkeypatch):
+    """The router tells the graph to the subscription, and then nothing new in its answer."""
+    stage.rmw("talker").publisher("/chatter", DDS_STRING, RIHS_STRING)
+    at_once = Ros2Node._on_token
+
+    def late(node, sample):
+        time.sleep(0.2)
+        at_once(node, sample)
+
+    monkeypatch.setattr(Ros2Node, "_on_token", late)
+    node = stage.ours()
+    assert node.wait_until_joined(30)
+    assert [e.node for e in node.endpoints("/chatter", Kind.PUBLISHER)] == ["/talker"]
+
+
 def test_another_type_hash_is_refused_and_both_are_named_once(stage):
     rmw, wrong = stage.rmw("talker"), "RIHS01_" + "0" * 64
     publish = rmw.publisher("/chatter", DDS_STRING, wrong)

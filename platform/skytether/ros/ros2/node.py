@@ -238,7 +238,9 @@ class Ros2Node:
         self._changes.clear()
         live = session.liveliness()
         token = live.declare_token(self.dialect.node_token(ours, self._name))
-        watch = live.declare_subscriber(self.dialect.watched, self._on_token, history=True)
+        # In Zenoh's own thread: what was told before an answer is known before the answer is.
+        on_token = zenoh.handlers.Callback(self._on_token, indirect=False)
+        watch = live.declare_subscriber(self.dialect.watched, on_token, history=True)
         try:
             patience = chain(_LOOK_S, repeat(_LOOK_S[-1]))
             whole = self._look_at_all(session, next(patience))
@@ -270,7 +272,10 @@ class Ros2Node:
             token.undeclare()  # type: ignore[no-untyped-call]
 
     def _look_at_all(self, session: zenoh.Session, patience_s: float) -> bool:
-        """Ask for what the subscription tells too; whether the answer is whole: who has joined knows all the graph."""
+        """Ask for the graph; whether the answer is whole: who has joined knows all of it.
+
+        The router tells each endpoint once: in this answer, or before it to the subscription.
+        """
         replies = list(session.liveliness().get(self.dialect.watched, timeout=patience_s))
         self._changes.extend((str(reply.ok.key_expr), True) for reply in replies if reply.ok is not None)
         if all(reply.ok is not None for reply in replies):
