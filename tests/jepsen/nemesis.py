@@ -42,8 +42,8 @@ class Fault(ABC):
         return self.random.uniform(1, 3)
 
     def leader(self) -> Member:
-        """The one that leads; any one that runs, if nobody does for long."""
-        wait_for(lambda: self.watcher.leaders, 20)
+        """The one that leads; any one that runs, if nobody does for long, or can: the database was broken first."""
+        wait_for(lambda: self.watcher.leaders or not self.watcher.answered, 20)
         leaders = self.watcher.leaders or [m.number for m in self.cluster.members if m.runs and not m.paused] or [0]
         return self.cluster.members[leaders[0]]
 
@@ -155,7 +155,8 @@ class Restart(_OfOne):
             if member.runs and not member.paused:
                 member.end()
                 member.spawn()
-                wait_for(member.ready, _PATIENCE)
+                # Without the database it ends at once; `Nemesis` starts it again when that is mended.
+                wait_for(lambda member=member: member.ready() or not member.runs, _PATIENCE)  # type: ignore[misc]
 
 
 class Update(Restart):
@@ -359,4 +360,8 @@ class Nemesis:
         self._history.add("fault", fault=told, step="over", well=well)
 
     def _well(self) -> bool:
+        """What has ended is started again, as a supervisor of services does."""
+        for member in self._cluster.members:
+            if not member.runs:
+                member.spawn()
         return bool(self._watcher.leaders) and all(member.ready() for member in self._cluster.members)

@@ -57,6 +57,8 @@ class Watcher:
         self._cluster, self._history = cluster, history
         self.leaders: list[int] = []
         """The one that leads by the database and its clock, and can: it is not dead, paused or cut off."""
+        self.answered = True
+        """Whether the database did when it was asked last who leads."""
         self._epochs: dict[int, int] = {}
         """Who led in each."""
         self._database: psycopg.Connection[tuple[int]] | None = None
@@ -106,7 +108,9 @@ class Watcher:
             row = self._database.execute(_LEADER).fetchone()
         except psycopg.Error:
             self._forget_database()
+            self.answered = False
             return 0
+        self.answered = True
         return row[0] if row else 0
 
     def _forget_database(self) -> None:

@@ -14,8 +14,10 @@ from reconcile_bench import Bench, add
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
-from skytether.orchestrator.clocks import SetClock
+from skytether.orchestrator.clocks import SetClock, SharedClock
 from skytether.orchestrator.records import Record
+from skytether.orchestrator.settings import Limits
+from skytether.orchestrator.store import Store
 from skytether.testing.runtimes import CrashingRuntime, NeverReadyRuntime
 
 NewRecord = Callable[..., Record]
@@ -94,6 +96,29 @@ def test_a_back_off_of_another_clock_is_not_waited_for(bench: Any, new_record: N
     b.clock.set_by(-HOURS)
     b.step(2)
     assert b.record().restarts == 3
+
+
+@either_way
+def test_ended_instances_are_kept_for_their_time_by_the_databases_clock_not_by_their_leaders(
+    tmp_path: Path, store: Store, clock: Any, new_record: NewRecord, by: float
+) -> None:
+    """One that the leader ended, and one that another orchestrator ended, whose machine's clock is right."""
+    shared: Any = SharedClock(clock, clock.steady, lambda: clock() + by)
+    shared.look()
+    shared.steady = clock.steady
+    b = Bench(tmp_path, store, shared)
+    b.reconciler._limits = Limits()
+    add(b, new_record())
+    add(b, new_record("elsewhere", state=State.STOPPED))
+    b.step(2)
+    b.store.change(b.record(), shared(), state=State.STOPPING, stopping_at=shared())
+    b.step(2)
+    clock.forward(Limits().ended_age - 1)
+    b.step()
+    assert [b.record(name).state for name in ("i1", "elsewhere")] == [State.STOPPED] * 2, "neither too early"
+    clock.forward(61)  # it looks once a minute
+    b.step()
+    assert [store.get(name) for name in ("i1", "elsewhere")] == [None] * 2, "nor too late"
 
 
 class Faked:
