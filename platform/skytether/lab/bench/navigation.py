@@ -1,0 +1,127 @@
+"""Benchmarks of the service ``navigation`` on recorded logs; the algorithms are found by entry point.
+
+The platform imports no service: what is measured belongs to whoever installs an entry point of the group
+``skytether.benches``, in ``pyproject.toml``::
+
+    [project.entry-points."skytether.benches"]
+    mapping = "skytether_services.navigation.bench_mapping:build"
+    localisation = "skytether_services.navigation.bench_localisation:run"
+
+Each is a function of plain arrays (a service cannot import `skytether.lab`): `MappingBench` and `LocalisationBench` are
+their shapes. To add the localisation bench, write that function and its line in ``pyproject.toml``, then reinstall
+(``pip install -e .``); `skytether lab bench localisation` calls it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+GROUP = "skytether.benches"
+
+Floats = NDArray[np.float64]
+
+
+class BuiltMap(Protocol):
+    """What mapping makes of a log."""
+
+    @property
+    def poses(self) -> Floats:
+        """Pose of the laser at each scan, n by (x [m], y [m], theta [rad])."""
+        ...
+
+    def save(self, path: Path) -> list[Path]:
+        """Write the occupancy map as YAML and PGM of map_server, and as PNG; the files that were written."""
+        ...
+
+
+class MappingBench(Protocol):
+    """The entry point ``mapping``."""
+
+    def __call__(
+        self,
+        *,
+        stamps: Floats,
+        ranges: NDArray[np.float32],
+        angles: Floats,
+        max_range: float,
+        odometry: Floats | None,
+        progress: Callable[[str], None],
+    ) -> BuiltMap:
+        """Build a map.
+
+        Args:
+            stamps: Of the scans, n, never falling [s].
+            ranges: n by rays [m]; NaN, and what is ``max_range`` or more, was not seen.
+            angles: Of the rays, anticlockwise from straight ahead [rad].
+            max_range: From here on a reading means that nothing was seen [m].
+            odometry: Pose of the robot by odometry at each scan, n by 3; None: from the laser only.
+            progress: Told now and then how far it is.
+        """
+        ...
+
+
+class LocalisationBench(Protocol):
+    """The entry point ``localisation``."""
+
+    def __call__(
+        self,
+        *,
+        stamps: Floats,
+        ranges: NDArray[np.float32],
+        angles: Floats,
+        max_range: float,
+        laser: Floats,
+        odometry: Floats,
+        seeds: Sequence[int],
+        progress: Callable[[str], None],
+    ) -> dict[str, Any]:
+        """Measure localisation.
+
+        Args:
+            stamps: Of the scans.
+            ranges: Of the scans.
+            angles: Of the rays.
+            max_range: Of the laser.
+            laser: Corrected pose of the laser at each scan, the truth.
+            odometry: Of the log. It may be but the laser's pose: add the noise to its increments.
+            seeds: One run for each.
+            progress: Told now and then how far it is.
+
+        Returns:
+            What is printed: ``position_mean_m, position_p95_m, heading_mean_deg, lost, seeds, update_p99_ms``.
+
+        Raises:
+            ValueError: The log is not good for it; the text says why.
+        """
+        ...
+
+
+class NavigationBenchError(Exception):
+    """The benchmark's algorithm cannot be had; the text says why and what to do."""
+
+
+def load(name: str) -> Any:
+    """Find an algorithm by the name of its entry point.
+
+    Raises:
+        NavigationBenchError: There is none of that name, or it cannot be imported.
+    """
+    found = {entry.name: entry for entry in entry_points(group=GROUP)}
+    if name not in found:
+        known = ", ".join(sorted(found)) or "none: is Skytether installed?"
+        raise NavigationBenchError(f"there is no benchmark '{name}'; known are: {known}")
+    try:
+        return found[name].load()
+    except ImportError as error:
+        raise NavigationBenchError(
+            f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}; "
+            "install the extra: pip install 'skytether[navigation]'"
+        ) from error
+    except Exception as error:  # whatever a broken plug-in raises at import
+        raise NavigationBenchError(f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}") from error
