@@ -203,17 +203,18 @@ def test_who_leads_asks_a_slow_database_no_more_than_it_must(postgres: str, monk
             assert (lock.hold() > 0, store.outdated(), store.now() > 0) == (True, False, True)
 
         look()
-        asked: list[str] = []
+        asked: list[tuple[str, float | None]] = []
         wait = Connection.wait
 
         def counted(connection: Connection, asking: Any, *rest: Any) -> Any:
             if "execute" in asking.__name__:
-                asked.append("autocommit" if connection.autocommit else "a transaction around it")
+                kind = "autocommit" if connection.autocommit else "a transaction around it"
+                asked.append((kind, connection.patience_s))
             return wait(connection, asking, *rest)
 
         monkeypatch.setattr(Connection, "wait", counted)
         look()
-        assert asked == ["autocommit"] * 3, "a round trip for each"
+        assert asked == [("autocommit", 2 * LEASE)] * 3, "a round trip for each, and no long wait for its answer"
         lock.release()
 
 

@@ -15,7 +15,7 @@ from skytether.api.rest import GateReport, Scope, SiteCreate
 
 from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
-from .leader import Lock, lock_of, look_at_fence
+from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
 from .models import facts, gates, robots, services, sites, stops, tokens
 from .security import TokenHash
 
@@ -98,7 +98,8 @@ class Database:
     def __init__(self, url: str, name: str = NAME) -> None:
         """``name`` is what a database server lists its connections under."""
         self._engine = make_engine(url, name)
-        self._apart = reading(make_engine(url, name, tried=False) if self.served else self._engine)
+        apart = make_engine(url, name, tried=False, patience_s=LEAD_PATIENCE_S) if self.served else self._engine
+        self._apart = reading(apart)
         """Connections of its own for who leads: a crowd of requests keeps those of the other waiting. Each statement is
         one round trip, for the lead is lost where a few of them take longer than it lasts."""
         self._reader = reading(self._engine)

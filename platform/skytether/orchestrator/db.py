@@ -69,7 +69,7 @@ def _address(url: str) -> URL:
         ) from error
 
 
-def make_engine(url: str, name: str = NAME, *, tried: bool = True) -> Engine:
+def make_engine(url: str, name: str = NAME, *, tried: bool = True, patience_s: float | None = None) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
@@ -77,7 +77,8 @@ def make_engine(url: str, name: str = NAME, *, tried: bool = True) -> Engine:
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
 
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
-    it under ``name``. Not ``tried``, a statement is answered sooner, and fails where the server was restarted.
+    it under ``name``. Not ``tried``, a statement is answered sooner, and fails where the server was restarted. A
+    connection without an answer for ``patience_s`` seconds is given up; None: after as long as a statement may take.
 
     Raises:
         AddressError: It is neither's address, or the driver is not installed.
@@ -93,7 +94,7 @@ def make_engine(url: str, name: str = NAME, *, tried: bool = True) -> Engine:
                 f"PostgreSQL's driver cannot be loaded ({error}): pip install 'skytether[postgres]', or use SQLite"
             ) from error
 
-        event.listen(made, "do_connect", Server().connect)
+        event.listen(made, "do_connect", Server(patience_s).connect)
         event.listen(made, "handle_error", stood_still)
         return made
     engine = create_engine(address, **_JSON)

@@ -34,6 +34,10 @@ LEASE = 2.0
 """Seconds that the lead lasts without being renewed: so long, and a look, is the gap after a leader that vanished."""
 _LOOK = 0.4
 """Seconds between two looks, of who leads and of who waits."""
+LEAD_PATIENCE_S = 2 * LEASE
+"""Seconds without an answer from the database after which whoever leads, or waits to, connects anew. Where all packets
+were lost for a while, TCP repeats what was lost after pauses that double: the old connection is the last to hear that
+the way is open again. Less, and a way that loses a third never gets a connection to stand."""
 _BELIEVED = LEASE - _LOOK
 """Seconds after a renewal was sent for which its sender takes itself for the leader: less than it is."""
 

@@ -21,7 +21,9 @@ _PATIENCE_S = STATEMENT_S + 2.0
 class Server:
     """Makes the connections to one server; while that hangs one at a time, and refuses others at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, patience_s: float | None = None) -> None:
+        """``patience_s``: for an answer; None: as long as a statement may take, and a little more."""
+        self._patience_s = patience_s or _PATIENCE_S
         self._trying = threading.Lock()
         self.hangs = False
 
@@ -47,7 +49,7 @@ class Server:
             self.hangs = True
             raise
         self.hangs = False
-        made.server = self
+        made.server, made.patience_s = self, self._patience_s
         return made
 
 
