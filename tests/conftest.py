@@ -49,7 +49,7 @@ TOGETHER = (
     "lab/test_bench_start.py",
     "lab/test_embedded.py",
     "lab/test_person.py",
-    "lab/test_world.py",
+    "lab/test_walk.py",
     "orchestrator/test_backup.py",
     "orchestrator/test_docker.py",
     "orchestrator/test_disk_full.py",

@@ -10,7 +10,7 @@ from skytether.lab.demo import WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.link import LinkEmulator
 from skytether.lab.trail import Trail
-from skytether.lab.world import World
+from skytether.lab.walk import World
 from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.command import Source
 from skytether.robot.tasks import TaskConfig

@@ -7,7 +7,7 @@ import pytest
 from skytether.lab.demo import WalkerBase
 from skytether.lab.measures import measure
 from skytether.lab.trail import Trail
-from skytether.lab.world import World
+from skytether.lab.walk import World
 from skytether.messages import Twist, Vector3, encode
 from skytether.robot.arbiter import Needs
 from skytether.robot.command import Source

@@ -8,7 +8,7 @@ import pytest
 from skytether.lab.measures import Measures, measure
 from skytether.lab.simulate import simulate
 from skytether.lab.trail import Trail
-from skytether.lab.world import STEP, World
+from skytether.lab.walk import STEP, World
 from skytether.messages import Message, Twist
 from skytether.testing.service import Harness
 from skytether_services.virtual_trail.service import VirtualTrail

@@ -28,7 +28,7 @@ from .link import LinkConditions, LinkEmulator
 from .measures import Judge, Measures, Sample
 from .plot import plot_walk
 from .trail import Trail
-from .world import STEP, World
+from .walk import STEP, World
 
 ROBOT = "walker"
 SERVICE = "virtual-trail"

@@ -11,7 +11,7 @@ from skytether.messages import Message, Twist
 from skytether.robot.command import Source
 
 from .measures import Sample
-from .world import STEP, World
+from .walk import STEP, World
 
 
 class Controller(Protocol):

@@ -23,7 +23,7 @@ from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
-from skytether.lab.world import World
+from skytether.lab.walk import World
 from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.command import Command, Source
 from skytether.robot.supervisor import Objection

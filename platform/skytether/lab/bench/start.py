@@ -15,7 +15,7 @@ from skytether.lab.bench.pair import BenchError
 from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
-from skytether.lab.world import World
+from skytether.lab.walk import World
 from skytether.robot.agent import Agent, AgentConfig
 
 _LIMIT_S = 60.0

@@ -5,8 +5,8 @@ from skytether.control.admittance import STANDSTILL, AdmittanceParams, Velocity,
 from skytether.lab.measures import Measures, measure
 from skytether.lab.simulate import simulate
 from skytether.lab.trail import Trail
+from skytether.lab.walk import STEP, World
 from skytether.lab.walker import WalkerParams
-from skytether.lab.world import STEP, World
 from skytether.messages import Message, Twist, Vector3, WrenchStamped, yaw_of
 
 TRAIL = Trail()
