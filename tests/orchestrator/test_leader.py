@@ -30,7 +30,7 @@ class Held:
     def __init__(self) -> None:
         self.epoch = 0
 
-    def hold(self) -> int:
+    def hold(self, above: int = 0) -> int:
         return self.epoch
 
     def release(self) -> None:
@@ -102,7 +102,7 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
 def test_a_renewal_that_took_long_counts_from_when_it_was_sent() -> None:
     one = Led()
 
-    def slow() -> int:
+    def slow(_: int) -> int:
         one.now += LEASE
         return 7
 
@@ -192,6 +192,34 @@ def test_a_leader_that_was_overtaken_in_the_middle_of_a_pass_leaves_it(
     other.release()
 
 
+def test_a_site_that_has_heard_of_an_epoch_that_is_to_come_is_led_in_a_later_one(
+    bench: Any, new_record: NewRecord, caplog: pytest.LogCaptureFixture
+) -> None:
+    b: Bench = bench()
+    add(b, new_record())
+    lock = b.store.lock()
+    first = lock.hold()
+    b.clock.forward(first + 100 - b.clock())
+    b.reconciler._lead = leadership = Leadership(lock, b.reconciler.owe_leases, b.clock.steady)
+
+    def led_after_a_site_heard_of(epoch: int) -> int:
+        b.runtime.world.epoch = epoch
+        for _ in range(2):
+            leadership.step()
+            b.step(3)
+        return leadership.epoch
+
+    assert led_after_a_site_heard_of(first + 50) == first, "it may be another leader's"
+    assert b.record().state is State.PENDING
+    later = led_after_a_site_heard_of(first + 5000)
+    assert later > first + 5000
+    assert b.record().state is State.RUNNING
+    assert f"heard of epoch {first + 5000}" in caplog.text
+    b.site.led = 0
+    assert led_after_a_site_heard_of(1 << 62) == later, "there is no such one"
+    lock.release()
+
+
 @pytest.mark.slow
 @pytest.mark.postgres
 def test_who_leads_asks_a_slow_database_no_more_than_it_must(postgres: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,6 +288,9 @@ def test_postgresql_gives_the_lead_to_one_and_to_the_next_when_it_is_not_renewed
     with stores[0]._writing() as connection:  # restored from a copy of when the same one led before
         connection.execute(text(f"UPDATE leadership SET epoch = {first}"))
     assert two.hold() > third, "no epoch that was"
+    later = two.hold(third + 5000)
+    assert later > third + 5000
+    assert (two.hold(third + 5000), two.hold(), one.hold(later)) == (later, later, 0)
     for lock, store in zip((one, two), stores, strict=True):
         lock.release()
         store.close()

@@ -45,6 +45,7 @@ _BELIEVED = LEASE - _LOOK
 # lead that would last for longer than any lasts is over: the database's clock was set back. Who finds another epoch
 # than its own beside its name leads in a new one: the database was restored from when it led before.
 _NOW = "extract(epoch FROM clock_timestamp())"
+# Where a site has heard of an epoch that is still to come, the database's clock was set back: a new one is above that.
 _TAKE = text(
     f"UPDATE leadership SET holder = :me, until = {_NOW} + :lease,"  # noqa: S608 (nothing of it comes from outside)
     " epoch = CASE WHEN holder = :me AND epoch = :mine THEN epoch"
@@ -54,8 +55,11 @@ _TAKE = text(
 _GIVE_UP = text("UPDATE leadership SET until = 0 WHERE holder = :me")
 _TAKE_FILE = text(
     "UPDATE leadership SET holder = :me,"
-    " epoch = max(epoch + 1, CAST(strftime('%s', 'now') AS INTEGER)) WHERE holder <> :me RETURNING epoch"
+    " epoch = max(epoch + 1, :above + 1, CAST(strftime('%s', 'now') AS INTEGER))"
+    " WHERE holder <> :me OR epoch <= :above RETURNING epoch"
 )
+_HIGHEST = 1 << 62
+"""An epoch that no leader had; the database has room for twice as much."""
 _EPOCH_NOW = select(leadership.c.epoch)
 _epoch: ContextVar[int] = ContextVar("epoch", default=0)
 
@@ -106,9 +110,15 @@ class Lead(Protocol):
         """As whose leader; 0: there can be no other one, or it does not lead."""
         ...
 
+    def rise_above(self, epoch: int) -> None:
+        """Lead on, if it leads, in an epoch after this one, of which a site has heard."""
+
 
 class _Alone:
     leads, epoch = True, 0
+
+    def rise_above(self, epoch: int) -> None:
+        """There is no epoch."""
 
 
 ALONE: Lead = _Alone()
@@ -118,8 +128,11 @@ ALONE: Lead = _Alone()
 class Lock(Protocol):
     """Held by one orchestrator at most."""
 
-    def hold(self) -> int:
-        """Take it, or keep it; gives the epoch. 0: another one has it, or the database does not answer."""
+    def hold(self, above: int = 0) -> int:
+        """Take it, or keep it; gives the epoch. 0: another one has it, or the database does not answer.
+
+        ``above``: the epoch is to be a later one than this; one that is not ends, and another begins.
+        """
 
     def release(self) -> None:
         """Let go; may be called without having it."""
@@ -135,12 +148,12 @@ class PostgresLock:
         self._mine = 0
         """The epoch in which it had the lead last."""
 
-    def hold(self) -> int:
+    def hold(self, above: int = 0) -> int:
         for _ in range(2):  # somebody may have ended the connection alone
             try:
                 if self._connection is None:
                     self._connection = self._engine.connect()
-                asked = self._me | {"lease": LEASE, "mine": self._mine}
+                asked = self._me | {"lease": LEASE, "mine": max(self._mine, above)}
                 self._mine = self._connection.scalar(_TAKE, asked) or 0
                 return self._mine
             except GONE:
@@ -171,8 +184,8 @@ class FileLock:
         self._me = {"me": secrets.token_hex(8)}
         self._held = 0
 
-    def hold(self) -> int:
-        if self._held:
+    def hold(self, above: int = 0) -> int:
+        if self._held > above:
             return self._held
         if self._path is not None and self._file is None:
             file = self._path.open("a")
@@ -182,8 +195,10 @@ class FileLock:
                 file.close()
                 return 0
             self._file = file
-        with contextlib.suppress(*GONE), self._engine.begin() as connection:
-            self._held = connection.scalar(_TAKE_FILE, self._me) or 0
+        with contextlib.suppress(*GONE):
+            with self._engine.begin() as connection:
+                epoch = connection.scalar(_TAKE_FILE, self._me | {"above": above}) or 0
+            self._held = epoch
         return self._held
 
     def release(self) -> None:
@@ -221,6 +236,7 @@ class Leadership:
         self._steady = steady
         self._held = _NOT_HELD
         """Epoch, and until when it takes itself for the leader; both at once, for other threads read them."""
+        self._above = 0
 
     @property
     def leads(self) -> bool:
@@ -233,10 +249,16 @@ class Leadership:
         epoch, until = self._held
         return epoch if self._steady() < until else 0
 
+    def rise_above(self, epoch: int) -> None:
+        """See ``Lead``; from any thread. What cannot be a leader's is left as it is."""
+        if self._above < epoch < _HIGHEST:
+            log.warning("a site has heard of epoch %d, which cannot be yet: the next one is above it", epoch)
+            self._above = epoch
+
     def step(self) -> float:
         """Take the lead, or renew it; returns seconds until the next look."""
         sent, led, before = self._steady(), self.leads, self._held[0]
-        epoch = self._lock.hold()
+        epoch = self._lock.hold(self._above)
         if not epoch:
             if before:
                 log.warning("this orchestrator leads no more: another one does, or the database does not answer")

@@ -348,6 +348,8 @@ class Reconciler:
             if due := whole and time.monotonic() - site.tidied_at >= _TIDY:
                 site.load = site.runtime.load()
         except RuntimeFailure as error:
+            if isinstance(error, OvertakenError) and error.epoch > self._clock():  # of no leader of this time
+                self._lead.rise_above(error.epoch)
             if str(error) != site.failure:
                 log.warning("site %s: %s", site.name, error)
             site.failure = str(error)

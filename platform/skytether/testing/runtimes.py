@@ -143,7 +143,7 @@ class FakeRuntime(Runtime):
     def _must_lead(self) -> None:
         self._answer()
         if 0 < self.epoch < self.world.epoch:
-            raise OvertakenError(f"site {self.site}: another orchestrator leads by now")
+            raise OvertakenError.by_leader(f"site {self.site}", self.world.epoch)
 
     def _answer(self) -> None:
         if self.silent:

@@ -119,10 +119,15 @@ class SiteSilentError(RuntimeFailure):
 class OvertakenError(RuntimeFailure):
     """Another orchestrator leads by now, or has begun a later run: nothing was done, and no service is to blame."""
 
+    epoch = 0
+    """Of the leader who was here; 0: not told."""
+
     @classmethod
-    def by_leader(cls, told: object) -> OvertakenError:
+    def by_leader(cls, told: object, epoch: int) -> OvertakenError:
         """Of a later epoch; ``told``: the file or object that says so."""
-        return cls(f"another orchestrator leads by now, says {told}: this one does nothing here any more")
+        error = cls(f"another orchestrator leads by now, says {told}: this one does nothing here any more")
+        error.epoch = epoch
+        return error
 
 
 class Runtime(ABC):

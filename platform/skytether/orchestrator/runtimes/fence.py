@@ -83,7 +83,7 @@ class Fence:
         except OSError as error:
             raise SiteSilentError(f"cannot read {self._epochs}, by which one leads here: {error}") from error
         if self._epoch and latest > self._epoch:
-            raise OvertakenError.by_leader(self._epochs / str(latest))
+            raise OvertakenError.by_leader(self._epochs / str(latest), latest)
 
     def _told(self) -> list[int]:
         try:

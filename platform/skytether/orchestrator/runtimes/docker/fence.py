@@ -60,7 +60,7 @@ class Fence:
     def _must_be_latest(self, epoch: int, there: Mapping[int, str]) -> None:
         latest = max(there, default=0)
         if latest > epoch:
-            raise OvertakenError.by_leader(f"the volume {there[latest]}")
+            raise OvertakenError.by_leader(f"the volume {there[latest]}", latest)
 
     def clear(self) -> None:
         """Leave nothing: the site is no more."""
