@@ -50,6 +50,7 @@ TOGETHER = (
     "lab/test_embedded.py",
     "lab/test_person.py",
     "lab/test_walk.py",
+    "lab/world/",
     "orchestrator/test_backup.py",
     "orchestrator/test_docker.py",
     "orchestrator/test_disk_full.py",
