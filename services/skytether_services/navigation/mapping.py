@@ -1,0 +1,321 @@
+"""Where a laser was at each scan of a drive through an unknown building: matching, loops, and a graph of poses.
+
+Three steps. `_Front` follows the laser from scan to scan, against a patch of map of the last keyframes. Loops are looked
+for as it goes on: what keyframes saw around themselves, against the patches of earlier ones near by. At the end each
+keyframe is matched once more against all passes near it, and the graph of all these motions is solved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .pose_graph import Edges, between, compose, optimise, wrapped
+from .scan_matching import Fit, Patch, make_patch, moved, rate, refine, scan_points, search, thin
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MappingParams:
+    """Settings of mapping.
+
+    Attributes:
+        usable_range: Points farther off are left out: a small error of the heading moves them far [m].
+        keyframe_m: A scan is kept as keyframe when the laser has moved so far [m].
+        keyframe_rad: Or has turned so far [rad].
+        window: Keyframes, back from the newest, that the next scan is matched against.
+        odometry_m: Error of the odometry's motion, for each metre [m/m].
+        odometry_rad: Error of its turn, for each radian [rad/rad].
+        loop_every: Every so many keyframes a loop is looked for.
+        loop_travel: Keyframes with less travel between them are no loop [m].
+        loop_reach: Drift for each metre of travel, within which a loop is looked for [m/m].
+        loop_most: The same, at most [m].
+        loop_score: Least part of the points that have to fit.
+        passes: How often all keyframes are matched anew at the end.
+    """
+
+    usable_range: float = 30.0
+    keyframe_m: float = 0.2
+    keyframe_rad: float = 0.15
+    window: int = 15
+    odometry_m: float = 0.1
+    odometry_rad: float = 0.1
+    loop_every: int = 4
+    loop_travel: float = 6.0
+    loop_reach: float = 0.03
+    loop_most: float = 5.0
+    loop_score: float = 0.6
+    passes: int = 2
+
+
+_INDEPENDENT = 0.02
+"""Part of a scan's points that err independently of their neighbours."""
+_FLOOR = np.diag([0.01**2, 0.01**2, 0.003**2])
+"""Covariance of a perfect match, in m², m², rad²: the map between two keyframes bends by so much."""
+_AROUND = 6
+"""Keyframes to each side that see one another's surroundings, for loops."""
+_MOVE_M, _MOVE_RAD = 0.5, 0.15
+"""A match at the end may not move a keyframe farther than this."""
+
+
+@dataclass
+class _Graph:
+    """Keyframes and the motions between them, as they grow."""
+
+    points: list[Floats] = field(default_factory=list)
+    poses: list[Floats] = field(default_factory=list)
+    travel: list[float] = field(default_factory=list)
+    scan: list[int] = field(default_factory=list)
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+    motions: list[Floats] = field(default_factory=list)
+    information: list[Floats] = field(default_factory=list)
+    loops: list[bool] = field(default_factory=list)
+
+    def add(self, first: int, second: int, pose_first: Floats, fit: Fit, loop: bool) -> None:
+        self.pairs.append((first, second))
+        self.motions.append(between(pose_first, fit.pose))
+        self.information.append(_turned(_damped(fit.information), pose_first[2]))
+        self.loops.append(loop)
+
+    def edges(self) -> Edges:
+        return Edges(
+            np.array(self.pairs), np.array(self.motions), np.array(self.information), np.array(self.loops, dtype=bool)
+        )
+
+    def solve(self) -> Floats:
+        """Moves the poses; returns the edges' errors."""
+        if len(self.poses) < 2:
+            return np.zeros(0)
+        poses, errors = optimise(np.array(self.poses), self.edges())
+        self.poses = list(poses)
+        return errors
+
+    def patch(self, keys: range | list[int] | NDArray[np.int64]) -> Patch:
+        return make_patch(np.vstack([moved(self.points[k], self.poses[k]) for k in keys]))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What mapping found.
+
+    Attributes:
+        poses: Of the laser at each scan, n by (x [m], y [m], theta [rad]); the first is the origin.
+        keyframes: Numbers of the scans that are in the graph.
+        loops: Number of motions in the graph that close a loop.
+    """
+
+    poses: Floats
+    keyframes: NDArray[np.int64]
+    loops: int
+
+
+def find_trajectory(
+    stamps: Floats,
+    ranges: NDArray[np.float32],
+    angles: Floats,
+    max_range: float,
+    odometry: Floats | None,
+    params: MappingParams | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Trajectory:
+    """Poses of the laser at all scans of a drive.
+
+    Args:
+        stamps: Of the scans, n [s].
+        ranges: n by rays [m].
+        angles: Of the rays [rad].
+        max_range: Ranges from here on, and NaN, met nothing [m].
+        odometry: Pose of the robot at each scan, n by 3; None: from the laser alone.
+        params: Settings.
+        progress: Told now and then how far it is.
+    """
+    params = params or MappingParams()
+    graph = _Graph()
+    raw = np.zeros((len(stamps), 3))  # as the front end saw it, relative to the keyframe before
+    owner = np.zeros(len(stamps), dtype=np.int64)
+    velocity = np.zeros(3)
+    pose = np.zeros(3)
+    far = min(max_range, params.usable_range)
+    patch: Patch | None = None
+    looked = 0
+    for i in range(len(stamps)):
+        points = scan_points(ranges[i], angles, far)
+        dt = stamps[i] - stamps[i - 1] if i else 0.0
+        if patch is None:
+            fit = Fit(pose, np.zeros((3, 3)), 1.0, 0.0)
+        else:
+            motion = between(odometry[i - 1], odometry[i]) if odometry is not None else velocity * dt
+            fit = _follow(patch, points, pose, motion, dt, odometry is not None, params)
+        if i and dt > 1e-3 and odometry is None:
+            velocity = np.clip(between(pose, fit.pose) / dt, [-2, -2, -2], [2, 2, 2])
+        pose = fit.pose
+        new = patch is None and len(points) >= 10
+        if graph.poses:
+            since = between(graph.poses[-1], pose)
+            new = bool(
+                np.hypot(since[0], since[1]) > params.keyframe_m or abs(since[2]) > params.keyframe_rad
+            ) and len(points) >= 10
+        if new:
+            last = len(graph.poses) - 1
+            graph.points.append(thin(points, 0.05))
+            graph.travel.append(graph.travel[-1] + float(np.hypot(since[0], since[1])) if last >= 0 else 0.0)
+            graph.scan.append(i)
+            graph.poses.append(pose)
+            if last >= 0:
+                prior = _odometry_information(since, params)
+                graph.add(last, last + 1, graph.poses[last], _held(fit, prior), False)
+            if last + 1 - looked >= 20:
+                looked = last + 1
+                if _close_loops(graph, looked - 20 - _AROUND, looked - _AROUND, params):
+                    graph.solve()
+                    pose = graph.poses[-1]
+                progress(f"scan {i + 1} of {len(stamps)}, {sum(graph.loops)} loops")
+            patch = graph.patch(range(max(0, len(graph.poses) - params.window), len(graph.poses)))
+        owner[i] = max(len(graph.poses) - 1, 0)
+        raw[i] = between(graph.poses[-1], pose) if graph.poses else pose
+    _close_loops(graph, looked - _AROUND, len(graph.poses), params)
+    graph.solve()
+    for turn in range(params.passes):
+        progress(f"all {len(graph.poses)} keyframes once more: {turn + 1} of {params.passes}")
+        graph = _matched_anew(graph, params)
+        graph.solve()
+    return Trajectory(_all_poses(graph, raw, owner), np.array(graph.scan), sum(graph.loops))
+
+
+def _follow(
+    patch: Patch, points: Floats, pose: Floats, motion: Floats, dt: float, measured: bool, params: MappingParams
+) -> Fit:
+    """Match the next scan, from where odometry, or the velocity before, says that it was taken."""
+    guess = compose(pose, motion)
+    if len(points) < 10:
+        return Fit(guess, np.zeros((3, 3)), 0.0, 0.0)
+    if measured:
+        prior = _odometry_information(motion, params)
+    else:
+        prior = np.diag([0.1**-2, 0.1**-2, 0.2**-2])
+    prior = _turned(prior, -pose[2])
+    fit = refine(patch, points, guess, prior)
+    if measured and fit.overlap > 0.5:
+        return fit
+    size, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    reach = (0.1 + 0.5 * size, 0.05 + 0.5 * turn) if measured else (min(0.1 + 0.6 * dt, 0.5), min(0.1 + 1.5 * dt, 0.6))
+    start, _ = search(patch, thin(points, 0.1), guess, reach[0], reach[1])
+    other = refine(patch, points, start, prior * 0.01)
+    return other if rate(patch, points, other.pose) > rate(patch, points, fit.pose) else fit
+
+
+def _close_loops(graph: _Graph, first: int, last: int, params: MappingParams) -> int:
+    """Look for loops at the keyframes from first up to last; returns how many there were."""
+    found = 0
+    travel = np.array(graph.travel)
+    for k in range(max(first, 0), last):
+        if k % params.loop_every:
+            continue
+        keys = range(max(0, k - _AROUND), min(len(graph.poses), k + _AROUND + 1))
+        seen = np.vstack([_of(graph, key, k) for key in keys])
+        seen = thin(seen, 0.1)
+        for j in _near(graph, k, params.loop_reach * (travel[k] - travel) + 0.5, params, most=params.loop_most)[:2]:
+            gap = travel[k] - travel[j]
+            reach = min(0.5 + params.loop_reach * gap, params.loop_most)
+            target = graph.patch(range(max(0, j - _AROUND - 4), min(j + _AROUND + 5, k - _AROUND)))
+            pose, score = search(
+                target, seen, graph.poses[k], reach, min(0.1 + 0.003 * gap, 0.5), params.loop_score
+            )
+            if score <= 0:
+                continue
+            fit = refine(target, seen, pose)
+            if rate(target, seen, fit.pose) >= params.loop_score and fit.overlap > 0.5:
+                graph.add(j, k, graph.poses[j], fit, True)
+                found += 1
+    return found
+
+
+def _of(graph: _Graph, key: int, k: int) -> Floats:
+    """The points of a keyframe in the frame of another."""
+    return moved(graph.points[key], between(graph.poses[k], graph.poses[key]))
+
+
+def _near(
+    graph: _Graph, k: int, reach: Floats | float, params: MappingParams, most: float, ahead: bool = False
+) -> list[int]:
+    """Keyframes of other passes near keyframe k, the nearest of each pass, nearest first."""
+    poses, travel = np.array(graph.poses), np.array(graph.travel)
+    away = np.hypot(poses[:, 0] - poses[k, 0], poses[:, 1] - poses[k, 1])
+    gap = travel[k] - travel
+    apart = (np.abs(gap) if ahead else gap) > params.loop_travel
+    candidates = np.flatnonzero(apart & (away <= np.minimum(reach, most)))
+    chosen: list[int] = []
+    for j in candidates[np.argsort(away[candidates])].tolist():
+        if all(abs(travel[j] - travel[other]) > params.loop_travel / 2 for other in chosen):
+            chosen.append(j)
+    return chosen
+
+
+def _matched_anew(graph: _Graph, params: MappingParams) -> _Graph:
+    """The same keyframes, each matched against the one before it and against the other passes near it."""
+    result = _Graph(graph.points, list(graph.poses), graph.travel, graph.scan)
+    seen = {pair: n for n, pair in enumerate(graph.pairs)}
+    for k in range(1, len(graph.poses)):
+        points, pose = graph.points[k], graph.poses[k]
+        before = seen[(k - 1, k)]
+        prior = _odometry_information(graph.motions[before], params)
+        guess = compose(graph.poses[k - 1], graph.motions[before])
+        target = graph.patch(range(max(0, k - params.window), k))
+        fit = refine(target, points, pose, np.zeros((3, 3)))
+        if fit.overlap < 0.3 or not _close(fit.pose, pose):
+            fit = Fit(guess, np.zeros((3, 3)), 0.0, 0.0)
+        result.add(k - 1, k, graph.poses[k - 1], _held(fit, prior), False)
+        for j in _near(graph, k, 4.0, params, most=4.0, ahead=True)[:3]:
+            low, high = max(0, j - _AROUND), min(j + _AROUND + 1, len(graph.poses))
+            fit = refine(graph.patch(range(low, high)), points, pose)
+            if fit.overlap >= 0.5 and _close(fit.pose, pose):
+                result.add(j, k, graph.poses[j], fit, True)
+    return result
+
+
+def _close(a: Floats, b: Floats) -> bool:
+    return bool(np.hypot(a[0] - b[0], a[1] - b[1]) < _MOVE_M and abs(wrapped(a[2] - b[2])) < _MOVE_RAD)
+
+
+def _held(fit: Fit, odometry: Floats) -> Fit:
+    """The fit, never weaker than the odometry's motion."""
+    return Fit(fit.pose, fit.information + odometry / _INDEPENDENT, fit.overlap, fit.residual)
+
+
+def _odometry_information(motion: Floats, params: MappingParams) -> Floats:
+    """Information of a motion by odometry, in the frame where it began."""
+    size, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    # The laser is not where the robot turns about: 0.2 m off.
+    sigma = 0.01 + params.odometry_m * size + 0.2 * turn
+    sigma_turn = 0.005 + params.odometry_rad * turn + 0.02 * size
+    return np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
+
+
+def _damped(information: Floats) -> Floats:
+    """The information of a match of points that do not err independently, on a map that bends."""
+    loose = information * _INDEPENDENT + np.diag([1e-3, 1e-3, 1e-3])
+    return np.linalg.inv(np.linalg.inv(loose) + _FLOOR)
+
+
+def _turned(information: Floats, angle: float) -> Floats:
+    """Information of the map frame in one that is turned by the angle."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    return turn.T @ information @ turn
+
+
+def _all_poses(graph: _Graph, raw: Floats, owner: NDArray[np.int64]) -> Floats:
+    """Poses of all scans: as seen from the keyframe before, and, the nearer it is, from the one behind."""
+    if not graph.poses:
+        return raw
+    keys, scans = np.array(graph.poses), np.array(graph.scan)
+    before = compose(keys[owner], raw)
+    poses = before.copy()
+    behind = np.minimum(owner + 1, len(keys) - 1)
+    # What the front end saw of the next keyframe, from the one before.
+    share = (np.arange(len(raw)) - scans[owner]) / np.maximum(scans[behind] - scans[owner], 1)
+    return poses
