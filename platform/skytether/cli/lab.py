@@ -9,6 +9,7 @@ import typer
 
 from .lab_failover import alarms, failover
 from .lab_hostile import hostile
+from .lab_navigation import localisation, mapping
 from .lab_safety import safety
 from .output import console, fail, print_json, silenced
 
@@ -17,6 +18,8 @@ bench = typer.Typer(help="Measure the real program, and print what was measured.
 app.add_typer(bench, name="bench")
 bench.command("safety")(safety)
 bench.command("hostile")(hostile)
+bench.command("mapping")(mapping)
+bench.command("localisation")(localisation)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 

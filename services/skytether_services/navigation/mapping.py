@@ -156,9 +156,10 @@ def find_trajectory(
         new = patch is None and len(points) >= 10
         if graph.poses:
             since = between(graph.poses[-1], pose)
-            new = bool(
-                np.hypot(since[0], since[1]) > params.keyframe_m or abs(since[2]) > params.keyframe_rad
-            ) and len(points) >= 10
+            new = (
+                bool(np.hypot(since[0], since[1]) > params.keyframe_m or abs(since[2]) > params.keyframe_rad)
+                and len(points) >= 10
+            )
         if new:
             last = len(graph.poses) - 1
             graph.points.append(thin(points, 0.05))
@@ -222,9 +223,7 @@ def _close_loops(graph: _Graph, first: int, last: int, params: MappingParams) ->
             gap = travel[k] - travel[j]
             reach = min(0.5 + params.loop_reach * gap, params.loop_most)
             target = graph.patch(range(max(0, j - _AROUND - 4), min(j + _AROUND + 5, k - _AROUND)))
-            pose, score = search(
-                target, seen, graph.poses[k], reach, min(0.1 + 0.003 * gap, 0.5), params.loop_score
-            )
+            pose, score = search(target, seen, graph.poses[k], reach, min(0.1 + 0.003 * gap, 0.5), params.loop_score)
             if score <= 0:
                 continue
             fit = refine(target, seen, pose)
@@ -305,17 +304,10 @@ def _turned(information: Floats, angle: float) -> Floats:
     """Information of the map frame in one that is turned by the angle."""
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return turn.T @ information @ turn
+    result: Floats = turn.T @ information @ turn
+    return result
 
 
 def _all_poses(graph: _Graph, raw: Floats, owner: NDArray[np.int64]) -> Floats:
-    """Poses of all scans: as seen from the keyframe before, and, the nearer it is, from the one behind."""
-    if not graph.poses:
-        return raw
-    keys, scans = np.array(graph.poses), np.array(graph.scan)
-    before = compose(keys[owner], raw)
-    poses = before.copy()
-    behind = np.minimum(owner + 1, len(keys) - 1)
-    # What the front end saw of the next keyframe, from the one before.
-    share = (np.arange(len(raw)) - scans[owner]) / np.maximum(scans[behind] - scans[owner], 1)
-    return poses
+    """Poses of all scans, each as it was seen from the keyframe before it."""
+    return compose(np.array(graph.poses)[owner], raw) if graph.poses else raw

@@ -1,4 +1,4 @@
-"""Poses from motions between them: least squares on a sparse graph, with a robust kernel for loops that may be wrong."""
+"""Poses from motions between them: least squares on a sparse graph, robust against loops that are wrong."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Finding where a laser scan was taken: against a patch of map that other scans made.
 
 A `Patch` is a grid that knows, around each surface, how near and which the nearest piece of surface is. `search` looks
-through a window of poses by the likelihood field of it, from coarse to fine (Olson, Real-time correlative scan matching,
-2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine` moves points onto lines
+through a window of poses by the likelihood field of it, from coarse to fine (Olson, Real-time correlative scan
+matching, 2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine` moves points onto lines
 (Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [m], y [m], theta [rad]).
 """
 
@@ -65,7 +65,9 @@ def make_patch(points: Floats) -> Patch:
 
 
 @compiled
-def _fill(points, x0, y0, rows, columns, cell, reach, sigma, merge):  # type: ignore[no-untyped-def]
+def _fill(
+    points: Floats, x0: float, y0: float, rows: int, columns: int, cell: float, reach: int, sigma: float, merge: int
+) -> tuple[NDArray[np.uint8], NDArray[np.int32], Floats]:
     wide, high = columns // merge + 1, rows // merge + 1
     number = np.full((high, wide), -1, np.int32)
     sums = np.zeros((points.shape[0], 5))
@@ -115,7 +117,9 @@ def _fill(points, x0, y0, rows, columns, cell, reach, sigma, merge):  # type: ig
 
 
 @compiled
-def _score(score, x0, y0, cell, points, x, y, theta):  # type: ignore[no-untyped-def]
+def _score(
+    score: NDArray[np.uint8], x0: float, y0: float, cell: float, points: Floats, x: float, y: float, theta: float
+) -> float:
     cos, sin = np.cos(theta), np.sin(theta)
     rows, columns = score.shape
     total = 0
@@ -167,7 +171,7 @@ def search(
 
 
 @compiled
-def _pyramid(score, levels):  # type: ignore[no-untyped-def]
+def _pyramid(score: NDArray[np.uint8], levels: int) -> NDArray[np.uint8]:
     """Level h holds at (r, c) the largest score of [r, r + 2^h) by [c, c + 2^h), and begins 2^h - 1 cells earlier."""
     rows, columns = score.shape
     margin = 2**levels - 1
@@ -186,7 +190,18 @@ def _pyramid(score, levels):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _branch(pyramid, x0, y0, cell, points, guess, turns, turn, cells, at_least):  # type: ignore[no-untyped-def]
+def _branch(
+    pyramid: NDArray[np.uint8],
+    x0: float,
+    y0: float,
+    cell: float,
+    points: Floats,
+    guess: Floats,
+    turns: int,
+    turn: float,
+    cells: int,
+    at_least: float,
+) -> Floats:
     levels = pyramid.shape[0] - 1
     margin = 2**levels - 1
     n = points.shape[0]
@@ -251,7 +266,9 @@ def _branch(pyramid, x0, y0, cell, points, guess, turns, turn, cells, at_least):
 
 
 @compiled
-def _bound(pyramid, level, us, vs, dc, dr):  # type: ignore[no-untyped-def]
+def _bound(
+    pyramid: NDArray[np.uint8], level: int, us: NDArray[np.int32], vs: NDArray[np.int32], dc: int, dr: int
+) -> float:
     rows, columns = pyramid.shape[1], pyramid.shape[2]
     total = 0
     for i in range(us.size):
@@ -305,7 +322,18 @@ def refine(
 
 
 @compiled
-def _gauss_newton(nearest, surfaces, x0, y0, cell, points, guess, prior, sigma, iterations):  # type: ignore[no-untyped-def]
+def _gauss_newton(
+    nearest: NDArray[np.int32],
+    surfaces: Floats,
+    x0: float,
+    y0: float,
+    cell: float,
+    points: Floats,
+    guess: Floats,
+    prior: Floats,
+    sigma: float,
+    iterations: int,
+) -> tuple[Floats, Floats, float, float]:
     rows, columns = nearest.shape
     pose = guess.copy()
     h = np.zeros((3, 3))
@@ -369,9 +397,7 @@ def _gauss_newton(nearest, surfaces, x0, y0, cell, points, guess, prior, sigma, 
     return pose, h, used / max(points.shape[0], 1), np.sqrt(square / max(used, 1))
 
 
-def scan_points(
-    ranges: NDArray[np.float32], angles: Floats, max_range: float, min_range: float = 0.05
-) -> Floats:
+def scan_points(ranges: NDArray[np.float32], angles: Floats, max_range: float, min_range: float = 0.05) -> Floats:
     """A scan as points with normals.
 
     Args:
@@ -383,11 +409,11 @@ def scan_points(
     Returns:
         n by (x, y, nx, ny) in the frame of the laser. Normals look at the laser; (0, 0): the neighbours are no line.
     """
-    return _points(ranges.astype(np.float64), angles, max_range, min_range)  # type: ignore[no-any-return]
+    return _points(ranges.astype(np.float64), angles, max_range, min_range)
 
 
 @compiled
-def _points(ranges, angles, max_range, min_range):  # type: ignore[no-untyped-def]
+def _points(ranges: Floats, angles: Floats, max_range: float, min_range: float) -> Floats:
     n = ranges.size
     out = np.zeros((n, 4))
     kept = 0
@@ -430,7 +456,8 @@ def thin(points: Floats, cell: float) -> Floats:
     """At most one point for each cell of that size [m]: near surfaces have no more say than far ones."""
     keys = np.floor(points[:, :2] / cell).astype(np.int64)
     _, first = np.unique(keys[:, 0] * 2_000_003 + keys[:, 1], return_index=True)
-    return points[np.sort(first)]
+    kept: Floats = points[np.sort(first)]
+    return kept
 
 
 def moved(points: Floats, pose: Floats) -> Floats:

@@ -17,10 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from skytether.lab.carmen import CarmenLog
 
 GROUP = "skytether.benches"
 
@@ -125,3 +127,25 @@ def load(name: str) -> Any:
         ) from error
     except Exception as error:  # whatever a broken plug-in raises at import
         raise NavigationBenchError(f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}") from error
+
+
+def bench_localisation(log: CarmenLog, seeds: Sequence[int], progress: Callable[[str], None]) -> dict[str, Any]:
+    """Call the entry point ``localisation`` with a log.
+
+    Raises:
+        NavigationBenchError: It is not installed, or the log is not good for it.
+    """
+    run = cast(LocalisationBench, load("localisation"))
+    try:
+        return run(
+            stamps=log.stamps,
+            ranges=log.ranges,
+            angles=log.angles,
+            max_range=log.max_range,
+            laser=log.laser,
+            odometry=log.odometry,
+            seeds=seeds,
+            progress=progress,
+        )
+    except ValueError as error:
+        raise NavigationBenchError(str(error)) from error
