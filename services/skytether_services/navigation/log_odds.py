@@ -1,4 +1,4 @@
-"""An occupancy grid from scans at known poses: the odds of each cell, by the beams through it and those that end there."""
+"""An occupancy grid from scans at known poses: beams that cross a cell, and beams that end there, make its odds."""
 
 from __future__ import annotations
 

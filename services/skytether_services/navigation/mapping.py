@@ -1,8 +1,8 @@
 """Where a laser was at each scan of a drive through an unknown building: matching, loops, and a graph of poses.
 
-Three steps. `_Front` follows the laser from scan to scan, against a patch of map of the last keyframes. Loops are looked
-for as it goes on: what keyframes saw around themselves, against the patches of earlier ones near by. At the end each
-keyframe is matched once more against all passes near it, and the graph of all these motions is solved.
+Three steps. `_follow` matches scan after scan against a patch of map of the last keyframes. Loops are looked for as it
+goes on: what keyframes saw around themselves, against the patches of earlier ones near by. At the end each keyframe is
+matched once more against all passes near it, and the graph of all these motions is solved.
 """
 
 from __future__ import annotations
@@ -145,10 +145,12 @@ def find_trajectory(
     for i in range(len(stamps)):
         points = scan_points(ranges[i], angles, far)
         dt = stamps[i] - stamps[i - 1] if i else 0.0
+        motion = velocity * dt
+        if odometry is not None and i:
+            motion = between(odometry[i - 1], odometry[i])
         if patch is None:
-            fit = Fit(pose, np.zeros((3, 3)), 1.0, 0.0)
+            fit = Fit(compose(pose, motion), np.zeros((3, 3)), 1.0, 0.0)
         else:
-            motion = between(odometry[i - 1], odometry[i]) if odometry is not None else velocity * dt
             fit = _follow(patch, points, pose, motion, dt, odometry is not None, params)
         if i and dt > 1e-3 and odometry is None:
             velocity = np.clip(between(pose, fit.pose) / dt, [-2, -2, -2], [2, 2, 2])
@@ -194,11 +196,8 @@ def _follow(
     guess = compose(pose, motion)
     if len(points) < 10:
         return Fit(guess, np.zeros((3, 3)), 0.0, 0.0)
-    if measured:
-        prior = _odometry_information(motion, params)
-    else:
-        prior = np.diag([0.1**-2, 0.1**-2, 0.2**-2])
-    prior = _turned(prior, -pose[2])
+    by_velocity = np.diag([0.1**-2, 0.1**-2, 0.2**-2])
+    prior = _turned(_odometry_information(motion, params) if measured else by_velocity, -pose[2])
     fit = refine(patch, points, guess, prior)
     if measured and fit.overlap > 0.5:
         return fit

@@ -2,8 +2,8 @@
 
 A `Patch` is a grid that knows, around each surface, how near and which the nearest piece of surface is. `search` looks
 through a window of poses by the likelihood field of it, from coarse to fine (Olson, Real-time correlative scan
-matching, 2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine` moves points onto lines
-(Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [m], y [m], theta [rad]).
+matching, 2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine` moves points onto
+lines (Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [m], y [m], theta [rad]).
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _score(
         r = int(np.floor((y + sin * points[i, 0] + cos * points[i, 1] - y0) / cell))
         if 0 <= c < columns and 0 <= r < rows:
             total += score[r, c]
-    return total / (255.0 * points.shape[0])
+    return float(total / (255.0 * points.shape[0]))
 
 
 def rate(patch: Patch, points: Floats, pose: Floats) -> float:
