@@ -11,11 +11,13 @@ from .lab_failover import alarms, failover
 from .lab_hostile import hostile
 from .lab_navigation import localisation, mapping
 from .lab_safety import safety
+from .lab_world import world
 from .output import console, fail, print_json, silenced
 
 app = typer.Typer(help="Experiments and benchmarks on this machine.", no_args_is_help=True)
 bench = typer.Typer(help="Measure the real program, and print what was measured.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+app.command("world")(world)
 bench.command("safety")(safety)
 bench.command("hostile")(hostile)
 bench.command("mapping")(mapping)
