@@ -53,7 +53,7 @@ class Control:
 
 
 class Controller(Protocol):
-    """MPPI and DWA; others may join."""
+    """What every controller does; MPPI is one."""
 
     def set_path(self, path: NDArray[np.float64]) -> None:
         """Follow another path: x [m], y [m], yaw [rad], n by 3, evenly spaced, in the costmap's frame. Empty: none."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .compiled import compiled
-from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
+from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams, cost_of_distance
 from .geometry import Pose
 
 # Machine code knows a module's own constants only.
@@ -156,3 +156,22 @@ def cost_at(costmap: Costmap, footprint: Footprint, pose: Pose) -> int:
     cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
     x, y = costmap.origin
     return footprint_cost(costmap.costs, costmap.resolution, x, y, pose.x, pose.y, cos, sin, samples, 0)
+
+
+class FootprintChecks:
+    """What ``footprint_cost`` needs, for one footprint and costmaps of one inflation."""
+
+    def __init__(self, footprint: Footprint, inflation: InflationParams) -> None:
+        self._footprint, self._inflation = footprint, inflation
+        self._known: tuple[float, NDArray[np.float64], int] | None = None
+
+    def on(self, costmap: Costmap) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+        """Frame of the costmap (resolution, x, y of its corner [m]), samples, and the cost to check them from."""
+        resolution = costmap.resolution
+        if self._known is None or self._known[0] != resolution:
+            # A cell more: both the centre and the obstacle may be anywhere in theirs.
+            reach = self._footprint.circumscribed + resolution
+            cost = cost_of_distance(reach, self._footprint.inscribed, self._inflation.decay)
+            check_from = cost if reach <= self._inflation.radius else 0
+            self._known = (resolution, self._footprint.samples(resolution), check_from)
+        return np.array([resolution, *costmap.origin]), self._known[1], self._known[2]
