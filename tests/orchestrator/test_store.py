@@ -3,7 +3,10 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -236,6 +239,40 @@ def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_
         live = store.change(live, NOW, reason=str(number)) or live
     store.prune(NOW, ended_age=100, ended_count=2, events_count=3)
     assert [e.reason for e in store.events("live", 0)] == ["7", "8", "9"]
+
+
+def test_an_instance_is_replaced_by_one_at_a_time(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("old"), "operator", None, "")
+    spare = store.add(new_record("spare", robot="", spare=True), "", None, "")
+    first = store.add(new_record("first", replaces="old"), "operator", None, "")
+    assert store.add(new_record("second", replaces="old"), "operator", None, "") == first
+    assert store.get("second") is None
+    taken = {"robot": "walker", "replaces": "old"}
+    assert store.claim(spare, taken, NOW, "", None, "") is None
+    assert store.change(first, NOW, state=State.STOPPED) is not None
+    assert store.claim(spare, taken, NOW, "", None, "") is not None, "the first one serves no more"
+
+
+@pytest.mark.slow
+@pytest.mark.postgres
+def test_two_orchestrators_that_replace_an_instance_at_once_make_one_successor(
+    postgres: str, new_record: NewRecord
+) -> None:
+    with closing(Store(postgres)) as one, closing(Store(postgres)) as other:
+        one.migrate()
+        one.add(new_record("old"), "operator", None, "")
+        with ThreadPoolExecutor() as pool:
+            for turn in range(20):
+                begin = Barrier(2)
+
+                def add(store: Store, name: str, begin: Barrier = begin) -> Record:
+                    begin.wait(30)
+                    return store.add(new_record(name, replaces="old"), "operator", None, "")
+
+                made = [pool.submit(add, store, f"{turn} {store is one}") for store in (one, other)]
+                first, second = (future.result(30) for future in made)
+                assert first == second
+                assert one.change(first, NOW, state=State.STOPPED) is not None
 
 
 def test_event_ids_never_come_again(store: Store, new_record: NewRecord) -> None:

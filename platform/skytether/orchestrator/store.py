@@ -87,6 +87,8 @@ _SUCCESSOR = (
 )
 _SUCCEEDS = _SUCCESSOR.scalar_subquery().label("successor")
 """Not by the renewed row's own id: names after RETURNING lose their table's on SQLite, and would be the subquery's."""
+_SUCCEED = text("SELECT pg_advisory_xact_lock(hashtextextended(:instance, 0))")
+"""Not a lock of its row: who extends all leases locks rows in any order."""
 _LOCKED_ACCOUNTS = (
     select(accounts)
     .where(accounts.c.robot.in_(bindparam("robots", expanding=True)))
@@ -186,12 +188,16 @@ class Store(Database):
     def add(self, record: Record, owner: str, key: str | None, body_sha256: str) -> Record:
         """Store a new instance; if another request with the same idempotency key was quicker, give back its one.
 
+        So it is with a successor, if another one of the same instance serves by now.
+
         Raises:
             KeyReusedError: The key was used with another body.
         """
         record = record.after({"key_id": self.key_id()})
         try:
             with self._writing() as connection:
+                if (coming := self._coming(connection, record.replaces)) is not None:
+                    return _record(connection.execute(_INSTANCE, {"instance": coming}).mappings().one())
                 connection.execute(insert(instances).values(**_values(record)))
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": record.id}
@@ -301,11 +307,13 @@ class Store(Database):
     def claim(
         self, spare: Record, changes: dict[str, Any], now: float, owner: str, key: str | None, body_sha256: str
     ) -> Record | None:
-        """Give a spare to a robot; None if another request was quicker."""
+        """Give a spare to a robot; None if another request was quicker, or what it would replace has a successor."""
         changes = {**changes, "version": spare.version + 1, "updated_at": now, "spare": False}
         new = spare.after(changes)
         try:
             with self._writing() as connection:
+                if self._coming(connection, new.replaces) is not None:
+                    return None
                 if connection.execute(_CHANGE, {**changes, **_as_seen(spare)}).rowcount == 0:
                     return None
                 if key is not None:
@@ -316,6 +324,14 @@ class Store(Database):
             return None  # the same request came twice at once: the other one has it
         self.on_change(new.id)
         return new
+
+    def _coming(self, connection: Connection, replaced: str | None) -> str | None:
+        """The successor of an instance that is to get one; whoever else is about to give it one waits meanwhile."""
+        if replaced is None:
+            return None
+        if self.served:
+            connection.execute(_SUCCEED, {"instance": replaced})
+        return connection.scalar(_SUCCESSOR, {"instance": replaced})
 
     def hand_out(self, instance: str, claim_sha256: str) -> bool:
         """Note who gets the key of an instance's session; False if somebody else has it."""
