@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,10 @@ def world(
     field: Annotated[
         int | None, typer.Option(min=0, max=49, help="Only draw this field of cylinders, with its shortest way.")
     ] = None,
+    live: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Show it in real time in a browser, on this port; 0: any free one."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object, and nothing else.")] = False,
 ) -> None:
     """A robot in a simulated building: nine goals on a way of 41 m, and a person who steps in (thesis, section 5.6.2).
@@ -30,9 +35,11 @@ def world(
     reached without a contact.
     """
     from skytether.lab.world.cluttered import NoFieldError
+    from skytether.lab.world.live import serve
     from skytether.lab.world.model import WorldError
-    from skytether.lab.world.plan import PlanError, read_plan
+    from skytether.lab.world.plan import PlanError, building, read_plan
     from skytether.lab.world.show import show, show_field
+    from skytether.lab.world.simulation import Simulation
 
     try:
         if field is not None:
@@ -43,6 +50,14 @@ def world(
                 console.print(f"shortest way {length:.2f} m: {file}", soft_wrap=True)
             return
         chosen = read_plan(plan) if plan is not None else None
+        if live is not None:
+            with suppress(KeyboardInterrupt):
+                serve(
+                    Simulation(chosen or building(), seed=seed, rounds=people),
+                    live,
+                    lambda url: console.print(f"open {url} in a browser; Ctrl-C ends it", soft_wrap=True),
+                )
+            return
         with console.status("compiling ...") as line:
             done = show(
                 output,
