@@ -1,0 +1,210 @@
+"""Likelihood field of a map (Probabilistic Robotics, 6.4): how well beams end where the map has obstacles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether_services.navigation.compiled import compiled
+from skytether_services.navigation.grid_map import GridMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """What the end of a beam says.
+
+    Attributes:
+        sigma: Standard deviation of an end from the obstacle that it met, errors of the map included [m].
+        outlier: Likelihood of an end far from all obstacles, of one on an obstacle being 1: people, moved furniture.
+        unknown: Likelihood of an end where the map knows nothing: says little either way.
+        explained: An end as near as this to an obstacle is explained by the map [m].
+        max_distance: Distances are cut off here [m].
+    """
+
+    sigma: float = 0.10
+    outlier: float = 0.05
+    unknown: float = 0.3
+    explained: float = 0.2
+    max_distance: float = 1.0
+
+
+@dataclass(frozen=True)
+class LikelihoodField:
+    """A map, ready for scans to be compared with.
+
+    Attributes:
+        distance: Rows by columns; from a cell's middle to the nearest occupied one [m], cut off.
+        log_likelihood: Of a beam that ends in the cell.
+        known: 1 where the map has seen the cell, or an obstacle is near enough to explain an end there.
+        free: n by 2: column and row of all free cells.
+        grid: The map.
+        model: What it was made with.
+    """
+
+    distance: NDArray[np.float32]
+    log_likelihood: NDArray[np.float32]
+    known: NDArray[np.uint8]
+    free: NDArray[np.int32]
+    grid: GridMap
+    model: BeamModel
+
+
+def likelihood_field(grid: GridMap, model: BeamModel | None = None) -> LikelihoodField:
+    """The field of a map, by OpenCV's distance transform."""
+    model = model or BeamModel()
+    empty = (grid.cells < 50).astype(np.uint8)
+    distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * np.float32(grid.resolution)
+    distance = np.minimum(distance, np.float32(model.max_distance))
+    hit = np.exp(-(distance**2) / (2 * model.sigma**2))
+    known = (grid.cells >= 0) | (distance <= model.explained)
+    likelihood = np.where(known, model.outlier + (1 - model.outlier) * hit, model.unknown)
+    rows, columns = np.nonzero((grid.cells >= 0) & (grid.cells < 50))
+    return LikelihoodField(
+        distance=distance.astype(np.float32),
+        log_likelihood=np.log(likelihood).astype(np.float32),
+        known=known.astype(np.uint8),
+        free=np.column_stack((columns, rows)).astype(np.int32),
+        grid=grid,
+        model=model,
+    )
+
+
+@compiled
+def _score(
+    log_likelihood: NDArray[np.float32],
+    known: NDArray[np.uint8],
+    unknown: float,
+    cells: Array,
+    points: Array,
+    total: Array,
+    in_known: Array,
+) -> None:
+    rows, columns = log_likelihood.shape
+    for index in range(cells.shape[0]):
+        cos, sin = math.cos(cells[index, 2]), math.sin(cells[index, 2])
+        x, y = cells[index, 0], cells[index, 1]
+        sum_all = 0.0
+        sum_known = 0
+        for beam in range(points.shape[0]):
+            column = math.floor(x + cos * points[beam, 0] - sin * points[beam, 1])
+            row = math.floor(y + sin * points[beam, 0] + cos * points[beam, 1])
+            if 0 <= row < rows and 0 <= column < columns:
+                sum_all += log_likelihood[row, column]
+                sum_known += known[row, column]
+            else:
+                sum_all += unknown
+        total[index] = sum_all
+        in_known[index] = sum_known
+
+
+def score_poses(field: LikelihoodField, poses: Array, points: Array) -> tuple[Array, Array]:
+    """How well points fit the map from each of many poses.
+
+    Args:
+        field: Of the map.
+        poses: n by 3: x [m], y [m], heading [rad], map frame.
+        points: m by 2, in the robot's frame [m].
+
+    Returns:
+        For each pose the sum of the points' log-likelihoods, and how many points lie where the map is known.
+    """
+    cells = to_cell_poses(field.grid, poses)
+    total, known = np.empty(len(poses)), np.empty(len(poses))
+    unknown = math.log(field.model.unknown)
+    _score(field.log_likelihood, field.known, unknown, cells, points / field.grid.resolution, total, known)
+    return total, known
+
+
+def to_cell_poses(grid: GridMap, poses: Array) -> Array:
+    """Poses of the map frame as column, row [cells] and heading from the map's own x axis [rad]."""
+    return np.column_stack((grid.to_cells(poses[:, :2]), poses[:, 2] - grid.origin[2]))
+
+
+@compiled
+def _ends_and_walls(
+    distance: NDArray[np.float32],
+    known: NDArray[np.uint8],
+    cells: NDArray[np.int8],
+    pose: Array,
+    starts: Array,
+    ends: Array,
+    near: float,
+    short_of_end: float,
+) -> tuple[int, int, int]:
+    """Among points: in known cells, near an obstacle, seen through a wall."""
+    rows, columns = distance.shape
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    in_known, explained, through = 0, 0, 0
+    for beam in range(ends.shape[0]):
+        ax = pose[0] + cos * starts[beam, 0] - sin * starts[beam, 1]
+        ay = pose[1] + sin * starts[beam, 0] + cos * starts[beam, 1]
+        bx = pose[0] + cos * ends[beam, 0] - sin * ends[beam, 1]
+        by = pose[1] + sin * ends[beam, 0] + cos * ends[beam, 1]
+        column, row = math.floor(bx), math.floor(by)
+        seen = 0 <= row < rows and 0 <= column < columns and known[row, column] != 0
+        length = math.hypot(bx - ax, by - ay)
+        reach = length - short_of_end
+        blocked = False
+        steps = int(reach * 2)
+        for step in range(steps):
+            share = step / (2.0 * length)
+            column_at = math.floor(ax + share * (bx - ax))
+            row_at = math.floor(ay + share * (by - ay))
+            if 0 <= row_at < rows and 0 <= column_at < columns and cells[row_at, column_at] >= 50:
+                blocked = True
+                break
+        if blocked:
+            through += 1
+            in_known += 1
+        elif seen:
+            in_known += 1
+            if distance[row, column] <= near:
+                explained += 1
+    return in_known, explained, through
+
+
+@dataclass(frozen=True)
+class Explained:
+    """How a map explains a scan from one pose.
+
+    Attributes:
+        known: Share of the beams about which the map says something.
+        share: Share of those that end at an obstacle, and pass through none.
+        through: Share of those that pass through an obstacle.
+    """
+
+    known: float
+    share: float
+    through: float
+
+
+def explain(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> Explained:
+    """Compare beams with the map from one pose, walls that they would have to pass included.
+
+    Args:
+        field: Of the map.
+        pose: x [m], y [m], heading [rad], map frame.
+        starts: m by 2: where each beam starts, in the frame of ``pose`` [m].
+        ends: m by 2: where it ends.
+    """
+    if len(ends) == 0:
+        return Explained(0.0, 0.0, 0.0)
+    resolution = field.grid.resolution
+    at = to_cell_poses(field.grid, pose[None, :])[0]
+    known, good, through = _ends_and_walls(
+        field.distance,
+        field.known,
+        field.grid.cells,
+        at,
+        starts / resolution,
+        ends / resolution,
+        field.model.explained,
+        2 * field.model.explained / resolution,
+    )
+    return Explained(known / len(ends), good / max(known, 1), through / max(known, 1))

@@ -1,0 +1,110 @@
+"""Particle sets: resampling, how many are needed, where they gather."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether_services.navigation.compiled import compiled
+from skytether_services.navigation.motion_model import wrap
+
+Array = NDArray[np.float64]
+
+
+def low_variance_sample(weights: Array, count: int, offset: float) -> NDArray[np.int64]:
+    """Indices of particles, each as often as its weight says, by one random number (Probabilistic Robotics, table 4.4).
+
+    Args:
+        weights: Not negative, with a positive sum.
+        count: How many are drawn.
+        offset: From [0, 1).
+    """
+    cumulated = np.cumsum(weights)
+    marks = (offset + np.arange(count)) * (cumulated[-1] / count)
+    indices: NDArray[np.int64] = np.searchsorted(cumulated, marks, side="right").astype(np.int64)
+    indices[indices >= len(weights)] = len(weights) - 1
+    return indices
+
+
+def kld_count(bins: int, error: float, quantile: float) -> int:
+    """Particles needed for as many bins (Fox 2003, equation 7).
+
+    Args:
+        bins: That have a particle in them.
+        error: Largest Kullback-Leibler distance from the true posterior.
+        quantile: Of the normal distribution, for the probability with which that holds: 2.33 for 99 percent.
+    """
+    if bins <= 1:
+        return 1
+    part = 2 / (9 * (bins - 1))
+    return math.ceil((bins - 1) / (2 * error) * (1 - part + math.sqrt(part) * quantile) ** 3)
+
+
+def bin_keys(particles: Array, cell: float, turn: float) -> NDArray[np.int64]:
+    """A number for the bin of each particle: ``cell`` by ``cell`` [m] by ``turn`` [rad]."""
+    turns = max(1, round(2 * math.pi / turn))
+    x = np.floor(particles[:, 0] / cell).astype(np.int64) + 2**20
+    y = np.floor(particles[:, 1] / cell).astype(np.int64) + 2**20
+    heading = np.floor((particles[:, 2] + math.pi) / (2 * math.pi) * turns).astype(np.int64) % turns
+    return (x * 2**21 + y) * turns + heading
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where particles gather.
+
+    Attributes:
+        mean: x [m], y [m], heading [rad].
+        covariance: 3 by 3.
+        weight: Share of all particles' weight.
+    """
+
+    mean: Array
+    covariance: Array
+    weight: float
+
+
+@compiled
+def _within(particles: Array, centre: Array, radius: float, turn: float) -> NDArray[np.bool_]:
+    inside = np.empty(particles.shape[0], np.bool_)
+    for index in range(particles.shape[0]):
+        angle = particles[index, 2] - centre[2]
+        angle -= 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
+        dx, dy = particles[index, 0] - centre[0], particles[index, 1] - centre[1]
+        inside[index] = dx * dx + dy * dy <= radius * radius and abs(angle) <= turn
+    return inside
+
+
+def heaviest_cluster(particles: Array, weights: Array, radius: float, turn: float) -> Cluster:
+    """Mean and covariance of the particles around the heaviest bin.
+
+    Args:
+        particles: n by 3: x [m], y [m], heading [rad].
+        weights: Sum to 1.
+        radius: How far from its middle a cluster reaches [m].
+        turn: And in heading [rad].
+    """
+    _, index = np.unique(bin_keys(particles, radius, turn), return_inverse=True)
+    sums = np.bincount(index, weights)
+    inside = index == int(sums.argmax())
+    mean, covariance = moments(particles[inside], weights[inside])
+    for _ in range(2):
+        inside = _within(particles, mean, radius, turn)
+        if not inside.any():
+            break
+        mean, covariance = moments(particles[inside], weights[inside])
+    return Cluster(mean, covariance, float(weights[inside].sum()))
+
+
+def moments(particles: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted mean and covariance of poses; headings as directions."""
+    total = weights.sum()
+    shares = weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
+    heading = math.atan2(float(shares @ np.sin(particles[:, 2])), float(shares @ np.cos(particles[:, 2])))
+    mean = np.array([float(shares @ particles[:, 0]), float(shares @ particles[:, 1]), heading])
+    away = particles - mean
+    away[:, 2] = wrap(away[:, 2])
+    return mean, (away * shares[:, None]).T @ away

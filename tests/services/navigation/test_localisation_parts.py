@@ -1,0 +1,110 @@
+"""The pure parts of localisation, each by numbers that can be checked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from skytether_services.navigation.bench_localisation import noisy_steps, scan_points
+from skytether_services.navigation.global_search import distinct
+from skytether_services.navigation.grid_map import GridMap
+from skytether_services.navigation.likelihood_field import BeamModel, likelihood_field
+from skytether_services.navigation.motion_model import (
+    OdometryNoise,
+    between,
+    compose,
+    move_particles,
+    step_deviations,
+    wrap,
+)
+from skytether_services.navigation.occupancy import Beams, beam_ends
+from skytether_services.navigation.particles import bin_keys, kld_count, low_variance_sample, moments
+
+
+def test_a_step_is_what_lies_between_its_ends() -> None:
+    start, step = np.array([1.0, 2.0, math.pi / 2]), np.array([2.0, 1.0, math.pi])
+    # Facing up: two ahead are two up, one to the left is one back along x.
+    np.testing.assert_allclose(compose(start, step), [0.0, 4.0, -math.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(np.abs(between(start, compose(start, step))), np.abs(step), atol=1e-12)
+    np.testing.assert_allclose(wrap(np.array([3 * math.pi / 2, -7.0])), [-math.pi / 2, 2 * math.pi - 7.0])
+
+
+def test_odometry_noise_grows_with_the_motion() -> None:
+    noise = OdometryNoise(alpha1=0.01, alpha2=0.0, alpha3=0.04, alpha4=0.0, floor_position=0.0, floor_heading=0.0)
+    # 2 m: sqrt(0.04) * 2; half a radian: sqrt(0.01) * 0.5, which moves the end across by half of it times 2 m.
+    np.testing.assert_allclose(step_deviations(np.array([2.0, 0.0, -0.5]), noise), (0.4, 0.05, 0.05), atol=1e-12)
+
+
+def test_moved_particles_scatter_as_the_model_says() -> None:
+    noise = OdometryNoise(alpha1=0.0, alpha2=0.0, alpha3=0.04, alpha4=0.0, floor_position=0.0, floor_heading=0.0)
+    start = np.tile([1.0, 1.0, math.pi / 2], (4000, 1))
+    moved = move_particles(start, np.array([2.0, 0.0, 0.0]), noise, np.random.default_rng(1))
+    np.testing.assert_allclose(moved.mean(axis=0), [1.0, 3.0, math.pi / 2], atol=0.02)
+    np.testing.assert_allclose(moved.std(axis=0), [0.0, 0.4, 0.0], atol=0.02)
+
+
+def test_low_variance_sampling_draws_each_as_often_as_it_weighs() -> None:
+    # Marks at 0.125, 0.375, 0.625, 0.875 of the cumulated 0.1, 0.6, 0.6, 1.0.
+    assert low_variance_sample(np.array([0.1, 0.5, 0.0, 0.4]), 4, 0.5).tolist() == [1, 1, 3, 3]
+
+
+def test_particles_for_a_bound_on_the_kullback_leibler_distance() -> None:
+    # Fox 2003: k = 50, error 0.05, 99 percent: 49 / 0.1 * (1 - 2/441 + sqrt(2/441) * 2.33)^3 = 749 or so.
+    assert kld_count(1, 0.05, 2.33) == 1
+    assert kld_count(50, 0.05, 2.33) == math.ceil(490 * (1 - 2 / 441 + math.sqrt(2 / 441) * 2.33) ** 3)
+    assert 740 < kld_count(50, 0.05, 2.33) < 760
+
+
+def test_bins_tell_places_and_headings_apart() -> None:
+    particles = np.array([[0.1, 0.1, 0.0], [0.2, 0.2, 0.1], [0.3, 0.1, 0.0], [0.1, 0.1, 0.5], [-0.1, 0.1, 0.0]])
+    keys = bin_keys(particles, 0.25, math.pi / 18)
+    assert keys[0] == keys[1]
+    assert len(set(keys.tolist())) == 4
+
+
+def test_the_mean_of_headings_goes_through_the_back() -> None:
+    particles = np.array([[0.0, 0.0, math.pi - 0.1], [2.0, 0.0, -math.pi + 0.1]])
+    mean, covariance = moments(particles, np.array([0.5, 0.5]))
+    np.testing.assert_allclose([mean[0], mean[1], abs(mean[2])], [1.0, 0.0, math.pi], atol=1e-12)
+    # Each is 1 m and 0.1 rad off.
+    np.testing.assert_allclose(np.diag(covariance), [1.0, 0.0, 0.01], atol=1e-12)
+
+
+def test_a_likelihood_field_knows_distances_and_what_it_does_not_know() -> None:
+    cells = np.zeros((3, 9), np.int8)
+    cells[:, 0], cells[:, 8] = 100, -1
+    field = likelihood_field(GridMap(cells, 0.1), BeamModel(sigma=0.1, outlier=0.05, unknown=0.3, max_distance=0.5))
+    np.testing.assert_allclose(field.distance[1], [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.5, 0.5], atol=1e-6)
+    # One standard deviation off: 0.05 + 0.95 exp(-1/2).
+    expected = np.log([1.0, 0.05 + 0.95 * math.exp(-0.5), 0.3])
+    np.testing.assert_allclose(field.log_likelihood[1, [0, 1, 8]], expected, atol=1e-5)
+    assert field.known[1].tolist() == [1] * 8 + [0]
+    assert len(field.free) == 21
+
+
+def test_beams_that_met_nothing_only_clear() -> None:
+    beams = Beams(0.0, math.pi / 2, 10.0, (0.5, 0.0, 0.0))
+    hits, misses = beam_ends(np.array([1.0, 2.0, np.nan, 30.0]), beams, np.array([1.0, 1.0, 0.0]), 4.0)
+    np.testing.assert_allclose(hits, [[2.5, 1.0], [1.5, 3.0]], atol=1e-12)
+    assert len(misses) == 0  # beyond the laser's range nothing is known
+
+
+def test_near_hypotheses_are_one() -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1], [0.1, 0.0, 2.0], [3.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+    assert distinct(poses, 0.5, 0.5, 3) == [0, 2, 3]
+
+
+def test_noise_is_in_proportion_to_the_motion() -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
+    steps = np.array([noisy_steps(poses, np.random.default_rng(seed)) for seed in range(500)])
+    assert (steps[:, 0] == 0).all()
+    assert (steps[:, 2] == 0).all()
+    np.testing.assert_allclose(steps[:, 1, 0].std(), 0.1, atol=0.01)
+    np.testing.assert_allclose(steps[:, 3, 2].std(), 0.1, atol=0.01)
+
+
+def test_a_scans_points_are_those_that_met_something() -> None:
+    angles = np.array([-math.pi / 2, 0.0, math.pi / 2])
+    points = scan_points(np.array([1.0, 81.0, np.nan], np.float32), angles, 80.0)
+    np.testing.assert_allclose(points, [[0.0, -1.0]], atol=1e-7)
