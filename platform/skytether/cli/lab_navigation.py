@@ -78,6 +78,10 @@ def localisation(
     log: _Log,
     seed: _Seed = 1,
     seeds: _Seeds = 1,
+    starts: Annotated[
+        int, typer.Option(min=0, max=1000, help="So many times the robot is to be found without a first pose.")
+    ] = 0,
+    kidnaps: Annotated[int, typer.Option(min=0, max=1000, help="So many times it is carried away.")] = 0,
     fov: _Fov = None,
     json: _Json = False,  # noqa: ARG001
 ) -> None:
@@ -91,7 +95,9 @@ def localisation(
     try:
         with console.status("reading ...") as line:
             recorded = read_log(log, fov=None if fov is None else math.radians(fov))
-            document = bench_localisation(recorded, range(seed, seed + seeds), line.update)
+            document = bench_localisation(
+                recorded, range(seed, seed + seeds), line.update, starts=starts, kidnaps=kidnaps
+            )
     except (CarmenError, NavigationBenchError, OSError) as error:
         fail(str(error))
     print_json(document)

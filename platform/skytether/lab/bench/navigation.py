@@ -82,6 +82,8 @@ class LocalisationBench(Protocol):
         odometry: Floats,
         seeds: Sequence[int],
         progress: Callable[[str], None],
+        starts: int,
+        kidnaps: int,
     ) -> dict[str, Any]:
         """Measure localisation.
 
@@ -94,9 +96,12 @@ class LocalisationBench(Protocol):
             odometry: Of the log. It may be but the laser's pose: add the noise to its increments.
             seeds: One run for each.
             progress: Told now and then how far it is.
+            starts: So many times the robot is to be found without a first pose.
+            kidnaps: So many times it is carried away.
 
         Returns:
-            What is printed: ``position_mean_m, position_p95_m, heading_mean_deg, lost, seeds, update_p99_ms``.
+            What is printed: ``position_mean_m, position_p95_m, heading_mean_deg, lost, seeds, update_p99_ms``, and more
+            with starts and kidnaps.
 
         Raises:
             ValueError: The log is not good for it; the text says why.
@@ -129,7 +134,9 @@ def load(name: str) -> Any:
         raise NavigationBenchError(f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}") from error
 
 
-def bench_localisation(log: CarmenLog, seeds: Sequence[int], progress: Callable[[str], None]) -> dict[str, Any]:
+def bench_localisation(
+    log: CarmenLog, seeds: Sequence[int], progress: Callable[[str], None], *, starts: int = 0, kidnaps: int = 0
+) -> dict[str, Any]:
     """Call the entry point ``localisation`` with a log.
 
     Raises:
@@ -146,6 +153,8 @@ def bench_localisation(log: CarmenLog, seeds: Sequence[int], progress: Callable[
             odometry=log.odometry,
             seeds=seeds,
             progress=progress,
+            starts=starts,
+            kidnaps=kidnaps,
         )
     except ValueError as error:
         raise NavigationBenchError(str(error)) from error
