@@ -56,3 +56,19 @@ def test_the_first_minutes_of_a_real_log(data_dir: Path, tmp_path: Path) -> None
     assert figures["seeds"] == 1
     assert (tmp_path / "map.png").stat().st_size > 1000
     assert (tmp_path / "map.pgm").read_bytes().startswith(b"P5")
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_a_robot_is_tracked_on_the_map_of_the_way_before(data_dir: Path, tmp_path: Path) -> None:
+    with gzip.open(data_dir / "laser" / "freiburg-079-corrected.log.gz", "rt") as file:
+        lines = [line for line in file if line.startswith("FLASER")]
+    log = tmp_path / "part.log"
+    log.write_text("".join(lines[:900]))
+    result = CliRunner().invoke(app, ["bench", "localisation", str(log), "--starts", "1", "--kidnaps", "1"])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["position_mean_m"] < 0.15
+    assert figures["heading_mean_deg"] < 2
+    assert figures["lost"] == 0
+    assert figures["seeds"] == 1
