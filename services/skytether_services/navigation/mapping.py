@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .pose_graph import Edges, between, compose, optimise, wrapped
-from .scan_matching import Fit, Patch, make_patch, moved, rate, refine, scan_points, search, thin
+from .scan_matching import REACH, Fit, Patch, make_patch, moved, rate, refine, scan_points, search, thin
 
 Floats = NDArray[np.float64]
 
@@ -58,6 +58,8 @@ _FLOOR = np.diag([0.01**2, 0.01**2, 0.003**2])
 """Covariance of a perfect match, in m², m², rad²: the map between two keyframes bends by so much."""
 _AROUND = 6
 """Keyframes to each side that see one another's surroundings, for loops."""
+_NARROW = 4
+"""Cells around a surface that know it, in the matches at the end, which begin near: 0.2 m."""
 _MOVE_M, _MOVE_RAD = 0.5, 0.15
 """A match at the end may not move a keyframe farther than this."""
 
@@ -94,8 +96,8 @@ class _Graph:
         self.poses = list(poses)
         return errors
 
-    def patch(self, keys: range | list[int] | NDArray[np.int64]) -> Patch:
-        return make_patch(np.vstack([moved(self.points[k], self.poses[k]) for k in keys]))
+    def patch(self, keys: range, reach: int = REACH) -> Patch:
+        return make_patch(np.vstack([moved(self.points[k], self.poses[k]) for k in keys]), reach)
 
 
 @dataclass(frozen=True)
@@ -211,14 +213,16 @@ def _follow(
 def _close_loops(graph: _Graph, first: int, last: int, params: MappingParams) -> int:
     """Look for loops at the keyframes from first up to last; returns how many there were."""
     found = 0
-    travel = np.array(graph.travel)
+    poses, travel = np.array(graph.poses), np.array(graph.travel)
     for k in range(max(first, 0), last):
         if k % params.loop_every:
             continue
         keys = range(max(0, k - _AROUND), min(len(graph.poses), k + _AROUND + 1))
         seen = np.vstack([_of(graph, key, k) for key in keys])
         seen = thin(seen, 0.1)
-        for j in _near(graph, k, params.loop_reach * (travel[k] - travel) + 0.5, params, most=params.loop_most)[:2]:
+        for j in _near(poses, travel, k, params.loop_reach * (travel[k] - travel) + 0.5, params, most=params.loop_most)[
+            :2
+        ]:
             gap = travel[k] - travel[j]
             reach = min(0.5 + params.loop_reach * gap, params.loop_most)
             target = graph.patch(range(max(0, j - _AROUND - 4), min(j + _AROUND + 5, k - _AROUND)))
@@ -238,10 +242,15 @@ def _of(graph: _Graph, key: int, k: int) -> Floats:
 
 
 def _near(
-    graph: _Graph, k: int, reach: Floats | float, params: MappingParams, most: float, ahead: bool = False
+    poses: Floats,
+    travel: Floats,
+    k: int,
+    reach: Floats | float,
+    params: MappingParams,
+    most: float,
+    ahead: bool = False,
 ) -> list[int]:
     """Keyframes of other passes near keyframe k, the nearest of each pass, nearest first."""
-    poses, travel = np.array(graph.poses), np.array(graph.travel)
     away = np.hypot(poses[:, 0] - poses[k, 0], poses[:, 1] - poses[k, 1])
     gap = travel[k] - travel
     apart = (np.abs(gap) if ahead else gap) > params.loop_travel
@@ -257,19 +266,20 @@ def _matched_anew(graph: _Graph, params: MappingParams) -> _Graph:
     """The same keyframes, each matched against the one before it and against the other passes near it."""
     result = _Graph(graph.points, list(graph.poses), graph.travel, graph.scan)
     seen = {pair: n for n, pair in enumerate(graph.pairs)}
+    poses, travel = np.array(graph.poses), np.array(graph.travel)
     for k in range(1, len(graph.poses)):
         points, pose = graph.points[k], graph.poses[k]
         before = seen[(k - 1, k)]
         prior = _odometry_information(graph.motions[before], params)
         guess = compose(graph.poses[k - 1], graph.motions[before])
-        target = graph.patch(range(max(0, k - params.window), k))
+        target = graph.patch(range(max(0, k - params.window), k), _NARROW)
         fit = refine(target, points, pose, np.zeros((3, 3)))
         if fit.overlap < 0.3 or not _close(fit.pose, pose):
             fit = Fit(guess, np.zeros((3, 3)), 0.0, 0.0)
         result.add(k - 1, k, graph.poses[k - 1], _held(fit, prior), False)
-        for j in _near(graph, k, 4.0, params, most=4.0, ahead=True)[:3]:
+        for j in _near(poses, travel, k, 4.0, params, most=4.0, ahead=True)[:3]:
             low, high = max(0, j - _AROUND), min(j + _AROUND + 1, len(graph.poses))
-            fit = refine(graph.patch(range(low, high)), points, pose)
+            fit = refine(graph.patch(range(low, high), _NARROW), points, pose)
             if fit.overlap >= 0.5 and _close(fit.pose, pose):
                 result.add(j, k, graph.poses[j], fit, True)
     return result

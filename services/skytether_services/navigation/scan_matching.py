@@ -46,21 +46,22 @@ class Patch:
     surfaces: Floats
 
 
-def make_patch(points: Floats) -> Patch:
+def make_patch(points: Floats, reach: int = REACH) -> Patch:
     """A patch of points with normals.
 
     Args:
         points: n by (x, y, nx, ny) in the map frame; a normal of (0, 0) is not known.
+        reach: Cells around a surface that know it.
     """
-    margin = (REACH + 1) * CELL
+    margin = (reach + 1) * CELL
     low = points[:, :2].min(axis=0) - margin
     high = points[:, :2].max(axis=0) + margin
     columns, rows = (np.ceil((high - low) / CELL).astype(int) + 1).tolist()
     if rows * columns > _MAX_CELLS:
         middle = np.median(points[:, :2], axis=0)
         half = np.sqrt(_MAX_CELLS) * CELL / 2 - margin
-        return make_patch(points[(np.abs(points[:, :2] - middle) < half).all(axis=1)])
-    score, nearest, surfaces = _fill(points, low[0], low[1], rows, columns, CELL, REACH, SIGMA, _MERGE)
+        return make_patch(points[(np.abs(points[:, :2] - middle) < half).all(axis=1)], reach)
+    score, nearest, surfaces = _fill(points, low[0], low[1], rows, columns, CELL, reach, SIGMA, _MERGE)
     return Patch((float(low[0]), float(low[1])), score, nearest, surfaces)
 
 

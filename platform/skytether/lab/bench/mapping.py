@@ -75,11 +75,12 @@ def bench_mapping(
         NavigationBenchError: The service's algorithms are not installed.
     """
     began = time.perf_counter()
-    build = cast(MappingBench, load("mapping"))
     recorded = read_log(log, fov=fov)
     truth = read_relations(relations) if relations else None
     if truth is not None:
         score(recorded.stamps, recorded.laser, truth, stamp_offset)  # a wrong offset is told at once
+    # Last, for it takes seconds where numba has to be loaded: a file that is no log is refused at once.
+    build = cast(MappingBench, load("mapping"))
     reading_s = time.perf_counter() - began
     process_s = time.process_time()
     runs = []
