@@ -237,7 +237,8 @@ def cluster(folder: Path, faketime: str | None, images: Images | None, count: in
         for member in made.members:
             stack.callback(member.place.close)
         made.small_disk.mkdir(parents=True)
-        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m,mode=0700", "tmpfs", str(made.small_disk)], check=True)
+        # What an hour's instances leave there for a day, with their logs, fits in; in 8 MiB it did not.
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64m,mode=0700", "tmpfs", str(made.small_disk)], check=True)
         stack.callback(subprocess.run, ["umount", "-l", str(made.small_disk)], check=True)
         if images is not None:
             made.engine = stack.enter_context(contextlib.closing(OwnEngine()))
