@@ -68,9 +68,15 @@ class Facts:
 
 
 def doubles(facts: Facts) -> Iterator[Violation]:
-    """Two runs of one instance never live at one time."""
+    """Two runs of one instance never live at one time, and none is two instances'."""
     told = set()
     for look in facts.looks:
+        owners: dict[str, str] = {}
+        for instance, name in ((i, name) for i, names in look["runs"].items() for name in names):
+            other = owners.setdefault(name, instance)
+            if other != instance and name not in told:
+                told.add(name)
+                yield Violation("runs twice", look["t"], f"{name} at {look['place']} is {other}'s and {instance}'s")
         for instance, names in look["runs"].items():
             if len(names) > 1 and instance not in told:
                 told.add(instance)
@@ -98,7 +104,19 @@ def unsettled(final: Entry) -> list[str]:
             wrong.append(f"{instance} stays {row['state']}: {row['reason']}")
         elif row["state"] == "running" and final["when"] == "drained":
             wrong.append(f"{instance} runs on")
+    if final["when"] == "settled":
+        wrong += _unsettled_standbys(final)
     return wrong
+
+
+def _unsettled_standbys(final: Entry) -> list[str]:
+    live = [row for row in final["instances"].values() if row["spare"] and row["state"] == "running"]
+    there = {service: sum(row["service"] == service for row in live) for service in final["standbys"]}
+    return [
+        f"{service} is to have {wanted} standbys, and has {there[service]}"
+        for service, wanted in final["standbys"].items()
+        if there[service] != wanted
+    ]
 
 
 def lost(facts: Facts) -> Iterator[Violation]:
@@ -107,6 +125,9 @@ def lost(facts: Facts) -> Iterator[Violation]:
     acknowledged = {}
     for _, answer in facts.answered("create", "migrate"):
         acknowledged.setdefault(answer["id"], answer["t"])
+    for _, answer in facts.answered("renew"):
+        if answer.get("successor"):
+            acknowledged.setdefault(answer["successor"], answer["t"])
     if facts.finals:
         for instance, t in acknowledged.items():
             if instance not in known:
@@ -121,7 +142,7 @@ def lost(facts: Facts) -> Iterator[Violation]:
 
 
 def made_twice(facts: Facts) -> Iterator[Violation]:
-    """One idempotency key makes one instance."""
+    """One idempotency key makes one instance, and what is no successor was made with one."""
     by_key: dict[str, set[str]] = defaultdict(set)
     for asked, answer in facts.answered("create"):
         made = by_key[asked["key"]]
@@ -130,11 +151,42 @@ def made_twice(facts: Facts) -> Iterator[Violation]:
         made.add(answer["id"])
     stored: dict[str, list[str]] = defaultdict(list)
     for instance, row in facts.stored.items():
-        if row.get("key") and not row["replaces"]:
-            stored[row["key"]].append(instance)
+        for key in row["keys"]:
+            stored[key].append(instance)
+        if not (row["keys"] or row["replaces"] or row["spare"]):
+            yield Violation("made twice", facts.end, f"{instance} of {row['robot']} was made with no key")
     for key, made_for in stored.items():
         if len(made_for) > 1 and len(by_key[key]) < 2:
             yield Violation("made twice", facts.end, f"key {key}, in the database: {', '.join(made_for)}")
+
+
+def standbys(facts: Facts) -> Iterator[Violation]:
+    """A standby is nobody's, until it is given to one request, or as one instance's successor."""
+    asked_with: dict[str, set[str]] = defaultdict(set)
+    for asked, answer in facts.answered("create"):
+        keys = asked_with[answer["id"]]
+        if keys and asked["key"] not in keys:
+            text = f"{answer['id']} was given to the requests {asked['key']} and {', '.join(keys)}"
+            yield Violation("standby", answer["t"], text)
+        keys.add(asked["key"])
+    for instance, row in facts.stored.items():
+        keys = asked_with[instance] | {*row["keys"]}
+        if row["replaces"] and keys:
+            text = f"{instance} was given to the request {', '.join(keys)}, and as successor of {row['replaces']}"
+            yield Violation("standby", facts.end, text)
+        if row["spare"] is bool(row["robot"]):
+            owner = f"robot {row['robot']}'s" if row["robot"] else "nobody's"
+            kind = "a standby" if row["spare"] else "no standby"
+            yield Violation("standby", facts.end, f"{instance} is {owner}, and {kind}")
+    for instance, times in given(facts).items():
+        if times > 1:
+            yield Violation("standby", facts.end, f"{instance} was given {times} times")
+
+
+def given(facts: Facts) -> dict[str, int]:
+    """Standbys that a robot got, and how often: that alone is told as an event without a change."""
+    repeats = {i: sum(a[1:] == b[1:] for a, b in pairwise(rows)) for i, rows in facts.truth.items()}
+    return {instance: times for instance, times in repeats.items() if times}
 
 
 def undead(facts: Facts) -> Iterator[Violation]:
@@ -160,7 +212,9 @@ def leases(facts: Facts) -> Iterator[Violation]:
     """
     kept: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for asked, answer in facts.answered("create", "migrate", "renew"):
-        if answer["state"] not in ("stopping", *FINAL):
+        # Who asks to move what is being moved already is told of what is coming, and renews nothing by that.
+        coming = answer["op"] == "migrate" and (answer["id"] in kept or answer["state"] != "pending")
+        if answer["state"] not in ("stopping", *FINAL) and not coming:
             kept[answer["id"]].append((answer["t"], asked["t"], asked["lease_s"]))
     for instance, (t, reason) in _ran_out(facts).items():
         good = max((begun + length for answered, begun, length in kept[instance] if answered <= t), default=-math.inf)
@@ -258,6 +312,7 @@ RULES: tuple[Callable[[Facts], Iterator[Violation]], ...] = (
     orphans,
     lost,
     made_twice,
+    standbys,
     undead,
     leases,
     streams,

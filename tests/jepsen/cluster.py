@@ -33,8 +33,10 @@ from skytether.lab.netns import Namespace, enter
 
 PORT = 8600
 DATABASE = "skytether"
-TOY, BOXED = "toy", "boxed"
-"""Services: one that runs as a process, one that runs in a container."""
+TOY, WARM, BOXED = "toy", "warm", "boxed"
+"""Services: two that run as processes, one that runs in a container."""
+STANDBYS = {WARM: 2, BOXED: 1}
+"""How many instances of each are kept for nobody."""
 _CONFIG = """\
 local_site: false
 insecure_http: true
@@ -84,6 +86,10 @@ class Member(Program):
     @property
     def runs(self) -> bool:
         return self.process is not None and self.process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        return self.process.pid if self.process is not None else None
 
     @property
     def acts(self) -> bool:
@@ -136,6 +142,8 @@ class Cluster:
         self.engine: OwnEngine | None = None
         self.proxy: EngineProxy | None = None
         self.processes = processes(self.instances)
+        self.standbys: dict[str, int] = {}
+        """How many there are to be, by service."""
 
     @property
     def token(self) -> str:
@@ -194,11 +202,21 @@ class Cluster:
             for name in ("one", "two"):
                 options: dict[str, Any] = {"folder": str(self.instances / name), "cpu": 100}
                 client.create_site(SiteCreate(name=name, tier="edge", runtime="process", options=options))
-            client.put_service(TOY, _manifest(TOY, entrypoint="skytether.testing.toy_service"))
+            for service in (TOY, WARM):
+                client.put_service(service, _manifest(service, STANDBYS.get(service, 0), **_PROCESS))
             if self.site is not None and self.proxy is not None:
                 options = self.site.options(engine=self.proxy.engine, cpu=100)
                 client.create_site(SiteCreate(name="boxes", tier="edge", runtime="docker", options=options))
-                client.put_service(BOXED, _manifest(BOXED, image=self.site.images.toy))
+                client.put_service(BOXED, _manifest(BOXED, STANDBYS[BOXED], image=self.site.images.toy))
+        self.standbys = {service: STANDBYS[service] for service in (WARM, BOXED) if service == WARM or self.site}
+
+    def end_standbys(self) -> None:
+        """Nothing is kept for nobody any more: one service needs none, the other one is deleted."""
+        with self.client(*range(len(self.members)), timeout=PATIENCE) as client:
+            client.put_service(WARM, _manifest(WARM, 0, **_PROCESS))
+            if self.site is not None:
+                client.delete_service(BOXED)
+        self.standbys = {}
 
     def heal(self) -> None:
         """Undo whatever any fault did."""
@@ -219,9 +237,13 @@ class Cluster:
                     os.killpg(int(session.split()[1]), signal.SIGKILL)
 
 
-def _manifest(name: str, **spec: Any) -> dict[str, Any]:
-    needs = {"cpu": 0.01, "memory_mb": 64}
-    spec = {**spec, "params": {"additionalProperties": True}, "needs": needs}
+_PROCESS = {"entrypoint": "skytether.testing.toy_service"}
+
+
+def _manifest(name: str, standby: int, **spec: Any) -> dict[str, Any]:
+    needs = {"cpu": 0.01, "memory_mb": 64, "standby": standby}
+    params = {"additionalProperties": True, "required": ["say"]}  # no standby is made before somebody has asked
+    spec = {**spec, "params": params, "needs": needs}
     return {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": name}, "spec": spec}
 
 

@@ -4,14 +4,14 @@ Every entry has ``t``, seconds of the monotonic clock since the run began, and `
 
 | kind | fields |
 | --- | --- |
-| ``op`` | ``n``, ``step`` (invoke, ok, fail, unknown), ``op`` (create, renew, delete, migrate), ``who``, ``replica``; ``id``, ``key``, ``lease_s``; answered: ``state``, ``reason``; failed: ``status``, ``reason`` |
+| ``op`` | ``n``, ``step`` (invoke, ok, fail, unknown), ``op`` (create, renew, delete, migrate), ``who``, ``replica``; ``id``, ``key``, ``lease_s``; answered: ``state``, ``reason``, ``successor``; failed: ``status``, ``reason`` |
 | ``event`` | ``stream``, ``id`` of the instance, ``event`` (its number), ``state``, ``reason`` |
 | ``stream`` | ``stream``, ``id``, ``step``: begin, again (over another connection), end (the instance has ended), lost |
 | ``look`` | ``place``, ``runs``: names of the runs of each instance that live at the same time |
 | ``leader`` | ``leaders``: the number of the orchestrator that leads by the database, and can; empty: nobody does |
 | ``fault`` | ``fault``, ``step`` (begin, heal, over), ``hits``: the instances of which a run was hit |
 | ``traceback`` | ``line``: of an orchestrator's log, before a traceback |
-| ``final`` | ``when`` (settled, drained), ``instances`` and ``events`` as in the database, ``runs`` |
+| ``final`` | ``when`` (settled, drained), ``instances`` and ``events`` as in the database, ``runs``; ``standbys``: how many there are to be, by service |
 """  # noqa: E501 (a table)
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from .nemesis import FAULTS, OF_ENGINE
 from .run import run, timed
 
 
+@pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")  # docker's, where no engine answers
 def test_faults_for_as_long_as_asked(
     clusters: Callable[..., Cluster],
     seed: int,

@@ -276,6 +276,25 @@ class SiteCut(Fault):
         self.cluster.proxy.start()
 
 
+class LeaderSiteCut(_OfOne):
+    """The way between the leader alone and the engine is cut: connections are refused, or get no answer."""
+
+    def __init__(self, cluster: Cluster, watcher: Watcher, rng: random.Random) -> None:
+        super().__init__(cluster, watcher, rng, leads=True)
+
+    def hold(self) -> float:
+        return self.random.uniform(3, 15)
+
+    def break_it(self) -> None:
+        assert self.cluster.proxy is not None
+        victim = self.victim
+        self.cluster.proxy.shut_out(lambda program: program == victim.pid, silently=self.random.random() < 0.5)
+
+    def heal(self) -> None:
+        assert self.cluster.proxy is not None
+        self.cluster.proxy.let_in()
+
+
 class DiskFull(Fault):
     """The disk of one site of processes."""
 
@@ -316,9 +335,10 @@ FAULTS: dict[str, Make] = {
     "engine-hangs": EngineHangs,
     "engine-killed": EngineKilled,
     "site-cut": SiteCut,
+    "leader-site-cut": LeaderSiteCut,
 }
 _OF_SERVER = {"database-restart", "database-away", "database-hangs", "update"}
-OF_ENGINE = {"remove-containers", "engine-hangs", "engine-killed", "site-cut"}
+OF_ENGINE = {"remove-containers", "engine-hangs", "engine-killed", "site-cut", "leader-site-cut"}
 """Those that need a Docker engine."""
 
 

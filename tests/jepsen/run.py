@@ -12,7 +12,7 @@ from typing import Any
 
 import psycopg
 
-from .checker import Facts, Row, Violation, check, leases_not_kept, table, unsettled
+from .checker import Facts, Row, Violation, check, given, leases_not_kept, table, unsettled
 from .cluster import Cluster, wait_for
 from .history import Entry, History
 from .nemesis import Nemesis
@@ -20,7 +20,9 @@ from .watcher import Watcher
 from .workload import LEASE_S, Workload
 
 _WARM_UP_S, _SETTLE_S = 60.0, 180.0
-_INSTANCES = "SELECT id, state, reason, replaces, restarts, site, params ->> 'say' FROM instances WHERE NOT spare"
+_COLUMNS = ("state", "reason", "replaces", "restarts", "site", "service", "robot", "spare")
+_KEYS = "ARRAY(SELECT key FROM idempotency WHERE instance = id)"
+_INSTANCES = f"SELECT id, {_KEYS}, {', '.join(_COLUMNS)} FROM instances"
 _EVENTS = "SELECT id, instance, state, reason FROM events ORDER BY id"
 
 
@@ -31,6 +33,9 @@ class Result:
     rows: Sequence[Row]
     violations: Sequence[Violation]
     instances: int
+    moves: int
+    given: int
+    """Standbys that a robot got."""
     leases_not_kept: int
 
     def text(self) -> str:
@@ -43,6 +48,7 @@ class Result:
         told = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines]
         told += [f"{v.t:8.1f} s  {v.rule}: {v.text}" for v in self.violations]
         count = f"{len(self.violations)} violations in {self.instances} instances"
+        count += f" ({self.moves} moves, {self.given} standbys given)"
         more = f"{self.leases_not_kept} leases ran out of robots that asked and got no answer"
         return "\n".join([*told, f"{count}; {more}; seed {self.seed}; history and logs: {self.folder}"])
 
@@ -67,7 +73,9 @@ def run(
 
 def judge(history: Sequence[Entry], seed: int, folder: Path) -> Result:
     facts = Facts(history)
-    return Result(seed, folder, table(history), check(history), len(facts.stored), leases_not_kept(facts))
+    moves = len({answer["id"] for _, answer in facts.answered("migrate")})
+    counts = len(facts.stored), moves, len(given(facts)), leases_not_kept(facts)
+    return Result(seed, folder, table(history), check(history), *counts)
 
 
 def timed(names: Sequence[str], seconds: float, pairs: bool) -> Callable[[Nemesis], Iterable[tuple[str, ...]]]:
@@ -101,6 +109,7 @@ def _work(
     say("settling")
     time.sleep(LEASE_S)  # whom nobody keeps is gone then
     _settle(cluster, history, "settled")
+    cluster.end_standbys()
     workload.drain()
     _settle(cluster, history, "drained")
     workload.close(patience=30)
@@ -124,10 +133,11 @@ def _look(cluster: Cluster, when: str) -> dict[str, Any] | None:
 
     with contextlib.suppress(psycopg.Error, docker.errors.DockerException):
         before = dict(cluster.processes()) | cluster.containers()
-        names = ("state", "reason", "replaces", "restarts", "site", "key")
+        names = ("keys", *_COLUMNS)
         instances = {row[0]: dict(zip(names, row[1:], strict=True)) for row in cluster.sql(_INSTANCES)}
         runs = dict(cluster.processes()) | cluster.containers()
         if before == runs:
             events = [list(row) for row in cluster.sql(_EVENTS)]
-            return {"kind": "final", "when": when, "instances": instances, "events": events, "runs": runs}
+            told = {"instances": instances, "events": events, "runs": runs, "standbys": cluster.standbys}
+            return {"kind": "final", "when": when, **told}
     return None

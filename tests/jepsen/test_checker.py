@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from .checker import check, table
+from .checker import Facts, check, given, table
 from .history import Entry, History
 
 LEASE = 10.0
@@ -39,11 +39,17 @@ def fault(t: float, name: str, step: str = "begin", hits: Iterable[str] = ()) ->
 
 
 def final(t: float, when: str, state: str, runs: dict[str, list[str]]) -> Entry:
-    row = {"state": state, "reason": "", "key": "key 1", "replaces": None}
+    row = stored(state, "key 1")
     states = ["pending", "placing", "starting", "running"] + (["stopping", "stopped"] if state == "stopped" else [])
     events = [[number, "i1", name, ""] for number, name in enumerate(states, start=11)]
-    instances = {"i1": row}
-    return {"t": t, "kind": "final", "when": when, "instances": instances, "events": events, "runs": runs}
+    found = {"instances": {"i1": row}, "events": events, "runs": runs, "standbys": {}}
+    return {"t": t, "kind": "final", "when": when, **found}
+
+
+def stored(state: str, *keys: str, **more: Any) -> dict[str, Any]:
+    """A row of the database."""
+    row = {"state": state, "reason": "", "keys": [*keys], "replaces": None, "robot": "walker", "service": "toy"}
+    return {**row, "spare": False, **more}
 
 
 def good() -> list[Entry]:
@@ -99,7 +105,7 @@ def test_two_processes_of_one_instance_are_one_violation_however_often_they_are_
 @pytest.mark.parametrize("state", ["stopped", "failed"])
 def test_a_process_of_what_has_ended_is_an_orphan(state: str) -> None:
     history = good()
-    of(history, when="settled")["instances"]["i0"] = {"state": state, "reason": "", "key": "key 0", "replaces": None}
+    of(history, when="settled")["instances"]["i0"] = stored(state, "key 0")
     of(history, when="settled")["runs"]["i0"] = ["session 8"]
     assert rules(history) == ["left behind"]
 
@@ -132,12 +138,62 @@ def test_nobody_may_say_that_it_never_was() -> None:
 
 def test_a_key_makes_one_instance() -> None:
     history = good()
-    other = {"state": "stopped", "reason": "", "key": "key 1", "replaces": None}
+    other = stored("stopped", "key 1")
     of(history, when="drained")["instances"]["i2"] = other
     assert rules(history) == ["made twice"], "nobody was told of the second"
     assert rules([*history, *asked(2.0, "create", 50, {"id": "i2", "state": "pending"}, key="key 1")]) == ["made twice"]
+    other["keys"] = []
+    assert rules(history) == ["made twice"], "nobody asked for it"
     other["replaces"] = "i1"
-    assert rules(history) == [], "a successor has the parameters of the one before"
+    assert rules(history) == [], "a successor is made with no key"
+
+
+def with_standby() -> list[Entry]:
+    """A standby that runs, is given to a request, and ends; and another one in its place."""
+    history = good()
+    settled, drained = of(history, when="settled"), of(history, when="drained")
+    settled["standbys"] = {"toy": 1}
+    given = ["pending", "placing", "starting", "running", "running"]
+    for final_, state, second in ((settled, "running", "running"), (drained, "stopped", "stopped")):
+        final_["instances"]["i2"] = stored(state, "key 2")
+        final_["instances"]["i3"] = stored(second, robot="", spare=True)
+        final_["events"] += [[number, "i2", name, ""] for number, name in enumerate(given, start=1)]
+    settled["runs"] |= {"i2": ["session 8"], "i3": ["session 9"]}
+    return [*history, *asked(10.0, "create", 50, {"id": "i2"}, key="key 2")]
+
+
+def test_a_standby_is_nobodys_until_it_is_given_to_one_request() -> None:
+    assert rules(with_standby()) == []
+    assert given(Facts(with_standby())) == {"i2": 1}
+    again = asked(11.0, "create", 51, {"id": "i2"}, key="key 3")
+    assert rules([*with_standby(), *again]) == ["standby"]
+    for column, wrong in (("replaces", "i1"), ("robot", "")):
+        history = with_standby()
+        of(history, when="drained")["instances"]["i2"][column] = wrong
+        assert rules(history) == ["standby"], column
+    history = with_standby()
+    of(history, when="drained")["instances"]["i3"]["robot"] = "walker"
+    assert rules(history) == ["standby"], "nobody may have it yet"
+    history = with_standby()
+    of(history, when="drained")["events"].append([6, "i2", "running", ""])
+    assert rules(history) == ["standby"], "given twice"
+
+
+def test_in_the_end_there_are_as_many_standbys_as_there_are_to_be() -> None:
+    history = with_standby()
+    of(history, when="settled")["standbys"] = {"toy": 2}
+    assert rules(history) == ["left behind"]
+    history = with_standby()
+    of(history, when="drained")["instances"]["i3"]["state"] = "running"
+    of(history, when="drained")["runs"]["i3"] = ["session 9"]
+    assert rules(history) == ["left behind"]
+    history = with_standby()
+    of(history, when="settled")["runs"]["i2"] = ["session 9"]
+    assert rules([*history, look(12.0, i2=["session 9"], i3=["session 9"])]) == ["runs twice"]
+
+
+def test_a_successor_that_a_robot_was_told_of_may_not_be_missing() -> None:
+    assert rules([*good(), *asked(6.0, "renew", 50, {"id": "i1", "successor": "i2"}, id="i1")]) == ["lost"]
 
 
 def test_what_was_deleted_ends() -> None:
@@ -163,6 +219,8 @@ def test_a_lease_that_was_kept_does_not_run_out() -> None:
     assert rules(ended(19.1)) == []
     told = asked(12.0, "renew", 50, {"state": "stopping", "reason": "the robot did not renew its lease"}, id="i1")
     assert rules([*good(), *told]) == ["lease"], "and so is one of which only a renewal tells"
+    moved = asked(18.0, "migrate", 50, {"id": "i1", "state": "running"}, of="i0")
+    assert rules([*ended(19.1), *moved]) == [], "it is coming already, and nobody renews it"
 
 
 def test_an_event_is_told_once_and_in_order() -> None:

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import random
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
+from engine_ways import EngineProxy
 
 from . import cluster as programs
 from .history import History
@@ -71,3 +80,69 @@ def test_orchestrators_that_ended_are_started_again() -> None:
     made.database_is_back()
     assert nemesis._well()
     assert [member.runs for member in made.members] == [True] * 3
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[EngineProxy]:
+    """To an engine that greets whoever comes."""
+    with socket.socket(socket.AF_UNIX) as engine:
+        engine.bind(str(tmp_path / "engine"))
+        engine.listen()
+
+        def greet() -> None:
+            with suppress(OSError):
+                while True:
+                    with engine.accept()[0] as one:
+                        one.sendall(b"hello")
+                        one.recv(1)
+
+        threading.Thread(target=greet, daemon=True).start()
+        proxy = EngineProxy(tmp_path / "proxy", target=str(tmp_path / "engine"))
+        proxy.start()
+        yield proxy
+        proxy.cut()
+        engine.shutdown(socket.SHUT_RDWR)
+
+
+_ASK = """\
+import socket, sys
+with socket.socket(socket.AF_UNIX) as one:
+    one.settimeout(30)
+    one.connect(sys.argv[1])
+    print(one.recv(9).decode())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2], ids=["silent", "refused"])
+def test_the_leader_alone_is_cut_from_the_engine(proxy: EngineProxy, seed: int) -> None:
+    made: Any = Cluster()
+    made.leaders, made.proxy, made.members[1].pid = [1], proxy, os.getpid()
+    fault = FAULTS["leader-site-cut"](made, made, random.Random(seed))
+    with _connected(proxy) as before:
+        assert before.recv(9) == b"hello"
+        fault.begin()
+        assert before.recv(9) == b""
+    with _connected(proxy) as now:
+        if seed == 1:
+            now.settimeout(0.2)
+            with pytest.raises(TimeoutError):
+                now.recv(9)
+        other = [sys.executable, "-c", _ASK, _socket(proxy)]
+        assert subprocess.run(other, capture_output=True, text=True, check=True).stdout == "hello\n"
+        fault.heal()
+        now.settimeout(30)
+        assert now.recv(9) == b""
+    with _connected(proxy) as after:
+        assert after.recv(9) == b"hello"
+
+
+def _connected(proxy: EngineProxy) -> socket.socket:
+    one = socket.socket(socket.AF_UNIX)
+    one.settimeout(30)
+    one.connect(_socket(proxy))
+    return one
+
+
+def _socket(proxy: EngineProxy) -> str:
+    return proxy.engine.removeprefix("unix://")

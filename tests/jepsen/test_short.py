@@ -10,7 +10,12 @@ import pytest
 from .cluster import Cluster
 from .run import run
 
-pytestmark = [pytest.mark.slow, pytest.mark.postgres, pytest.mark.docker]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.postgres,
+    pytest.mark.docker,
+    pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning"),  # docker's, where no engine answers
+]
 
 SEED = 13
 FAULTS = (
@@ -27,3 +32,5 @@ def test_nothing_that_was_promised_is_broken(
     result = run(clusters(faketime, docker_images), SEED, lambda _: FAULTS)
     assert not result.violations, result.text()
     assert result.instances > 10
+    assert result.moves
+    assert result.given

@@ -11,20 +11,24 @@ from typing import Any
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import Instance, InstanceCreate, Renew
 
-from .cluster import BOXED, TOY, Cluster
+from .cluster import BOXED, STANDBYS, TOY, WARM, Cluster
 from .history import History
 
 LEASE_S = 10.0
 RENEW_S = 2.0
 _TRIES = 30
-_MOST, _PAUSE_S = {TOY: 4, BOXED: 2}, {TOY: (0.3, 1.0), BOXED: (1.0, 3.0)}
+_MOST, _PAUSE_S = {TOY: 4, WARM: 4, BOXED: 2}, {TOY: (0.3, 1.0), WARM: (0.3, 1.0), BOXED: (1.0, 3.0)}
 """Of one client: instances at a time, and the time between two requests. Containers take ten times as long to start."""
+_SAID = "usual", "usual", "usual", "other"
+"""Parameters of services with standbys, which are given to whoever asks for the same ones, and replaced by others."""
+_CHANGE_S = 15.0
+"""A robot waits so long for what it is to change to."""
 
 
 class Workload:
     """Clients with their instances, each followed and kept by threads of its own."""
 
-    def __init__(self, cluster: Cluster, history: History, seed: int, clients: int = 3) -> None:
+    def __init__(self, cluster: Cluster, history: History, seed: int) -> None:
         self.cluster, self.history = cluster, history
         count = len(cluster.members)
         self.replicas = [cluster.client(number) for number in range(count)]
@@ -32,11 +36,11 @@ class Workload:
         """No more changes; no more at all."""
         self._lock = threading.Lock()
         self.robots: dict[str, Robot] = {}
+        self._draining = False
         self._threads: list[threading.Thread] = []
         self._random = random.Random(f"{seed} robots")
-        for number in range(clients):
-            boxed = cluster.engine is not None and number == 0
-            one = Asker(self, f"client{number}", BOXED if boxed else TOY, random.Random(f"{seed} {number}"))
+        for number, service in enumerate((TOY if cluster.engine is None else BOXED, TOY, TOY, WARM)):
+            one = Asker(self, f"client{number}", service, random.Random(f"{seed} {number}"))
             self.spawn(one.run, one.name)
 
     def spawn(self, call: Callable[[], object], name: str) -> None:
@@ -61,20 +65,23 @@ class Workload:
             told = {"id": fields.get("id"), "state": "", "reason": ""}
             if answer is not None:
                 told = {"id": answer.id, "state": answer.state.value, "reason": answer.reason}
+                told |= {"successor": answer.successor} if answer.successor else {}
             note("op", step="ok", **common, **told)
             return answer or True
         return None
 
-    def adopt(self, made: Instance, follow: bool = True) -> Robot:
+    def adopt(self, instance: str, follow: bool = True) -> Robot:
         """A robot for an instance that was acknowledged."""
         with self._lock:
-            if made.id in self.robots:
-                return self.robots[made.id]
+            if instance in self.robots:
+                return self.robots[instance]
             seed = self._random.random()
-            robot = self.robots[made.id] = Robot(self, made.id, random.Random(seed))
-        self.spawn(robot.keep, f"robot {made.id}")
+            robot = self.robots[instance] = Robot(self, instance, random.Random(seed))
+            if self._draining:
+                robot.leave()
+        self.spawn(robot.keep, f"robot {instance}")
         if follow:
-            self.spawn(robot.follow, f"follower {made.id}")
+            self.spawn(robot.follow, f"follower {instance}")
         return robot
 
     def delete(self, instance: str, who: str, rng: random.Random) -> bool:
@@ -91,9 +98,10 @@ class Workload:
         self.stopped.set()
 
     def drain(self) -> None:
-        """End all that is there."""
+        """End all that is there. What robots hear of only now nobody keeps: it ends with its lease."""
         rng = random.Random(0)
         with self._lock:
+            self._draining = True
             robots = list(self.robots.values())
         for robot in robots:
             if not robot.over:
@@ -119,7 +127,8 @@ class Asker:
 
     def run(self) -> None:
         while not self._workload.stopped.wait(self._random.uniform(*_PAUSE_S[self._service])):
-            self._mine = [robot for robot in self._mine if not robot.over]
+            mine = dict.fromkeys(one for robot in self._mine for one in (robot, robot.successor) if one)
+            self._mine = [robot for robot in mine if not robot.over]
             choice = self._random.random()
             if not self._mine or (len(self._mine) < _MOST[self._service] and choice < 0.5):
                 self._create()
@@ -127,7 +136,7 @@ class Asker:
                 robot = self._mine.pop(self._random.randrange(len(self._mine)))
                 robot.leave()
                 self._workload.delete(robot.instance, self.name, self._random)
-            elif choice < 0.9 and self._service == TOY:
+            elif choice < 0.9 and self._service != BOXED:
                 self._move(self._random.choice(self._mine))
             elif choice < 0.95:
                 robot = self._mine.pop(self._random.randrange(len(self._mine)))
@@ -139,7 +148,8 @@ class Asker:
     def _create(self) -> None:
         self._count += 1
         key = f"{self.name} {self._count}"
-        asked = InstanceCreate(robot=self.name, service=self._service, lease_s=LEASE_S, params={"say": key})
+        say = self._random.choice(_SAID) if self._service in STANDBYS else key
+        asked = InstanceCreate(robot=self.name, service=self._service, lease_s=LEASE_S, params={"say": say})
         made: list[Instance] = []
 
         def ask(client: Client) -> Instance:
@@ -162,20 +172,15 @@ class Asker:
                 break
             time.sleep(0.3)
         if made:
-            self._mine.append(self._workload.adopt(made[0], follow=self._random.random() < 0.7))
+            self._mine.append(self._workload.adopt(made[0].id, follow=self._random.random() < 0.7))
 
     def _move(self, robot: Robot) -> None:
         replica = self._random.randrange(len(self._workload.replicas))
         ask = lambda client: client.migrate_instance(robot.instance)  # noqa: E731
         coming = self._workload.call("migrate", self.name, replica, ask, of=robot.instance)
-        if coming is None:
-            return
-        successor = self._workload.adopt(coming)
-        self._mine.append(successor)
-        if successor.running.wait(15):  # make before break
-            self._mine.remove(robot)
-            robot.leave()
-            self._workload.delete(robot.instance, self.name, self._random)
+        if coming is not None:
+            self._mine.append(self._workload.adopt(coming.id))
+            robot.change_to(coming.id)
 
 
 class Robot:
@@ -186,12 +191,30 @@ class Robot:
         self.running = threading.Event()
         self.over = False
         """It has ended, or is left."""
+        self.successor: Robot | None = None
+        """What it changes to as soon as that runs."""
         self._left = threading.Event()
+        self._lock = threading.Lock()
 
     def leave(self) -> None:
         """Renew no more."""
         self.over = True
         self._left.set()
+
+    def change_to(self, coming: str) -> None:
+        """Make before break: it was moved, or a standby takes over."""
+        with self._lock:
+            if self.over or self.successor is not None:
+                return
+            successor = self.successor = self._workload.adopt(coming)
+        self._workload.spawn(lambda: self._change(successor), f"change to {coming}")
+
+    def _change(self, successor: Robot) -> None:
+        if not successor.running.wait(_CHANGE_S):
+            self.successor = None
+        elif not self.over:
+            self.leave()
+            self._workload.delete(self.instance, "robot", self._random)
 
     def keep(self) -> None:
         while not self._left.wait(RENEW_S * self._random.uniform(0.8, 1.2)) and not self._workload.ended.is_set():
@@ -206,6 +229,8 @@ class Robot:
                     self.leave()
                 elif answer.state.value == "running":
                     self.running.set()
+                if answer.successor:
+                    self.change_to(answer.successor)
                 break
 
     def follow(self) -> None:

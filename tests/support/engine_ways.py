@@ -11,6 +11,7 @@ import json
 import os
 import socket
 import ssl
+import struct
 import subprocess
 import tarfile
 import tempfile
@@ -39,7 +40,10 @@ class EngineProxy:
         self.port = 0
         self._path = path
         self._context = context
-        self._open: list[socket.socket] = []
+        self._open: list[tuple[socket.socket, int]] = []
+        """Connections, with the programs whose they are; 0: unknown."""
+        self._shuts_out: Callable[[int], bool] = lambda _: False
+        self._answers_all = True
         self._listener: socket.socket | None = None
 
     @property
@@ -65,11 +69,26 @@ class EngineProxy:
                 self._listener.shutdown(socket.SHUT_RDWR)
             self._listener.close()
             self._listener = None
-        for one in self._open:
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
-        self._open.clear()
+        self._close(lambda _: True)
+
+    def shut_out(self, whose: Callable[[int], bool], *, silently: bool = False) -> None:
+        """Cut off those programs, by their ids; others are served as before. ``silently``: they get no answer."""
+        self._shuts_out, self._answers_all = whose, not silently
+        self._close(whose)
+
+    def let_in(self) -> None:
+        """Serve all of them again."""
+        self._close(self._shuts_out)  # those that wait for an answer
+        self._shuts_out = lambda _: False
+
+    def _close(self, whose: Callable[[int], bool]) -> None:
+        for one, program in list(self._open):
+            if whose(program):
+                with contextlib.suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)
+                one.close()
+            if one.fileno() < 0:
+                self._open.remove((one, program))
 
     def _accept(self, listener: socket.socket) -> None:
         while True:
@@ -80,6 +99,12 @@ class EngineProxy:
             threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
+        program = _program(client)
+        self._open.append((client, program))
+        if self._shuts_out(program):
+            if self._answers_all:
+                client.close()
+            return
         engine = socket.socket(socket.AF_UNIX)
         try:
             if self._context is not None:
@@ -89,7 +114,7 @@ class EngineProxy:
             engine.close()
             client.close()
             return
-        self._open += [client, engine]
+        self._open.append((engine, program))
         both = [
             threading.Thread(target=_pump, args=(client, engine, self._loses), daemon=True),
             threading.Thread(target=_pump, args=(engine, client, lambda _: False), daemon=True),
@@ -102,6 +127,14 @@ class EngineProxy:
         if lost:
             self.swallowed.set()
         return lost
+
+
+def _program(client: socket.socket) -> int:
+    """Whose end the other one is."""
+    if client.family != socket.AF_UNIX:
+        return 0
+    told = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    return int(struct.unpack("3i", told)[0])
 
 
 def _pump(source: socket.socket, sink: socket.socket, loses: Callable[[bytes], bool]) -> None:
