@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.api.pull import Pull, read_pull
-from skytether.orchestrator.runtimes.base import Launch, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import Engine, EngineGoneError, Tunnel, root_cause
@@ -750,6 +750,28 @@ def test_who_sees_that_a_start_failed_sees_that_nothing_is_left_of_it() -> None:
     job = Failing(nothing, nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None)
     job._run()
     assert "no space left" in job.failure
+
+
+def test_a_start_that_fails_under_another_leader_says_nothing_of_the_service() -> None:
+    """Who leads by now removed what had just been made."""
+
+    class Failing(Job):
+        def _clear(self) -> bool:
+            return False
+
+        def _launch(self) -> None:
+            raise RuntimeFailure("the container is marked for removal")
+
+    class Overtaken(Fence):
+        def must_lead(self, epoch: int | None = None) -> None:
+            raise OvertakenError("another orchestrator leads")
+
+    nothing: Any = None
+    job = Failing(nothing, nothing, nothing, "", nothing, nothing, nothing, Overtaken(nothing, ""), None)
+    job.launch = launch()
+    job._run()
+    assert job.unanswered
+    assert not job.failure
 
 
 @pytest.mark.parametrize(

@@ -133,11 +133,24 @@ class Job:
             self._follower.doubt(error)
             self.unanswered = True
         except RuntimeFailure as error:
+            if self._is_overtaken():  # and has removed what was just made: that says nothing of the service
+                log.info("start of %s: another orchestrator leads: %s", self.launch.instance, error)
+                self.unanswered = True
+                return
             self.unstarted = cleared  # first: whoever sees the failure reads this next
             self.failure = f"could not be started: {advised(str(error))}"
         except Exception as error:
             log.exception("start of %s failed", self.launch.instance)
             self.failure = f"could not be started: {error}"
+
+    def _is_overtaken(self) -> bool:
+        try:
+            self._fence.must_lead(self._epoch)
+        except OvertakenError:
+            return True
+        except RuntimeFailure:
+            pass  # the engine does not answer: nobody can tell
+        return False
 
     def _go_on(self) -> None:
         if self._cancelled.is_set():
