@@ -53,7 +53,7 @@ class Control:
 
 
 class Controller(Protocol):
-    """What every controller does; MPPI is one."""
+    """MPPI and DWA; others may join."""
 
     def set_path(self, path: NDArray[np.float64]) -> None:
         """Follow another path: x [m], y [m], yaw [rad], n by 3, evenly spaced, in the costmap's frame. Empty: none."""
