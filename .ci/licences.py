@@ -21,7 +21,6 @@ NOTES = {
     "eclipse-zenoh": "its user chooses Apache-2.0",
     "psycopg": "extra `postgres`; LGPL: used unchanged as a library, replaceable",
     "psycopg-binary": "extra `postgres`; LGPL: used unchanged as a library, replaceable",
-    "zfec": "GPL-2.0-or-later or TGPPL-1.0-or-later, by choice: who passes on images with it keeps to one",
 }
 _HEAD = """\
 # Licences

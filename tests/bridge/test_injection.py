@@ -67,7 +67,7 @@ KINDS = {
     "wrong key": (lambda seen, spec: [hello(bytes(32), spec.topics)], "hello_forged"),
     "replayed hello": (lambda seen, spec: [p for p in seen if p[0] == packet.HELLO][:1], "hello_replayed"),
     "wrong version": (lambda seen, spec: [changed(p, 0, 0x10) for p in data_of(seen)], "version"),
-    "unknown type": (lambda seen, spec: [changed(p, 0, 0x2F) for p in data_of(seen)], "type"),
+    "unknown type": (lambda seen, spec: [changed(p, 0, packet.VERSION << 4 | 0xF) for p in data_of(seen)], "type"),
     "other session": (lambda seen, spec: [changed(p, 8, p[8] ^ 8) for p in data_of(seen)], "session"),
     "other keys": (lambda seen, spec: [changed(p, 9, p[9] ^ 0x55) for p in data_of(seen)], "forged"),
     "session's own id": (

@@ -1,13 +1,11 @@
-"""Shards of a message, against reassembly, and against a slow Reed-Solomon code."""
+"""Shards of a message, against reassembly."""
 
-from itertools import combinations
 from random import Random
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.wire import fragment, packet
+from skytether.wire import packet
 from skytether.wire.fragment import BLOCK_SHARDS, Shape, Shards, shape_for
 from skytether.wire.reassembly import Reassembly
 from skytether.wire.tags import SECRET_SIZE, Tags
@@ -39,46 +37,6 @@ def test_any_claim_is_judged(length, size):
     if shape.valid:
         assert shape.size % 4 == 0
         assert (shape.shards - 1) * shape.size < length <= shape.shards * shape.size
-
-
-def test_parity_rows_do_not_depend_on_how_many_there_are():
-    zfec = pytest.importorskip("zfec")
-    data = [Random(1).randbytes(300) for _ in range(10)]
-    for total in (11, 20, 256):
-        assert zfec.Encoder(10, total).encode(data, (10,)) == fragment.encode(tuple(map(memoryview, data)), (10,))
-
-
-def gf_multiply(a, b):
-    """GF(256) with zfec's polynomial, x^8 + x^4 + x^3 + x^2 + 1."""
-    product = 0
-    while b:
-        product ^= a * (b & 1)
-        a = a << 1 ^ (0x11D if a & 0x80 else 0)
-        b >>= 1
-    return product
-
-
-def test_one_data_shard_of_a_block_of_two_can_be_solved_by_hand():
-    # A parity byte is p = c0 d0 + c1 d1 in GF(256), with constants of the row: find them from unit vectors.
-    one, zero = memoryview(b"\x01"), memoryview(b"\x00")
-    c0 = fragment.encode((one, zero), (2,))[0][0]
-    c1 = fragment.encode((zero, one), (2,))[0][0]
-    data = (memoryview(b"\x57"), memoryview(b"\x83"))
-    parity = fragment.encode(data, (2,))
-    assert parity[0][0] == gf_multiply(c0, 0x57) ^ gf_multiply(c1, 0x83)
-    assert [bytes(d) for d in fragment.decode((data[0], parity[0]), (0, 2))] == [b"\x57", b"\x83"]
-
-
-def test_any_k_of_a_block_will_do():
-    data = [bytes([i]) * 4 for i in range(1, 5)]
-    views = tuple(map(memoryview, data))
-    shards = [*data, *fragment.encode(views, (4, 5, 6))]
-    for chosen in combinations(range(7), 4):
-        indices = [i if i in chosen else None for i in range(4)]
-        parity = iter(i for i in chosen if i >= 4)
-        numbers = tuple(i if i is not None else next(parity) for i in indices)
-        decoded = fragment.decode(tuple(shards[i] for i in numbers), numbers)
-        assert [bytes(d) for d in decoded] == data
 
 
 def cut(message, room, parity):

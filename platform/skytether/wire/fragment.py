@@ -2,8 +2,7 @@
 
 A message of ``length`` bytes in shards of ``size`` bytes (a multiple of 4, for the tags) has ``ceil(length / size)``
 data shards, in as few blocks of at most `BLOCK_SHARDS` as will do, split evenly. The receiver derives all of it from
-two numbers. Parity is systematic Reed-Solomon over GF(256) by `zfec`; a row of its matrix depends on k and the row
-only, so the receiver need not know how many parity shards there are.
+two numbers. Parity is that of `reed_solomon`.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-import zfec
 
 from .packet import COMMON_SIZE, HEADER_SIZE, INDEX_AT, NUMBER_AT, SHARD_AT, TIME_AT
+from .reed_solomon import Bytes, encode
 
-Bytes = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 """Of data shards in their message."""
 Sums = npt.NDArray[np.uint64]
@@ -79,34 +77,11 @@ def shape_for(length: int, room: int) -> Shape:
     return Shape(length, -(-length // (shards * STEP)) * STEP)
 
 
-@lru_cache(maxsize=BLOCK_SHARDS)
-def _encoder(k: int) -> zfec.Encoder:
-    return zfec.Encoder(k, MAX_SHARDS)
-
-
-@lru_cache(maxsize=BLOCK_SHARDS)
-def _decoder(k: int) -> zfec.Decoder:
-    return zfec.Decoder(k, MAX_SHARDS)
-
-
-def encode(data: tuple[memoryview, ...], rows: tuple[int, ...]) -> list[bytes]:
-    """Parity shards of one block: ``rows`` are their indices, from ``len(data)`` up."""
-    parity: list[bytes] = _encoder(len(data)).encode(data, rows)
-    return parity
-
-
 def encode_sealed(sealed: memoryview, shape: Shape, rows: range) -> list[bytes]:
-    """The same of a sealed message of one block, padded to whole shards."""
+    """Parity shards of a sealed message of one block, padded to whole shards: ``rows`` are their indices."""
     if not rows:
         return []
-    size = shape.size
-    return encode(tuple(sealed[i * size : (i + 1) * size] for i in range(shape.shards)), tuple(rows))
-
-
-def decode(shards: tuple[memoryview | bytes | Bytes, ...], indices: tuple[int, ...]) -> list[bytes]:
-    """Data shards of one block from any k of its shards, distinct, of equal size."""
-    data: list[bytes] = _decoder(len(shards)).decode(shards, indices)
-    return data
+    return encode(np.frombuffer(sealed, np.uint8).reshape(shape.shards, shape.size), rows)
 
 
 @lru_cache(maxsize=256)
@@ -246,10 +221,9 @@ class Shards:
         turn, block = divmod(position - self._shape.shards, blocks)
         k, start = self._shape.block_k(block), self._shape.block_start(block)
         if (block, turn) not in self._parity:
-            data = tuple(row.data for row in self._data[start : start + k])
             # All of a single block at once; of many blocks only what is sent now, so that no call takes long.
             turns = range(parity) if blocks == 1 else range(turn, turn + 1)
-            made = encode(data, tuple(k + t for t in turns))
+            made = encode(self._data[start : start + k], [k + t for t in turns])
             self._parity.update(zip(((block, t) for t in turns), made, strict=True))
         return self._parity.pop((block, turn))
 

@@ -32,7 +32,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-VERSION = 2
+VERSION = 3
 
 DATA = VERSION << 4
 HELLO = VERSION << 4 | 1

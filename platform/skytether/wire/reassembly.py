@@ -12,7 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .fragment import MAX_SHARDS, Bytes, Shape, decode
+from .fragment import MAX_SHARDS, Shape
+from .reed_solomon import Bytes, recover
 
 ENTRY_COST = 1024
 """Bytes of book-keeping charged for an incomplete message, on top of its shards."""
@@ -77,12 +78,7 @@ class _Block:
                 parity.update(zip(indices[~data].tolist(), shards[~data], strict=True))
         missing = [i for i in range(k) if not self.seen[i]]
         if missing:
-            numbers, sources = list(range(k)), list(out)
-            for i, (number, shard) in zip(missing, parity.items(), strict=False):
-                numbers[i], sources[i] = number, shard
-            decoded = decode(tuple(sources), tuple(numbers))
-            for i in missing:
-                out[i] = np.frombuffer(decoded[i], np.uint8)
+            recover(out, missing, parity)
         self.rows, self.singles = [], {}
 
 
