@@ -8,9 +8,11 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -60,7 +62,8 @@ def nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     def waits(_: float) -> None:
         raise AssertionError("it waits")
 
-    monkeypatch.setattr(programs.time, "sleep", waits)
+    # Of this module alone: threads that other tests left may sleep.
+    monkeypatch.setattr(programs, "time", SimpleNamespace(monotonic=time.monotonic, sleep=waits))
 
 
 @pytest.mark.usefixtures("nobody_waits")
