@@ -50,7 +50,7 @@ class Kit(ABC):
 
     def launch(self, instance: str = "i1", attempt: int = 1, behaviour: str = "good") -> Launch:
         params: dict[str, Any] = {
-            "good": {"say": f"run {attempt}"},
+            "good": {"say": f"run {attempt}", "report": f"run {attempt} is up"},
             "stubborn": {"ignore_sigterm": True},
             "crashing": {"exit_status": 1, "say": "boom"},
         }[behaviour]

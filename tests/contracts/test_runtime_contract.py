@@ -210,3 +210,15 @@ def test_tidying_is_always_possible(kit: Kit) -> None:
     runtime.start(kit.launch())
     runtime.tidy()
     kit.until(runtime, Phase.RUNNING)
+
+
+def test_what_a_run_reports_is_seen_and_the_next_run_begins_anew(kit: Kit) -> None:
+    runtime = kit.open()
+    for attempt in (1, 2):
+        runtime.start(kit.launch(attempt=attempt))
+        deadline = time.monotonic() + kit.patience
+        while not (seen := kit.until(runtime, Phase.RUNNING)).reports:
+            assert time.monotonic() < deadline, seen
+            runtime.tidy()
+            time.sleep(0.05)
+        assert [(r.number, r.code, r.message) for r in seen.reports] == [(1, "said", f"run {attempt} is up")]

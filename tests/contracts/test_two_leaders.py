@@ -50,6 +50,16 @@ def test_who_was_overtaken_is_refused_and_sees_what_the_other_does(kit: Kit) -> 
     kit.until(late, None)
 
 
+def test_the_first_look_of_a_leader_finds_what_the_one_before_has_begun(kit: Kit) -> None:
+    late, leader = kit.open(), kit.open()
+    late.lead(1)
+    leader.observe()
+    late.start(kit.launch())
+    kit.until(late, Phase.RUNNING)
+    leader.lead(2)
+    assert leader.observe()["i1"].attempt == 1, "what it did not see it would begin anew"
+
+
 def test_the_leader_of_the_latest_epoch_acts_whoever_it_is(kit: Kit) -> None:
     first, second = kit.open(), kit.open()
     first.lead(1)

@@ -79,15 +79,42 @@ def test_an_answer_that_never_ends_costs_no_memory(engine: Callable[..., Client]
         engine(answer).info()
 
 
+def drops(drop: bytes, pause_s: float = 0.02) -> Iterator[bytes]:
+    for _ in range(10_000):
+        yield drop
+        time.sleep(pause_s)
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        (CHUNKED, chunks(b" ", 0.02)),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 60000\r\n\r\n", drops(b" ")),
+        (b"HTTP/1.1 200 OK\r\nX: ", drops(b"x")),
+        (b"", drops(b"HTTP/1.1 100 Continue\r\n\r\n")),
+    ],
+    ids=["chunks", "body", "head", "interim"],
+)
 def test_an_answer_that_comes_in_drops_takes_no_longer_than_its_call_may(
-    engine: Callable[..., Client],
+    engine: Callable[..., Client], head: bytes, body: Iterator[bytes]
 ) -> None:
     def answer(_: bytes) -> Iterator[bytes]:
-        yield CHUNKED
-        yield from chunks(b" ", 0.02)
+        yield head
+        yield from body
 
-    with pytest.raises(requests.ConnectionError, match="without an end in time"):
+    before = time.monotonic()
+    with pytest.raises(requests.RequestException, match="timed out"):
         engine(answer, 0.5).info()
+    assert time.monotonic() - before < 20
+
+
+def test_a_stream_goes_on_for_longer_than_a_call_may(engine: Callable[..., Client]) -> None:
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        yield from drops(b'9\r\n{"a": 1}\n\r\n', 0.1)
+
+    events = engine(answer, 0.5).events(decode=True)
+    assert [next(events) for _ in range(8)] == [{"a": 1}] * 8
 
 
 def test_nobody_is_asked_whom_an_engine_names(engine: Callable[..., Client]) -> None:

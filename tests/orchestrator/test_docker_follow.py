@@ -59,7 +59,7 @@ class StagedEngine:
         return [{"Id": "c1", "Labels": {INSTANCE: "i1"}}]
 
     def inspect_container(self, _container: str) -> dict[str, Any]:
-        labels = {INSTANCE: "i1", OWNER: "me", "skytether.io/attempt": "1"}
+        labels = {INSTANCE: "i1", OWNER: "me", "skytether.io/attempt": "1", "skytether.io/port": "7600"}
         state = {"Status": "running", "ExitCode": 0, "OOMKilled": False}
         return {
             "Id": "c1",

@@ -468,6 +468,18 @@ def test_the_profile_of_calls_is_an_allow_list_and_another_may_be_named(tmp_path
         DockerRuntime("edge", tmp_path, options(seccomp="/nowhere"))
 
 
+def test_a_key_for_an_engine_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    files = {name: tmp_path / f"{name}.pem" for name in ("ca", "cert", "key")}
+    for path in files.values():
+        path.write_text("anything")
+    of_tls = options(engine="tcp://127.0.0.1:1", bind_host="127.0.0.1", tls={n: str(p) for n, p in files.items()})
+    files["key"].chmod(0o644)
+    with pytest.raises(RuntimeFailure, match=f"others can read the key.*chmod 600 {files['key']}"):
+        DockerRuntime("edge", tmp_path, of_tls)
+    files["key"].chmod(0o640)
+    DockerRuntime("edge", tmp_path, of_tls).close()
+
+
 def test_what_holds_a_container_is_told_and_no_user_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
         assert runtime.isolation() == (), "nothing is known of an engine that is away"

@@ -78,7 +78,22 @@ def test_those_who_left_are_forgotten() -> None:
     for guest in [*guests, *guests]:
         at.leave(guest)
     at.know(guests[0], "robot:a")
-    assert (at.guests, at._at, at._of, list(at._strangers)) == (set(), {}, {}, [])
+    assert (at.guests, at._at, at._of, at._strangers, at._strange) == (set(), {}, {}, {}, 0)
+
+
+def test_of_strangers_the_oldest_of_the_largest_crowd_gives_way() -> None:
+    at = book(strangers=4)
+    robot = came(at, "robot")
+    crowd = [came(at, "crowd") for _ in range(3)]
+    assert [at.is_alone(one) for one in (robot, *crowd)] == [True, False, False, False]
+    assert at.room("other") == (True, crowd[0])
+    at.leave(crowd[0])
+    assert at.room("other") == (True, None)
+    came(at, "crowd")
+    at.know(robot, "robot:a")
+    assert at.room("other") == (True, None), "who has shown a token counts no more"
+    came(at, "other")
+    assert at.room("robot") == (True, crowd[1])
 
 
 def test_late_is_who_owes_something_or_does_not_take_what_it_was_sent() -> None:

@@ -63,6 +63,7 @@ INSTANCE: dict[str, Any] = {
     "spare": False,
     "claim": None,
     "key_id": "",
+    "said": 0,
 }
 """A value for every column that a table had at any time; what a version has not is left out."""
 ROWS: dict[str, dict[str, Any]] = {
@@ -88,7 +89,7 @@ ROWS: dict[str, dict[str, Any]] = {
         "images": ["*"],
         "draining": False,
     },
-    "events": {"instance": "i1", "at": NOW, "state": "running", "reason": ""},
+    "events": {"instance": "i1", "at": NOW, "state": "running", "reason": "", "code": ""},
     "idempotency": {"owner": "robot:walker", "key": "k", "body_sha256": "0" * 64, "instance": "i1", "created_at": NOW},
     "reports": {"instance": "i1", "at": NOW, "report": {"rtt_s": 0.02}},
     "facts": {"name": "secret.key", "value": "f"},

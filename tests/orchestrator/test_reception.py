@@ -279,3 +279,34 @@ def test_who_still_waits_when_an_orchestrator_ends_is_told_to_ask_again() -> Non
     assert sent[0]["status"] == 503
     assert (b"retry-after", b"2") in sent[0]["headers"]
     assert b"ask again" in sent[1]["body"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "ends"), [([(b"content-type", b"text/event-stream")], True), ([(b"Content-Length", b"9")], False)]
+)
+def test_a_stream_that_an_orchestrator_has_no_time_for_ends_and_a_part_of_an_answer_is_none(
+    headers: list[tuple[bytes, bytes]], ends: bool
+) -> None:
+    sent: list[Any] = []
+
+    async def tells(_: Any, __: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": b"one", "more_body": True})
+        await asyncio.Event().wait()
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def nothing() -> Any:
+        return {}
+
+    async def ended() -> None:
+        telling = asyncio.ensure_future(GivenUp(tells)({"type": "http"}, nothing, send))
+        await asyncio.sleep(0)
+        telling.cancel()
+        with contextlib.nullcontext() if ends else pytest.raises(asyncio.CancelledError):
+            await telling
+
+    asyncio.run(ended())
+    assert len(sent) == (3 if ends else 2)
+    assert not (ends and sent[-1].get("more_body"))

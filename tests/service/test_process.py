@@ -119,3 +119,10 @@ def test_a_taken_port_is_said(grant, spawn) -> None:
     assert child.returncode == 1
     assert stderr.startswith(f"error: cannot listen on UDP 127.0.0.1:{port}: ")
     assert stderr.count("\n") == 1
+
+
+def test_what_it_reports_is_in_a_file_beside_its_ready_file(grant, spawn, tmp_path) -> None:
+    write_module(tmp_path, "self.report('lost', 'The robot was carried away.')")
+    child = spawn("under_test", grant(), tmp_path)
+    told = wait_ready(child, tmp_path / "reports.json")["reports"]
+    assert told == [{"number": 1, "code": "lost", "message": "The robot was carried away."}]

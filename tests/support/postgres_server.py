@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import socket
@@ -57,7 +58,8 @@ class PostgresServer:
         """To all of its processes."""
         server = psutil.Process(int((self.folder / "data/postmaster.pid").read_text().split()[0]))
         for process in (server, *server.children()):
-            process.send_signal(number)
+            with contextlib.suppress(psutil.NoSuchProcess):  # some end by themselves, an autovacuum worker for one
+                process.send_signal(number)
 
 
 def as_postgres() -> list[str]:

@@ -161,7 +161,7 @@ class Instance(Strict):
 
 
 class InstanceEvent(Strict):
-    """A change of an instance's state or reason, as server-sent events tell it."""
+    """A change of an instance's state or reason, or what its service reports, as server-sent events tell it."""
 
     id: int
     """Counts up; ``Last-Event-ID`` resumes after it."""
@@ -169,6 +169,9 @@ class InstanceEvent(Strict):
     at: datetime
     state: State
     reason: str = ""
+    """Of a report: what the service says, a sentence for people."""
+    code: str = ""
+    """Of a report: what the service says, for programs; empty: a change."""
 
 
 def _between(least: float, most: float) -> BeforeValidator:

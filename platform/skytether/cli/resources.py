@@ -283,7 +283,10 @@ def watch_events(
             if json:
                 print_json(plain(event))
             else:
-                typer.echo(f"{event.at.isoformat(timespec='milliseconds')}  {event.state}  {event.reason}".rstrip())
+                code = f"{event.code}: " if event.code else ""
+                typer.echo(
+                    f"{event.at.isoformat(timespec='milliseconds')}  {event.state}  {code}{event.reason}".rstrip()
+                )
 
 
 @instance_app.command("delete")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import ipaddress
 import logging
 import math
@@ -36,6 +37,8 @@ _WITHOUT_FILES = 0.1
 """Seconds until the next attempt, when the system has no file for another connection."""
 _TAKEN_S = 30.0
 """Seconds in which somebody who was answered takes something of it; a stream is read as it comes."""
+_CROWD = 256
+"""After so many connections have gone, what they used is given back to the system."""
 _MOST_AROUND = 1 << 18
 """Bytes of a request that are not its body: line, headers, what frames chunks."""
 
@@ -81,37 +84,45 @@ class Book:
         self._most = most
         self.guests: set[Guest] = set()
         self._at: Counter[str] = Counter()
-        self._strangers: OrderedDict[Guest, None] = OrderedDict()
-        """Without a token so far, the oldest first."""
+        self._strangers: dict[str, OrderedDict[Guest, None]] = {}
+        """Without a token so far, by address, the oldest first."""
+        self._strange = 0
+        """How many these are."""
         self._of: dict[str, OrderedDict[Guest, None]] = {}
         """By owner, the one that was quiet for the longest first."""
 
     def room(self, address: str, *, free: bool = False) -> tuple[bool, Guest | None]:
         """Whether another one may come in, and who has to give way for it; ``free``: an address without a bound."""
-        if len(self.guests) >= self._most:
+        if len(self.guests) >= self._most or self._strange >= self._limits.strangers:
             gives_way = self.stranger()
             return gives_way is not None, gives_way
         if not free and self._at[address] >= self._limits.connections_per_address:
-            gives_way = next((guest for guest in self._strangers if guest.address == address), None)
+            gives_way = next(iter(self._strangers.get(address, ())), None)
             return gives_way is not None, gives_way
         return True, None
 
     def stranger(self) -> Guest | None:
-        """The one that has been here for the longest without a token."""
-        return next(iter(self._strangers), None)
+        """Of the address with most connections without a token, the one that has been here for the longest."""
+        crowd = max(self._strangers.values(), key=len, default=None)
+        return next(iter(crowd)) if crowd else None
+
+    def is_alone(self, guest: Guest) -> bool:
+        """Whether its address has no other connection."""
+        return self._at[guest.address] == 1
 
     def come(self, guest: Guest) -> None:
         """It is here now."""
         self.guests.add(guest)
         self._at[guest.address] += 1
-        self._strangers[guest] = None
+        self._strangers.setdefault(guest.address, OrderedDict())[guest] = None
+        self._strange += 1
 
     def know(self, guest: Guest, owner: str) -> Guest | None:
         """It has shown a good token; perhaps another one of the same owner gives way."""
         if guest not in self.guests:
             return None
         if guest.owner != owner:
-            self._strangers.pop(guest, None)
+            self._forget_stranger(guest)
             self._forget_owner(guest)
             guest.owner = owner
         mine = self._of.setdefault(owner, OrderedDict())
@@ -126,11 +137,19 @@ class Book:
         if guest not in self.guests:
             return
         self.guests.discard(guest)
-        self._strangers.pop(guest, None)
+        self._forget_stranger(guest)
         self._forget_owner(guest)
         self._at[guest.address] -= 1
         if not self._at[guest.address]:
             del self._at[guest.address]
+
+    def _forget_stranger(self, guest: Guest) -> None:
+        crowd = self._strangers.get(guest.address)
+        if crowd is not None and guest in crowd:
+            del crowd[guest]
+            self._strange -= 1
+            if not crowd:
+                del self._strangers[guest.address]
 
     def _forget_owner(self, guest: Guest) -> None:
         mine = self._of.get(guest.owner)
@@ -273,6 +292,8 @@ class Door:
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._told_at = -math.inf
+        self._most_here = 0
+        """Since memory was given back."""
         self.book = Book(limits, most)
         listener.setblocking(False)
         self._open = True
@@ -312,6 +333,8 @@ class Door:
         address, proxy = _place_of(host), self._is_proxy(host)
         has_room, gives_way = self.book.room(address, free=proxy)
         if gives_way is not None:
+            if self.book.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
+                self._strain.note()
             self._end(gives_way)
         if not has_room:
             taken.close()
@@ -329,8 +352,10 @@ class Door:
     async def _greet(self, taken: socket.socket, guest: Guest) -> None:
         taken.setblocking(False)
         guest.socket = taken
+        protocol: Any = None
 
         def make() -> Any:
+            nonlocal protocol
             protocol = self._make()
             protocol.guest, protocol.book, protocol.limits = guest, self.book, self._limits
             return protocol
@@ -341,6 +366,8 @@ class Door:
         except (OSError, asyncio.CancelledError):  # it left, or what it speaks is no TLS
             self.book.leave(guest)
             taken.close()
+            if protocol is not None:
+                protocol.parser = None  # it holds the protocol, which holds it: thousands would wait for the collector
         finally:
             guest.socket = None
 
@@ -368,6 +395,11 @@ class Door:
             now = self._loop.time()
             for guest in self.book.late(now):
                 self._end(guest)
+            here = len(self.book.guests)
+            self._most_here = max(self._most_here, here)
+            if self._most_here - here >= _CROWD:
+                self._most_here = here
+                _give_back()
             await asyncio.sleep(_SWEEP)
 
     def _is_proxy(self, address: str) -> bool:
@@ -382,6 +414,13 @@ class Door:
         if now - self._told_at >= 60.0:
             self._told_at = now
             log.warning(text, what)
+
+
+def _give_back() -> None:
+    """Memory that is free, but between what is not: the C library keeps it for good, 50 kB of a connection with TLS."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+    if trim is not None:
+        trim(0)
 
 
 def _place_of(host: str) -> str:

@@ -139,6 +139,7 @@ instances = Table(
     Column("spare", Boolean, nullable=False, server_default=false()),
     Column("claim", String(64), comment="SHA-256 of the claim that got the session's key; NULL: nobody did"),
     Column("key_id", String(32), nullable=False, server_default=""),
+    Column("said", Integer, nullable=False, server_default="0", comment="See Record.said"),
     Column("version", Integer, nullable=False),
 )
 
@@ -150,6 +151,7 @@ events = Table(
     Column("at", Float, nullable=False),
     Column("state", String(16), nullable=False),
     Column("reason", String(1024), nullable=False),
+    Column("code", String(63), nullable=False, server_default="", comment="Of what the service said; empty: our own"),
     Index(None, "instance", "id"),
     sqlite_autoincrement=True,  # an id that a watcher has seen must not come again after pruning
 )

@@ -98,9 +98,9 @@ def install(app: FastAPI) -> None:
 
 
 class GivenUp:
-    """ASGI middleware: whoever still waits when the orchestrator ends is told to ask again.
+    """ASGI middleware: whoever still waits when the orchestrator ends is told to ask again, and a stream ends there.
 
-    The server cancels what takes too long then, and would answer that it made a mistake (500).
+    The server cancels what takes too long then, would answer that it made a mistake (500), and writes a traceback.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -108,16 +108,21 @@ class GivenUp:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        begun = False
+        begun = streams = False
 
         async def noting(message: Message) -> None:
-            nonlocal begun
+            nonlocal begun, streams
+            if message["type"] == "http.response.start":
+                streams = all(name.lower() != b"content-length" for name, _ in message.get("headers", ()))
             begun = True
             await send(message)
 
         try:
             await self._app(scope, receive, noting)
         except asyncio.CancelledError:
+            if streams:  # it goes on elsewhere, from what came last
+                await send({"type": "http.response.body"})
+                return
             if begun or scope["type"] != "http":
                 raise
             headers = {"Retry-After": _RETRY_AFTER, "Connection": "close"}

@@ -27,6 +27,7 @@ from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, St
 from .records import Record
 from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .security import SecretFileError, Secrets
+from .service_events import ServiceEvents
 from .settings import Limits, Timing, Weights
 from .sites import Site, Sites
 from .store import Store
@@ -83,6 +84,7 @@ class Reconciler:
         self._site_instances = site_instances
         self._stored = stored
         self._strain = strain or Strain(steady)
+        self._service_events = ServiceEvents(store, steady)
         self._store = store
         self._secrets = secrets
         self._metrics = metrics
@@ -372,6 +374,7 @@ class Reconciler:
         if whole:
             site.ended = self._ended_of(looked.keys() - ids, frozenset() if due else site.ended)
         looked = self._bounded(site, live, looked) if whole else looked
+        live = self._service_events.keep(live, looked, now)
         actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
         done = [action for action in actions if self._act(site, action)]
         if due:
@@ -442,7 +445,7 @@ class Reconciler:
 
     def _start(self, site: Site, record: Record) -> None:
         # Noted first: an orchestrator killed in between finds either nothing, and starts, or its run, and adopts.
-        noted = self._store.change(record, self._clock(), started_at=self._clock())
+        noted = self._store.change(record, self._clock(), started_at=self._clock(), said=0)
         if noted is None:
             return
         try:

@@ -93,6 +93,8 @@ class Record:
     """Warm, and nobody's yet: it has no robot and no lease."""
     key_id: str = ""
     """Fingerprint of the secret key that its session's is derived from; empty: from before they were noted."""
+    said: int = 0
+    """Number of the last report of the present run that became an event: whoever leads next tells none twice."""
     version: int = 1
     """Counts changes: who changes a record must have seen the last one."""
 

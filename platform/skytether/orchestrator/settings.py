@@ -91,9 +91,12 @@ class Limits(Group):
     """Largest request of a robot: its parameters, or all that it reports with a renewal, 320 bytes for each topic."""
     connections: Count = 8192
     """Open connections of all, at most half of the files that the system lets the program have. Of more, one that has
-    shown no good token gives way, the oldest first."""
+    shown no good token gives way."""
     connections_per_address: Count = 2048
     """The same of one address (IPv6: one /64 network), as of all robots behind one router; not of `proxies`."""
+    strangers: Count = 1024
+    """The same of those that have shown no good token, which cost 130 kB each with TLS. Of more, the oldest of the
+    address that has most of them gives way."""
     connections_per_robot: Count = 32
     """Of more, the one that was quiet for the longest is closed."""
     head_s: Seconds = 10.0

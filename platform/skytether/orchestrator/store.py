@@ -1,14 +1,15 @@
 """Instances in the database, their events, reports and sums.
 
 Changes of instances are compare-and-set on the record's version: load, work outside any transaction, apply; who has not
-seen the last change gets None and looks again. Each change of state or reason leaves an event.
+seen the last change gets None and looks again. Each change of state or reason leaves an event, and so does what a
+service reports.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -36,6 +37,7 @@ from sqlalchemy.sql.dml import ReturningUpdate
 
 from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import State
+from skytether.api.service_report import ServiceReport
 
 from .accounts import MOST_NAMES, Account, merge
 from .database import Database
@@ -54,13 +56,15 @@ _FETCHED = 500
 
 @dataclass(frozen=True, slots=True)
 class EventRow:
-    """One change of an instance."""
+    """One change of an instance, or what it reported."""
 
     id: int
     instance: str
     at: float
     state: State
     reason: str
+    code: str
+    """Of a report; empty: a change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,6 +308,23 @@ class Store(Database):
             self.on_change(new.id)
         return new
 
+    def tell(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
+        """Keep what the present run of an instance reported, as events, if the instance is still as it was seen.
+
+        Returns:
+            The record as it is now; None if somebody else changed it meanwhile.
+        """
+        changes = {"version": record.version + 1, "said": reports[-1].number}
+        said = {"instance": record.id, "at": now, "state": record.state.value}
+        with self._writing() as connection:
+            if connection.execute(_CHANGE, {**changes, **_as_seen(record)}).rowcount == 0:
+                return None
+            connection.execute(_EVENT, [{**said, "reason": one.message, "code": one.code} for one in reports])
+        new = record.after(changes)
+        self._remember(new)
+        self.on_change(new.id)
+        return new
+
     def claim(
         self, spare: Record, changes: dict[str, Any], now: float, owner: str, key: str | None, body_sha256: str
     ) -> Record | None:
@@ -451,7 +472,7 @@ class Store(Database):
         query = select(events).where(events.c.instance == instance, events.c.id > after).order_by(events.c.id)
         with self._reader.connect() as connection:
             rows = connection.execute(query).all()
-        return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason) for row in rows]
+        return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason, row.code) for row in rows]
 
     def prune(self, now: float, ended_age: float, ended_count: int, events_count: int) -> list[tuple[str, str | None]]:
         """Forget ended instances that are too old or too many, their events, keys and sums, and the oldest events.

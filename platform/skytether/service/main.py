@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from pydantic import ValidationError
 
 from skytether.api.grant import DEFAULT_GRANT_PATH, GRANT_VARIABLE, Grant
+from skytether.api.service_report import FILE_NAME
 from skytether.messages import warm
 from skytether.wire.topic import Role
 
@@ -101,6 +102,8 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
     except ValueError as error:
         raise ConfigError(f"the grant is wrong: {error}") from None
     service = cls(params, Context(grant.robot, grant.instance, Path(grant.data_dir), time.time() - time.monotonic()))
+    if grant.ready_file is not None:
+        service.reports.path = Path(grant.ready_file).with_name(FILE_NAME)
     with closing(SystemClock()) as clock:
         port = ServicePort(service, clock.wake)
         loop = Loop(service, port, clock, grant.idle_exit_s)

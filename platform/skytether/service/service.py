@@ -15,6 +15,7 @@ from skytether.messages import ServiceType
 from .calls import Caller
 from .mailbox import Mailbox, RawQueue, Sender
 from .params import NoParams, schema_of
+from .reports import Reports
 from .topics import Answer, AnyInput, Call, Declared, Input, Output
 
 P = TypeVar("P")
@@ -73,6 +74,7 @@ class Service(ABC, Generic[P]):
         self.params = params
         self.context = context or Context()
         self.log = logging.getLogger(type(self).__name__)
+        self.reports = Reports()
         self.mailboxes: dict[str, Mailbox[Any]] = {}
         self.senders: dict[str, Sender[Any]] = {}
         self.anything: RawQueue | None = None
@@ -94,6 +96,22 @@ class Service(ABC, Generic[P]):
 
     def stop(self) -> None:
         """Called once after the last step, also after one that raised: close what is open."""
+
+    def report(self, code: str, message: str) -> None:
+        """Tell people something: it becomes an event of the instance, and a line of its log.
+
+        Of many in a short time the orchestrator takes the newest: it is for what somebody should know, not for
+        measurements.
+
+        Args:
+            code: For programs: small letters, digits and underscores.
+            message: A sentence; 300 characters of it are kept.
+
+        Raises:
+            ValueError: The code is none.
+        """
+        self.reports.add(code, message)
+        self.log.info("%s: %s", code, message)
 
     def _open(self, declared: Declared) -> object:
         """Make what stands behind one declaration."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +17,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from skytether.api.manifest import ServiceSpec, Strict
+from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.runtimes.base import (
     Capacity,
     Launch,
@@ -47,6 +48,7 @@ class FakeRun:
     exit_status: int | None = None
     last_line: str = ""
     log: str = ""
+    reports: tuple[ServiceReport, ...] = ()
 
 
 class FakeWorld(dict[str, FakeRun]):
@@ -103,7 +105,10 @@ class FakeRuntime(Runtime):
         if old is not None and old.launch.attempt > launch.attempt and not old.ended:
             raise OvertakenError(f"attempt {old.launch.attempt} of {launch.instance} runs already")
         log = f"{old.log if old else ''}run {launch.attempt} of {launch.grant.service}\n"
-        self.world[launch.instance] = FakeRun(launch, old.port if old else next(self._ports), log=log)
+        said = launch.grant.params.get("report")
+        reports = (ServiceReport(1, "said", said),) if said else ()
+        port = old.port if old else next(self._ports)
+        self.world[launch.instance] = FakeRun(launch, port, log=log, reports=reports)
         self.started.append((launch.instance, launch.attempt))
 
     def observe(self) -> Mapping[str, Observation]:
@@ -118,7 +123,8 @@ class FakeRuntime(Runtime):
             return Observation(attempt, Phase.EXITED, exit_status=run.exit_status, last_line=run.last_line)
         if run.looks < self.looks_until_ready:
             return Observation(attempt, Phase.STARTING)
-        return Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
+        here = Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, reports=run.reports)
+        return replace(here, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
 
     def stop(self, instance: str, *, force: bool) -> None:
         self._must_lead()

@@ -38,6 +38,8 @@ class Behaviour:
     """Says the names of all its environment variables."""
     flood: int = 0
     """Says this many lines."""
+    report: str = ""
+    """Reports this, with the code ``said``, before it is ready."""
     hog_mb: int = 0
     """Takes this much memory before it is ready."""
 
@@ -64,6 +66,9 @@ def main() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind((grant["bind_host"], grant["bind_port"]))
         ready = Path(grant["ready_file"])
+        if wanted.report:
+            told = {"reports": [{"number": 1, "code": "said", "message": wanted.report}]}
+            ready.with_name("reports.json").write_text(json.dumps(told))
         if not wanted.never_ready:
             draft = ready.with_suffix(".new")
             draft.write_text(json.dumps({"port": bound.getsockname()[1], "pid": os.getpid()}))

@@ -163,7 +163,7 @@ def _is_over(core: Orchestrator, record: Record) -> bool:
 async def events(
     core: Core, record: Own, last_event_id: Annotated[int, Header(ge=0)] = 0
 ) -> AsyncIterator[ServerSentEvent]:
-    """All changes so far after ``Last-Event-ID``, then each as it comes; the stream ends with the instance."""
+    """All events so far after ``Last-Event-ID``, then each as it comes; the stream ends with the instance."""
     last, ended = last_event_id, False
     with core.broker.subscribe(record.id) as changed:
         while not core.broker.closed:
@@ -174,9 +174,9 @@ async def events(
             for row in rows:
                 last = row.id
                 event = InstanceEvent(
-                    id=row.id, instance=row.instance, at=utc(row.at), state=row.state, reason=row.reason
+                    id=row.id, instance=row.instance, at=utc(row.at), state=row.state, reason=row.reason, code=row.code
                 )
-                yield ServerSentEvent(id=str(row.id), event="state", data=event)
+                yield ServerSentEvent(id=str(row.id), event="report" if row.code else "state", data=event)
             if ended:
                 return
             with contextlib.suppress(TimeoutError):

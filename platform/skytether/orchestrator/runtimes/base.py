@@ -24,6 +24,7 @@ from typing import Any, ClassVar
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec, Strict
+from skytether.api.service_report import ServiceReport
 
 
 class Phase(StrEnum):
@@ -63,6 +64,9 @@ class Observation:
     received_bytes: int | None = None
     """By the network, of this run so far."""
     sent_bytes: int | None = None
+    reports: tuple[ServiceReport, ...] = ()
+    """The newest that the run reported, read from the file beside its ready file within some seconds; a runtime that
+    cannot reads none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +195,7 @@ class Runtime(ABC):
         Called before the first look of a leader at the site, again until it succeeds. Until then a runtime acts for
         whoever asks, as tools and single orchestrators do. Whatever an earlier leader begins after this is refused with
         ``OvertakenError`` and does nothing; what it had begun before is seen by ``observe``, now or when it is done.
+        What ``observe`` tells after this was looked at after this: who leads begins anew what it does not see.
 
         Args:
             epoch: Of the leader, above 0; each new leader has a higher one than all before.

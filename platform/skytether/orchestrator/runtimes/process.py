@@ -307,14 +307,21 @@ class ProcessRuntime(Runtime):
             status = run.child.poll() if run.child else None
             if run.child and status is None:
                 return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
-            return Observation(
-                run.attempt, Phase.EXITED, exit_status=status, last_line=last_line(Path(run.folder, "log"))
-            )
+            line = last_line(Path(run.folder, "log"))
+            return Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=line, reports=run.reports())
         port = run.port()
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
-        used = stat.memory_bytes
-        return Observation(run.attempt, phase, host, port, exceeds=run.exceeds, cpu_s=stat.cpu_s, memory_bytes=used)
+        return Observation(
+            run.attempt,
+            phase,
+            host,
+            port,
+            exceeds=run.exceeds,
+            cpu_s=stat.cpu_s,
+            memory_bytes=stat.memory_bytes,
+            reports=run.reports(),
+        )
 
     def stop(self, instance: str, *, force: bool) -> None:
         with self._fence.acting(instance):

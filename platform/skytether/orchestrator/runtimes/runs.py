@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.api.grant import GRANT_VARIABLE
+from skytether.api.service_report import FILE_NAME, ServiceReport, pull_reports
 
 from .base import Observation, Phase, RuntimeFailure
 from .fence import Fence
@@ -65,6 +66,8 @@ class Run:
     """As it was when it was read last."""
     ready: tuple[Stamp, int] | None = None
     """Which ready file was read, and its port."""
+    reported: tuple[Stamp, tuple[ServiceReport, ...]] | None = None
+    """Which file of reports was read, and what is in it."""
 
     @property
     def ended(self) -> Observation | None:
@@ -92,6 +95,16 @@ class Run:
             port = noted_port(Path(self.ready_file))
             self.ready = None if port is None else (written, port)
         return self.ready[1] if self.ready else None
+
+    def reports(self) -> tuple[ServiceReport, ...]:
+        """What it reported; read again where it was written again."""
+        path = f"{os.path.dirname(self.ready_file)}/{FILE_NAME}"
+        written = _stamp(path)
+        if written is None:
+            return ()
+        if self.reported is None or self.reported[0] != written:
+            self.reported = written, pull_reports(read_json(Path(path)))
+        return self.reported[1]
 
     def kill(self) -> None:
         """Kill it and everything in its session, and of its own user: it may have left the session."""

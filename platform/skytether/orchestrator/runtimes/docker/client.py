@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
 from http import HTTPStatus
+from http.client import HTTPResponse
+from math import inf
 from typing import Any
 
 import requests
@@ -30,6 +34,9 @@ class Client(APIClient):
         super().__init__(*arguments, **options)
         # What the environment says of proxies and authorities is meant for the Internet, not for an engine.
         self.trust_env = False
+        adapters: Iterable[Any] = self.adapters.values()
+        for adapter in adapters:
+            adapter.get_connection_with_tls_context = partial(_hurried, adapter.get_connection_with_tls_context)
 
     @override
     def send(self, request: requests.PreparedRequest, **options: Any) -> requests.Response:
@@ -37,7 +44,9 @@ class Client(APIClient):
         patience = options.get("timeout") or self.timeout
         answer = super().send(request, **{**options, "timeout": patience, "stream": True})
         if answer.status_code >= HTTPStatus.BAD_REQUEST or not options.get("stream"):
-            _read(answer, patience)
+            _read(answer)
+        else:
+            _original(answer).until = inf
         return answer
 
     @override
@@ -51,7 +60,8 @@ class Client(APIClient):
                 yield json.loads(line)
             return
         if not response.raw.chunked:
-            _read(response, self.timeout)
+            _original(response).until = time.monotonic() + self.timeout
+            _read(response)
         yield from super()._stream_helper(response, decode)  # type: ignore[misc]
 
     def _multiplexed_response_stream_helper(self, response: requests.Response) -> Iterator[bytes]:
@@ -67,20 +77,74 @@ class Client(APIClient):
                 yield piece
 
 
-def _read(answer: requests.Response, patience: float) -> None:
-    """Take all of an answer, as the library does it, within ``patience`` [s].
+class _Hurried(io.RawIOBase):
+    """What comes from a socket, up to a moment: http.client waits for each byte anew, and so without end for drops."""
+
+    def __init__(self, sock: Any, raw: io.RawIOBase, answer: _Answer) -> None:
+        self._sock, self._raw, self._answer = sock, raw, answer
+        self._patience = sock.gettimeout()
+
+    @override
+    def readable(self) -> bool:
+        return True
+
+    @override
+    def readinto(self, buffer: Any) -> int | None:
+        left = self._answer.until - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        if self._patience is not None and left < inf:
+            self._sock.settimeout(min(left, self._patience))
+        return self._raw.readinto(buffer)
+
+    @override
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _Answer(HTTPResponse):
+    """Head and body are there within the socket's time-out, but for a stream's."""
+
+    def __init__(self, sock: Any, *arguments: Any, **options: Any) -> None:
+        super().__init__(sock, *arguments, **options)
+        self.until = time.monotonic() + (sock.gettimeout() or inf)
+        self.fp = io.BufferedReader(_Hurried(sock, self.fp.detach(), self))
+
+
+def _hurried(get: Any, *arguments: Any, **options: Any) -> Any:
+    """A pool whose connections' answers are such ones."""
+    pool = get(*arguments, **options)
+    make = pool._new_conn  # noqa: SLF001 (the SDK's pools have their own, and no other place for it)
+    if not isinstance(make, partial):
+        pool._new_conn = partial(_connection, make)  # noqa: SLF001
+    return pool
+
+
+def _connection(make: Any) -> Any:
+    made = make()
+    made.response_class = _Answer
+    return made
+
+
+def _original(answer: requests.Response) -> Any:
+    """http.client's, below those of two libraries."""
+    return answer.raw._original_response  # noqa: SLF001
+
+
+def _read(answer: requests.Response) -> None:
+    """Take all of an answer, as the library does it.
 
     Raises:
         requests.RequestException: It has no end.
     """
-    pieces, size, until = [], 0, time.monotonic() + patience
+    pieces, size = [], 0
     for piece in answer.iter_content(_PIECE):
         pieces.append(piece)
         size += len(piece)
-        if size > _MOST or time.monotonic() > until:
+        if size > _MOST:
             answer.close()
-            why = f"more than {_MOST >> 20} MiB" if size > _MOST else "without an end in time"
-            raise requests.ConnectionError(f"an answer of {why}")
+            raise requests.ConnectionError(f"an answer of more than {_MOST >> 20} MiB")
     answer._content = b"".join(pieces)  # noqa: SLF001 (it has no other way to be given it)
 
 

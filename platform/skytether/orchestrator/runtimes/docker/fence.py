@@ -3,7 +3,8 @@
 An engine has no lock, so an act cannot be kept from being overtaken between its look and its call. What makes that
 harmless: a container is made first, under a name that only one can have; then it is looked whether another one leads;
 only then it is begun. Whatever a later leader finds made and not begun it removes. And what is to be ended is chosen
-before it is looked whether another one leads: so nothing is ended that a later leader has begun.
+before it is looked whether another one leads: so nothing is ended that a later leader has begun. A container whose
+begin got no answer is left as it is where another one leads by now, who may have adopted it.
 """
 
 from __future__ import annotations

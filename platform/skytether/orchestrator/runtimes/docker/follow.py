@@ -14,10 +14,12 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from http import HTTPStatus
+from itertools import count
 from typing import Any
 
 import requests
 import urllib3
+from docker import APIClient
 from docker.errors import NotFound
 
 from ..base import RuntimeFailure
@@ -35,6 +37,8 @@ _SHORT_S = 0.1
 """A stream that was shorter is not opened anew at once."""
 _READY_S = 0.02
 """Between two looks for the ready file of a container that starts; each costs the engine some 3 ms."""
+_REMEMBERED = 256
+"""Containers that are gone of which it is known: a look that was begun before need not find them again."""
 _TAIL = 20
 """Lines of a log among which the last one that can be read is looked for."""
 _TOLD = frozenset({"create", "start", "die", "oom", "pause", "unpause", "stop", "restart", "rename", "update"})
@@ -49,12 +53,17 @@ class Follower:
         """``on_connect`` is called with each new connection; it must not wait. ``timeout_s``: the engine's patience."""
         self._engine = engine
         self._quiet_s = min(_QUIET_S, 5 * timeout_s)  # not oftener than a busy engine can bear
-        self._owner = owner
+        self._mine = {"label": [f"{OWNER}={owner}"]}
         self._on_connect = on_connect
         self._lock = threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._helpers: dict[str, Helper] = {}
         self._awaited: set[str] = set()
+        self._turns = count()
+        self._shown: dict[str, int] = {}
+        """By container, the turn of the look that is shown: one that was begun before that is late."""
+        self._gone: dict[str, int] = {}
+        """The same of those that were forgotten last."""
         self._failure: RuntimeFailure | None = None
         self._connected = False
         self._looked = threading.Event()
@@ -117,8 +126,31 @@ class Follower:
         """It is gone."""
         self.meter.forget(container)
         with self._lock:
+            self._shown.pop(container, None)
+            self._gone[container] = next(self._turns)
+            if len(self._gone) > _REMEMBERED:
+                del self._gone[next(iter(self._gone))]
             self._seen.pop(container, None)
             self._helpers.pop(container, None)
+
+    def catch_up(self, timeout_s: float) -> None:
+        """List anew, now: what is seen after this is no older than the call.
+
+        Events are told one after the other, and each is looked at: on a busy engine that can be half a minute behind.
+
+        Raises:
+            EngineGoneError: The engine does not answer, or has not been looked at once within ``timeout_s`` [s].
+            RuntimeFailure: What it answers is not understood.
+        """
+        self._must_answer(timeout_s)
+        try:
+            with self._engine.asked():
+                before, rows = self._list(self._engine.api())
+            self._take(before, rows, anew=False)
+        except RuntimeFailure:
+            raise
+        except Exception as error:  # as in the thread: an engine may be anybody's
+            raise _not_understood(error) from error
 
     def look(self, container: str) -> Seen | None:
         """Look at one container now; None: it is not there, or not ours.
@@ -126,6 +158,8 @@ class Follower:
         Raises:
             RuntimeFailure: The engine does not answer.
         """
+        with self._lock:
+            turn = next(self._turns)
         with self._engine.asked():
             try:
                 inspected = self._engine.api().inspect_container(container)
@@ -138,9 +172,13 @@ class Follower:
             seen = carried_over(seen, old)
             if seen.ended and (old is None or not old.ended):
                 seen = replace(seen, last_line=self._last_line(container))
+        if seen is None and helper is None:
+            self.forget(container)
+            return None
         with self._lock:
-            self._seen.pop(container, None)
-            self._helpers.pop(container, None)
+            if max(self._shown.get(container, turn), self._gone.get(container, turn)) > turn:
+                return self._seen.get(container)
+            self._shown[container] = turn
             if seen is not None:
                 self._seen[container] = seen
             if helper is not None:
@@ -172,7 +210,7 @@ class Follower:
                 self._lost(error)
             except Exception as error:
                 # Whatever it is, the next look sees everything anew; a dead thread would see nothing ever.
-                failure = RuntimeFailure(f"the Docker engine's answer is not understood: {root_cause(error)}")
+                failure = _not_understood(error)
                 if str(failure) != str(self._failure):  # once, though it is asked every second
                     log.exception("following the engine failed")
                 self._lost(failure)
@@ -184,50 +222,57 @@ class Follower:
         self._closing.wait(_AGAIN_S)
 
     def _follow(self) -> None:
-        mine = {"label": [f"{OWNER}={self._owner}"]}
-        with self._lock:
-            before = self._seen.keys() | self._helpers.keys()
         with self._engine.asked():
             api = self._engine.api()
             self._info = api.info()
             # By the engine's clock: events from before the list are looked at again, and none is missed.
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
             quiet = self._engine.api(self._quiet_s)
-            rows = api.containers(all=True, filters=mine)
-        # What holds a network comes before who is in there, whose network would seem to be gone.
-        there = [row["Id"] for row in sorted(rows, key=lambda row: INSTANCE in (row["Labels"] or ()))]
-        for container in before - set(there):  # and not what a start has made and looked at since
-            self.forget(container)
-        self._look_at_all(there if not self._connected else self._changed(rows, there))
+            before, rows = self._list(api)
+        self._take(before, rows, anew=not self._connected)
         self._failure = None
         self._looked.set()
         if not self._connected:
             self._connected = True
             self._on_connect()
             self._await_all()
+            return  # a look at all takes its time, and an engine keeps its last 256 events only: the next list is short
         try:
             # Podman answers with the first event only, so that silence until then says nothing of the engine.
             with self._engine.asked(), suppress(requests.ReadTimeout):
-                self._stream = quiet.events(since=since, filters={**mine, "type": ["container"]}, decode=True)
+                self._stream = quiet.events(since=since, filters={**self._mine, "type": ["container"]}, decode=True)
             self._read_events()
         finally:
             self._end_stream()
+
+    def _list(self, api: APIClient) -> tuple[set[str], list[dict[str, Any]]]:
+        """Those that were seen before, and those that there are now."""
+        with self._lock:
+            before = self._seen.keys() | self._helpers.keys()
+        return before, api.containers(all=True, filters=self._mine)
+
+    def _take(self, before: set[str], rows: Sequence[Mapping[str, Any]], *, anew: bool) -> None:
+        """Look at what has changed by a list, or at all of it ``anew``."""
+        # What holds a network comes before who is in there, whose network would seem to be gone.
+        there = [row["Id"] for row in sorted(rows, key=lambda row: INSTANCE in (row["Labels"] or ()))]
+        for container in before - set(there):  # and not what a start has made and looked at since
+            self.forget(container)
+        for container in there if anew else self._changed(rows, there):
+            seen = self.look(container)
+            if anew and seen is not None and seen.runs and not seen.ready:
+                self._look_ready(container)  # or an adopted one would seem to start
 
     def _changed(self, rows: Sequence[Mapping[str, Any]], there: Sequence[str]) -> list[str]:
         """Those of a list that are not as they were seen last: events say the rest."""
         listed = {row["Id"]: (row.get("State"), "unhealthy" in str(row.get("Status"))) for row in rows}
         with self._lock:
-            seen = {one.id: (one.status, bool(one.ill)) for one in self._seen.values()}
+            # That it was connected to its network, and has a port since, no event tells.
+            known = [one for one in self._seen.values() if not one.runs or one.host_port is not None]
+            seen = {one.id: (one.status, bool(one.ill)) for one in known}
             run = [one.id for one in self._seen.values() if one.runs]
         for container in run:
             self.meter.follow(container)
         return [container for container in there if listed[container] != seen.get(container)]
-
-    def _look_at_all(self, there: Sequence[str]) -> None:
-        for container in there:
-            seen = self.look(container)
-            if not self._connected and seen is not None and seen.runs and not seen.ready:
-                self._look_ready(container)  # or an adopted one would seem to start
 
     def _read_events(self) -> None:
         with suppress(urllib3.exceptions.HTTPError, OSError, ValueError, AttributeError):  # ended, or silent too long
@@ -284,6 +329,10 @@ class Follower:
             with self._lock:
                 if container in self._seen:
                     self._seen[container] = replace(self._seen[container], ready=True)
+
+
+def _not_understood(error: Exception) -> RuntimeFailure:
+    return RuntimeFailure(f"the Docker engine's answer is not understood: {root_cause(error)}")
 
 
 def _seconds(moment: str) -> str:

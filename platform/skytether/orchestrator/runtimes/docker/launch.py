@@ -92,6 +92,7 @@ class Job:
         self._epoch = fence.epoch
         self._before = before
         self._cancelled = threading.Event()
+        self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._run, name="docker-start", daemon=True)
 
     @property
@@ -108,6 +109,10 @@ class Job:
     def cancel(self) -> None:
         """Let it come to nothing, wherever it is."""
         self._cancelled.set()
+
+    def leave(self) -> None:
+        """Begin nothing any more. What is begun by now runs on: it is the next leader's, who may have adopted it."""
+        self._leaving.set()
 
     def join(self, timeout_s: float) -> None:
         self._thread.join(timeout_s)
@@ -127,7 +132,10 @@ class Job:
             log.info("start of %s: %s", self.launch.instance, error)
             self.unanswered = True
         except StoppedError:
-            self.failure = "was stopped before it ran"
+            if self._cancelled.is_set():
+                self.failure = "was stopped before it ran"
+            else:
+                self.unanswered = True
         except EngineGoneError as error:
             log.warning("start of %s: %s", self.launch.instance, error)
             self._follower.doubt(error)
@@ -153,7 +161,7 @@ class Job:
         return False
 
     def _go_on(self) -> None:
-        if self._cancelled.is_set():
+        if self._cancelled.is_set() or self._leaving.is_set():
             raise StoppedError
 
     def _tell(self, detail: str) -> None:
@@ -174,6 +182,7 @@ class Job:
             self._prepare(anew=True)
             made = self._create(image, openings)
         if self._cancelled.is_set():
+            self._must_lead()  # whoever asked for its end may have been followed: it is the later leader's then
             with suppress(RuntimeFailure):
                 kill(self._engine, made.id, "KILL")
             self._follower.look(made.id)
@@ -293,7 +302,7 @@ class Job:
                 if namespace is not None:
                     try:
                         return self._run_in(image, port, gpus, openings, None, namespace)
-                    except (EngineGoneError, OvertakenError):
+                    except (EngineGoneError, OvertakenError, StoppedError):
                         raise
                     except RuntimeFailure as error:  # whoever removed that network, or whatever else it is
                         log.info("start of %s in a prepared network: %s", self.launch.instance, error)
@@ -324,18 +333,21 @@ class Job:
                 if error.status_code == HTTPStatus.CONFLICT:
                     raise _NameTakenError(explain(error)) from error
                 raise
+            begun = False
             try:
                 api.put_archive(made, *grant_archive(self.launch))
                 if guard is not None:
                     api.disconnect_container_from_network(made, network)
+                self._go_on()
                 self._must_lead()  # now that it is there for a later leader to see
+                begun = True  # or will be, whatever comes of the call
                 api.start(made)
                 seen = self._follower.look(made)
                 if guard is not None:
                     self._connect(guard, made, openings)
                     seen = self._follower.look(made)
             except BaseException as error:
-                self.given_up.add(made)
+                self._give_up(made, begun=begun)
                 remove(self._engine, self._follower, made)
                 said = explain(error) if isinstance(error, APIError) else ""
                 if any(words in said for words in _TAKEN):
@@ -346,6 +358,16 @@ class Job:
         if seen is None:
             raise RuntimeFailure("its container was removed by somebody else")
         return seen
+
+    def _give_up(self, made: str, *, begun: bool) -> None:
+        """Before it is removed; raises where that is another one's to decide: a later leader may have adopted it."""
+        self.given_up.add(made)
+        try:
+            if begun:
+                self._must_lead()
+        except OvertakenError:
+            self.given_up.discard(made)
+            raise
 
     def _connect(self, guard: str, made: str, openings: Openings) -> None:
         """Let it have the network, closed off; one that has ended meanwhile needs none."""

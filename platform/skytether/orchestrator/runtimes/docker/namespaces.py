@@ -194,18 +194,26 @@ class Namespaces:
         """Leave none of its own behind; where several orchestrators share a site, the others have theirs."""
         self._closing.set()
         deadline = self._clock() + self._options.timeout_s
-        own = self._forget()
+        own = self._forget()  # but what a start has that is not over: its container may just be begun in there
         with suppress(RuntimeFailure):  # whoever is next removes it
-            for container in self._left() if own else ():
+            if own:
+                self._follower.catch_up(self._options.timeout_s)  # who is in there need not have been told of yet
+            left = self._left() if own else []
+            if left:
+                self._must_lead()  # after the look, as ever
+            for container in left:
                 if container in own and self._clock() < deadline:
                     self.remove(container)
 
     def _forget(self) -> set[str]:
-        """Let whatever is made be finished, and none of it be kept; returns those that were handed out or might be."""
+        """Let whatever is made be finished, and none of it be kept; returns those that were handed out or might be.
+
+        What a start under way was given stays its own.
+        """
         if self._thread is not None:
             self._thread.join(self._options.timeout_s)
         with self._lock:
             own = {one.id for one in self._ready} | self._given
-            self._mine.clear()
+            self._mine -= {one.name for one in self._ready}
             self._ready.clear()
         return own

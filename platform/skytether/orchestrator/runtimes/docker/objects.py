@@ -12,6 +12,7 @@ from typing import Any
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec
+from skytether.api.service_report import FILE_NAME, ServiceReport
 
 from ..base import Launch, Observation, Phase
 from .egress import refusal_of
@@ -27,6 +28,7 @@ _OWN = "instance"
 """Folder of the grant and the ready file; only the service can read it."""
 GRANT = f"{_ROOT}/{_OWN}/grant.json"
 READY = f"{_ROOT}/{_OWN}/ready.json"
+REPORTS = f"{_ROOT}/{_OWN}/{FILE_NAME}"
 _DATA = "data"
 _LOG = {"max-size": "2m", "max-file": "2"}
 """The engine keeps at most this of each run's log."""
@@ -413,7 +415,13 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
 
 
 def observation(
-    seen: Seen, options: DockerOptions, usage: Usage | None = None, exceeds: str = "", *, cut_off: bool = False
+    seen: Seen,
+    options: DockerOptions,
+    usage: Usage | None = None,
+    exceeds: str = "",
+    *,
+    cut_off: bool = False,
+    reports: tuple[ServiceReport, ...] = (),
 ) -> Observation:
     """What the contract calls it; ``exceeds``: what it wrote too much of; ``cut_off``: its network is held no more."""
     if seen.ended:
@@ -424,13 +432,14 @@ def observation(
             exit_status=_SIGNALLED - seen.exit_code if signalled else seen.exit_code,
             last_line=seen.last_line,
             detail=_how_it_ended(seen),
+            reports=reports,
         )
     if seen.runs and seen.ready and seen.host_port is not None:
         used = asdict(usage) if usage is not None else {}
         where = options.advertised, seen.host_port
         ill = "the container that held its network has ended" if cut_off else seen.ill
-        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, **used)
-    return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds)
+        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, reports=reports, **used)
+    return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds, reports=reports)
 
 
 def _how_it_ended(seen: Seen) -> str:

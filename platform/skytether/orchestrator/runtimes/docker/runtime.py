@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import secrets
+import stat
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -38,6 +39,7 @@ from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
 from .objects import USER, Seen, data_volume, observation, refusal
 from .options import DockerOptions
+from .reports import ReportReader
 from .volumes import Scales, remove_left
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,8 @@ _LIMITS = {"MemoryLimit": "memory", "CpuCfsQuota": "processor time", "PidsLimit"
 """In words for people, what an engine says that it can limit."""
 _SWEEP_S = 10.0
 """Seconds between two looks for volumes whose containers somebody has removed."""
+_LEAVE_S = 10.0
+"""Seconds that starts under way get at the end: an engine that hangs must not hold up a restart for long."""
 _AGAIN_S = 10.0
 """Seconds between two attempts to make the network of a site ready that could not be."""
 
@@ -73,6 +77,8 @@ class DockerRuntime(Runtime):
         for path in (options.tls.ca, options.tls.cert, options.tls.key) if options.tls else ():
             if not Path(path).is_file():
                 raise RuntimeFailure(f"tls: there is no file {path}")
+        if options.tls and stat.S_IMODE(Path(options.tls.key).stat().st_mode) & 0o007:
+            raise RuntimeFailure(f"tls: others can read the key, and be us to the engine: chmod 600 {options.tls.key}")
         options.security  # noqa: B018 (a profile that cannot be read is told now)
         if options.registry_auth is not None:
             check_credentials(options.registry_auth)
@@ -97,12 +103,16 @@ class DockerRuntime(Runtime):
         self._namespaces = Namespaces(
             self._engine, options, self._owner, self._follower, self._prepare, self._fence.must_lead
         )
+        self._reports = ReportReader(self._engine, self._running)
         self._follower.start()
 
     @override
     @classmethod
     def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
         return {"owner": secrets.token_hex(6), **options}
+
+    def _running(self) -> list[str]:
+        return [seen.id for seen in self._follower.seen(self._options.timeout_s) if seen.runs]
 
     def _on_connect(self) -> None:
         self._network_ready = False  # network and guard's image may have been removed meanwhile
@@ -172,6 +182,7 @@ class DockerRuntime(Runtime):
     @override
     def lead(self, epoch: int) -> None:
         self._fence.lead(epoch)
+        self._follower.catch_up(self._options.timeout_s)  # after that: what the leader before has begun is in it
         with self._lock:
             # What came of starts for an earlier leader is seen; those that are under way are refused where they are.
             self._jobs = {instance: job for instance, job in self._jobs.items() if not job.ended}
@@ -239,6 +250,7 @@ class DockerRuntime(Runtime):
                 meter.usage(seen.id),
                 self._scales.exceeds(seen.volume, seen.other_volumes),
                 cut_off=bool(seen.namespace) and not (seen.namespace in helpers and helpers[seen.namespace].runs),
+                reports=self._reports.of(seen.id),
             )
             for instance, seen in newest.items()
             if seen.status != "created"
@@ -325,6 +337,7 @@ class DockerRuntime(Runtime):
             self._swept_at = time.monotonic()
             remove_left(self._engine, self._owner)
         self._scales.begin()
+        self._reports.begin()
         with self._lock:
             starting = any(not job.ended for job in self._jobs.values())
         starting |= any(seen.runs and not seen.ready for seen in self._follower.seen(self._options.timeout_s))
@@ -369,8 +382,12 @@ class DockerRuntime(Runtime):
     @override
     def close(self) -> None:
         with self._lock:
-            for job in self._jobs.values():
-                job.cancel()
+            jobs = [job for job in self._jobs.values() if not job.ended]
+        for job in jobs:
+            job.leave()
+        deadline = time.monotonic() + min(_LEAVE_S, self._options.timeout_s)
+        for job in jobs:
+            job.join(max(0.0, deadline - time.monotonic()))  # what it has begun is closed off, and seen in its network
         self._namespaces.close()
         self._follower.close()
         if self._early is not None:
