@@ -51,6 +51,7 @@ fmt: $(READY) ## format, and mend what can be mended
 
 docs: $(READY) ## the pages that are made from the code
 	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
+	$(BIN)/python .ci/parameters.py > docs/navigation-parameters.md
 
 licences: $(READY) ## the licences of all that requirements.lock names, as a page
 	$(BIN)/python .ci/licences.py > docs/licences.md

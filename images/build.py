@@ -38,6 +38,7 @@ PYTHON = "3.11"
 EXTRAS: dict[str, tuple[str, ...]] = {
     "base": (),
     "recorder": ("recorder",),
+    "navigation": ("navigation",),
     "orchestrator": ("orchestrator", "docker", "postgres", "recorder"),
 }
 """Images with wheels of their own, and the extras that these are; all but the base's, which they are built on."""

@@ -9,7 +9,8 @@ import typer
 
 from .lab_failover import alarms, failover
 from .lab_hostile import hostile
-from .lab_navigation import localisation, mapping
+from .lab_navigation import localisation, mapping, navigation
+from .lab_run import app as run_app
 from .lab_safety import safety
 from .lab_world import world
 from .output import console, fail, print_json, silenced
@@ -17,11 +18,13 @@ from .output import console, fail, print_json, silenced
 app = typer.Typer(help="Experiments and benchmarks on this machine.", no_args_is_help=True)
 bench = typer.Typer(help="Measure the real program, and print what was measured.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+app.add_typer(run_app, name="run")
 app.command("world")(world)
 bench.command("safety")(safety)
 bench.command("hostile")(hostile)
 bench.command("mapping")(mapping)
 bench.command("localisation")(localisation)
+bench.command("navigation")(navigation)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 

@@ -1,10 +1,10 @@
-"""``skytether lab bench mapping`` and ``localisation``: the service ``navigation`` on recorded logs."""
+"""``skytether lab bench mapping``, ``localisation`` and ``navigation``: the service ``navigation`` is measured."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -101,3 +101,101 @@ def localisation(
     except (CarmenError, NavigationBenchError, OSError) as error:
         fail(str(error))
     print_json(document)
+
+
+def navigation(
+    trajectories: Annotated[
+        int, typer.Option(min=10, max=20_000, help="That the controller tries in each step.")
+    ] = 1000,
+    goals: Annotated[int, typer.Option(min=1, max=9, help="So many of the building's nine goals.")] = 9,
+    delays: Annotated[
+        bool, typer.Option("--delays", help="Instead: over links of more and more delay, with each compensation.")
+    ] = False,
+    cluttered: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="Instead: through so many fields of cylinders.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="In each field.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Of the world's noise, of links and fields.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")] = False,
+) -> None:
+    """Drive the service navigation through the simulated building, and time each step of its loop of 30 Hz.
+
+    A step is all that the service does in one: localisation, costmaps, planner, controller, messages. Time is made up,
+    so nothing waits; compilation comes before, and is told apart. By the clock, and of the processor.
+    """
+    from skytether.lab.bench.navigation import NavigationBenchError, bench_driving
+
+    if delays and cluttered is not None:
+        fail("--delays and --cluttered are two benchmarks; give one of them", 2)
+    try:
+        with console.status("loading ...") as line:
+            if delays:
+                found = bench_driving("navigation-delays", goals=goals, seed=seed, progress=line.update)
+            elif cluttered is not None:
+                found = bench_driving(
+                    "navigation-cluttered", worlds=cluttered, runs=runs, seed=seed, progress=line.update
+                )
+            else:
+                found = bench_driving(
+                    "navigation", trajectories=trajectories, goals=goals, seed=seed, progress=line.update
+                )
+    except NavigationBenchError as error:
+        fail(str(error))
+    if json:
+        print_json(found)
+    elif delays:
+        _print_delays(found)
+    elif cluttered is not None:
+        _print_cluttered(found)
+    else:
+        _print_steps(found)
+
+
+def _print_steps(found: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    table = Table("ms per step", "p50", "p99", "max")
+    for name, text in (("wall", "by the clock"), ("cpu", "of the processor")):
+        table.add_row(text, *(f"{found[f'{name}_{part}_ms']:.2f}" for part in ("p50", "p99", "max")))
+    console.print(table)
+    console.print(
+        f"{found['steps']} steps, {found['trajectories']} trajectories of {found['trajectory_steps']} steps; "
+        f"{found['state']} after {found['driven_s']} s and {found['driven_m']} m, {found['contacts']} contacts; "
+        f"compilation and warm-up {found['warm_up_s']} s.",
+        highlight=False,
+    )
+    verdict = "within" if found["within_bar"] else "not within"
+    console.print(f"p99 by the clock is {verdict} {found['bar_p99_ms']:g} ms.", highlight=False)
+
+
+def _print_delays(found: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    table = Table("round trip", "jitter", "loss", "compensation", "ended", "time", "path error", "contacts")
+    for row in found["rows"]:
+        table.add_row(
+            f"{1000 * row['round_trip']:.0f} ms",
+            f"{1000 * row['jitter']:.0f} ms",
+            f"{100 * row['loss']:g} %",
+            row["compensation"],
+            row["state"],
+            f"{row['seconds']:.1f} s",
+            f"{1000 * row['path_error']:.0f} mm",
+            str(row["contacts"]),
+        )
+    console.print(table)
+    for name, text in (
+        ("time_within_bar", "At the longest round trip within 5 % of the time without delay"),
+        ("measured_beats_fixed", "With jitter and loss measured is nearer to the path than fixed"),
+        ("measured_halves_off", "and at most half as far off as without compensation"),
+    ):
+        console.print(f"{text}: {'yes' if found[name] else 'no'}.", highlight=False)
+
+
+def _print_cluttered(found: dict[str, Any]) -> None:
+    console.print(
+        f"{found['worlds']} fields of our own generator, {found['runs']} runs in each: "
+        f"{100 * found['success']:.1f} % without contact at the goal, score {found['score']:.3f} (not a BARN score).",
+        highlight=False,
+    )
+    console.print(f"95 % and 0.44 are {'met' if found['within_bar'] else 'not met'}.", highlight=False)

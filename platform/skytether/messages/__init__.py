@@ -21,6 +21,7 @@ from .codec import (
 from .geometry import (
     Point,
     Pose,
+    PoseArray,
     PoseStamped,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
@@ -90,6 +91,7 @@ __all__ = [
     "PointCloud2",
     "PointField",
     "Pose",
+    "PoseArray",
     "PoseStamped",
     "PoseWithCovariance",
     "PoseWithCovarianceStamped",

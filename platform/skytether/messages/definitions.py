@@ -21,6 +21,7 @@ _BOTH = {
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
     "geometry_msgs/msg/Point": "float64 x, float64 y, float64 z",
     "geometry_msgs/msg/Pose": "geometry_msgs/msg/Point position, geometry_msgs/msg/Quaternion orientation",
+    "geometry_msgs/msg/PoseArray": "std_msgs/msg/Header header, geometry_msgs/msg/Pose[] poses",
     "geometry_msgs/msg/PoseStamped": "std_msgs/msg/Header header, geometry_msgs/msg/Pose pose",
     "geometry_msgs/msg/PoseWithCovariance": "geometry_msgs/msg/Pose pose, float64[36] covariance",
     "geometry_msgs/msg/PoseWithCovarianceStamped": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -52,6 +53,14 @@ class PoseStamped(Message):
 
     header: Header = Header()
     pose: Pose = Pose()
+
+
+@message("geometry_msgs/msg/PoseArray")
+class PoseArray(Message):
+    """Poses in ``header.frame_id``, such as those of particles."""
+
+    header: Header = Header()
+    poses: Sequence[Pose] = ()
 
 
 @message("geometry_msgs/msg/PoseWithCovariance")

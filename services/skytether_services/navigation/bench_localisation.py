@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.likelihood_field import LikelihoodField, likelihood_field
 from skytether_services.navigation.localisation import Estimate, Localisation
-from skytether_services.navigation.motion_model import between, wrap
 from skytether_services.navigation.occupancy import Beams, map_from_scans
+from skytether_services.navigation.poses import between, wrap
 
 Array = NDArray[np.float64]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
@@ -10,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.control.admittance import Velocity
+from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
 
 from .costmap import Costmap
@@ -125,6 +126,38 @@ class FollowedPath:
     def left(self) -> float:
         """Way from the last place to the end [m]."""
         return float(self._along[-1] - self._along[self._index])
+
+
+class PathController(ABC):
+    """A `Controller`, but for what it is about: it refuses what cannot be driven, and asks ``drive`` for the rest."""
+
+    def __init__(self) -> None:
+        """Begin without a path."""
+        self._path: FollowedPath | None = None
+
+    def set_path(self, path: NDArray[np.float64]) -> None:
+        """As in `Controller`; raises ValueError for what is no path."""
+        self._path = FollowedPath(path) if len(path) else None
+
+    @abstractmethod
+    def reset(self) -> None:
+        """As in `Controller`."""
+
+    @abstractmethod
+    def drive(
+        self, path: FollowedPath, pose: Pose, velocity: Velocity, costmap: Costmap, speed_limit: float
+    ) -> Control:
+        """The command; all numbers are finite, but for a limit that is none."""
+
+    def control(self, pose: Pose, velocity: Velocity, costmap: Costmap, *, speed_limit: float = math.inf) -> Control:
+        """As in `Controller`."""
+        if self._path is None:
+            self.reset()
+            return Control(STANDSTILL, ControlStatus.NO_PATH)
+        if not all(math.isfinite(value) for value in (*pose, *velocity)) or math.isnan(speed_limit):
+            self.reset()
+            return Control(STANDSTILL, ControlStatus.NOT_FINITE)
+        return self.drive(self._path, pose, velocity, costmap, speed_limit)
 
 
 def turn_towards(error: float, angular: float, limits: MotionLimits, dt: float) -> float:

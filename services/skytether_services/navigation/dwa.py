@@ -17,7 +17,7 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
 
 from .compiled import compiled
-from .controller import Control, ControlStatus, FollowedPath, MotionLimits, turn_towards
+from .controller import Control, ControlStatus, FollowedPath, MotionLimits, PathController, turn_towards
 from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams
 from .footprint import Footprint, FootprintChecks, footprint_cost
 from .geometry import Pose, advance, wrap
@@ -97,15 +97,17 @@ def best_velocity(
     to_path: NDArray[np.float32],
     to_goal: NDArray[np.float32],
     weights: NDArray[np.float64],
+    goal: NDArray[np.float64],
+    near: bool,
 ) -> tuple[float, float, float]:
     """The best of the velocities, and its cost; infinite: all collide, or leave what was scored.
 
     Args:
         pose: x, y [m], yaw [rad].
-        linear: Forward velocities to try [m/s].
+        linear: Forward velocities to try [m/s]; of equals the first is taken.
         angular: Turning rates to try with each [rad/s].
         rate: The last command's turning rate [rad/s].
-        timing: Horizon, step [s]; above 0: without the point in front.
+        timing: Horizon, step [s].
         costs: Inflated, rows by columns.
         frame: Resolution, and x, y of the corner of cell (0, 0) [m].
         samples: Of the footprint.
@@ -113,6 +115,8 @@ def best_velocity(
         to_path: Of ``spread``, from the path.
         to_goal: Of ``spread``, from its last pose in the window.
         weights: Path and goal [1/cell], front [m], occupied, change.
+        goal: x, y of the path's end [m].
+        near: It is so near that ends are scored by their distance from it, not by cells.
     """
     rows, columns = costs.shape
     steps = max(1, int(np.ceil(timing[0] / timing[1])))
@@ -141,21 +145,26 @@ def best_velocity(
             fc = int((x + weights[2] * np.cos(yaw) - frame[1]) / frame[0])
             if r < 0 or c < 0 or r >= rows or c >= columns or fr < 0 or fc < 0 or fr >= rows or fc >= columns:
                 continue
-            total = weights[0] * to_path[r, c] + weights[1] * to_goal[r, c]
-            # Near the goal the point in front would pass it; and in front of the robot may be a wall.
-            if timing[2] > 0:
-                total *= 2.0
-            elif to_path[fr, fc] < np.inf:
-                total += weights[0] * to_path[fr, fc] + weights[1] * to_goal[fr, fc]
+            front = weights[2] / frame[0]
+            if near:
+                # A cell is too coarse now, and the way left too short to lead around anything.
+                total = 2.0 * weights[1] * np.hypot(x - goal[0], y - goal[1]) / frame[0]
             else:
-                total += weights[0] * to_path[r, c] + weights[1] * (to_goal[r, c] + weights[2] / frame[0])
+                total = weights[0] * to_path[r, c] + weights[1] * to_goal[r, c]
+                # In front of the robot may be a wall, or the goal already behind the point.
+                if to_goal[r, c] < front:
+                    total += weights[0] * to_path[r, c]
+                elif to_path[fr, fc] < np.inf:
+                    total += weights[0] * to_path[fr, fc] + weights[1] * to_goal[fr, fc]
+                else:
+                    total += weights[0] * to_path[r, c] + weights[1] * (to_goal[r, c] + front)
             total += weights[3] * worst + weights[4] * abs(w - rate)
             if total < best:
                 best, best_v, best_w = total, v, w
     return best_v, best_w, best
 
 
-class Dwa:
+class Dwa(PathController):
     """A `Controller`."""
 
     def __init__(
@@ -173,40 +182,36 @@ class Dwa:
             inflation: Of the costmaps to come: it tells from which cost on a polygon is looked at.
             params: Sizes and weights.
         """
+        super().__init__()
         self._params = params or DwaParams()
         self._limits = limits
         self._checks = FootprintChecks(footprint, inflation)
-        self._path: FollowedPath | None = None
         self._rate = 0.0
         self._turning = False
         self._at_goal = False
 
     def set_path(self, path: NDArray[np.float64]) -> None:
         goal = self._path.goal if self._path is not None else None
-        self._path = FollowedPath(path) if len(path) else None
+        super().set_path(path)
         if self._path is None or goal is None or math.dist(goal[:2], self._path.goal[:2]) > self._params.goal_within:
             self._at_goal = False
 
     def reset(self) -> None:
         self._rate, self._turning, self._at_goal = 0.0, False, False
 
-    def control(self, pose: Pose, velocity: Velocity, costmap: Costmap, *, speed_limit: float = math.inf) -> Control:
-        if self._path is None:
-            self.reset()
-            return Control(STANDSTILL, ControlStatus.NO_PATH)
-        if not all(math.isfinite(value) for value in (*pose, *velocity)) or math.isnan(speed_limit):
-            self.reset()
-            return Control(STANDSTILL, ControlStatus.NOT_FINITE)
-        goal = self._path.goal
-        path = self._path.ahead(pose.x, pose.y, math.inf, costmap.resolution)
+    def drive(
+        self, path: FollowedPath, pose: Pose, velocity: Velocity, costmap: Costmap, speed_limit: float
+    ) -> Control:
+        goal = path.goal
+        poses = path.ahead(pose.x, pose.y, math.inf, costmap.resolution)
         near = math.dist(pose[:2], goal[:2])
-        if near <= self._params.goal_within and self._path.left() < 1.0:
+        if near <= self._params.goal_within and path.left() < 1.0:
             self._at_goal = True
         elif near > 2.5 * self._params.goal_within:
             self._at_goal = False
         if self._at_goal:
             return self._turn(pose, velocity, costmap, goal.yaw - pose.yaw)
-        ahead = path[min(len(path) - 1, math.ceil(2 * self._params.front / costmap.resolution))]
+        ahead = poses[min(len(poses) - 1, math.ceil(2 * self._params.front / costmap.resolution))]
         away = math.dist(ahead[:2], pose[:2])
         error = wrap(math.atan2(ahead[1] - pose.y, ahead[0] - pose.x) - pose.yaw) if away > 0.1 else 0.0
         # The last piece is too short for an arc: face the goal, then go straight.
@@ -217,10 +222,16 @@ class Dwa:
             control = self._turn(pose, velocity, costmap, error)
             if control.status is ControlStatus.DRIVING:
                 return control
-        return self._choose(pose, velocity, costmap, path, speed_limit)
+        return self._choose(pose, velocity, costmap, poses, path.left(), speed_limit)
 
     def _choose(
-        self, pose: Pose, velocity: Velocity, costmap: Costmap, path: NDArray[np.float64], speed_limit: float
+        self,
+        pose: Pose,
+        velocity: Velocity,
+        costmap: Costmap,
+        path: NDArray[np.float64],
+        left: float,
+        speed_limit: float,
     ) -> Control:
         params, limits = self._params, self._limits
         seeds = self._cells(costmap, path)
@@ -230,11 +241,12 @@ class Dwa:
         fastest = max(min(limits.max_linear, speed_limit), 0.0)
         dv, dw = limits.linear_acceleration * params.period, limits.angular_acceleration * params.period
         # It must be able to stop at the goal; a speed that is above the limit goes down as fast as it may.
-        fastest = min(fastest, max(math.sqrt(2 * 0.7 * limits.linear_acceleration * self._left()), 0.05))
+        fastest = min(fastest, max(math.sqrt(2 * 0.7 * limits.linear_acceleration * left), 0.05))
         low = max(velocity.linear - dv, -limits.max_backward)
         high = max(min(velocity.linear + dv, fastest), low)
         low = min(low, high)
-        linear = np.linspace(low, high, params.linear_samples)
+        # The fastest first: ends in the same cell score alike.
+        linear = np.linspace(high, low, params.linear_samples)
         angular = np.linspace(
             max(velocity.angular - dw, -limits.max_angular),
             min(velocity.angular + dw, limits.max_angular),
@@ -250,11 +262,14 @@ class Dwa:
         weights = np.array(
             [params.path_distance * cells, params.goal_distance * cells, params.front, params.occupied, params.change]
         )
-        near = self._left() < params.front + 0.1
-        timing = np.array([params.horizon, params.step, float(near)])
+        # A trajectory keeps its velocity to its end, but the robot will brake. Driven on beyond the goal a fast one
+        # would score worse than a slow one: the robot would come nearer by a constant share of the way each second.
+        horizon = min(params.horizon, max(left / max(fastest, 1e-3), 2 * params.step))
+        timing = np.array([horizon, params.step])
         v, w, best = best_velocity(
             np.array(pose), linear, angular, self._rate, timing,
             costmap.costs, frame, samples, check_from, to_path, to_goal, weights,
+            path[-1, :2], left < params.front + 0.1,
         )  # fmt: skip
         if not math.isfinite(best):
             self._rate = 0.0
@@ -280,9 +295,6 @@ class Dwa:
                 return Control(STANDSTILL, ControlStatus.BLOCKED)
         self._rate = rate
         return Control(Velocity(linear, rate), ControlStatus.DRIVING, trajectory)
-
-    def _left(self) -> float:
-        return self._path.left() if self._path is not None else 0.0
 
     def _trajectory(self, pose: Pose, velocity: Velocity) -> NDArray[np.float64]:
         times = np.arange(1, math.ceil(self._params.horizon / self._params.step) + 1) * self._params.step

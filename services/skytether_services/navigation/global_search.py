@@ -7,6 +7,7 @@ driving put together, which fit fewer places than a single one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
 from skytether_services.navigation.likelihood_field import Explained, LikelihoodField, explain, to_cell_poses
-from skytether_services.navigation.motion_model import wrap
+from skytether_services.navigation.poses import wrap
 from skytether_services.navigation.scan_align import align
 
 Array = NDArray[np.float64]
@@ -25,6 +26,7 @@ class SearchParams:
     """How a map is searched.
 
     Attributes:
+        thinned: Of the points that lie in a square of this side one is kept [m].
         spacing: Of the places that are tried [m].
         turn: Of the headings [rad].
         sigma: Standard deviation of a point in the coarse comparison: covers the spacing [m].
@@ -35,10 +37,11 @@ class SearchParams:
         apart_turn: And the same heading [rad].
     """
 
+    thinned: float = 0.15
     spacing: float = 0.25
-    turn: float = math.radians(7.5)
+    turn: float = math.radians(4)
     sigma: float = 0.25
-    points: int = 60
+    points: int = 150
     seeds: int = 100
     hypotheses: int = 12
     apart: float = 0.6
@@ -78,7 +81,12 @@ def _sweep(
 
 
 def search(
-    field: LikelihoodField, starts: Array, ends: Array, random: np.random.Generator, params: SearchParams | None = None
+    field: LikelihoodField,
+    starts: Array,
+    ends: Array,
+    random: np.random.Generator,
+    params: SearchParams | None = None,
+    also: Sequence[Array] = (),
 ) -> list[Hypothesis]:
     """Places that a scan fits, the best first.
 
@@ -88,14 +96,17 @@ def search(
         ends: m by 2: where it ends [m].
         random: Which points are compared coarsely.
         params: How to search.
+        also: Poses that are looked at in any case.
     """
     params = params or SearchParams()
     if len(ends) == 0 or len(field.free) == 0:
         return []
-    chosen = random.permutation(len(ends))[: params.points]
-    seeds = _coarse(field, ends[chosen], params)
-    fine = random.permutation(len(ends))[: 4 * params.points]
-    return _refine(field, starts[fine], ends[fine], seeds, params)
+    squares = np.floor(ends / params.thinned).astype(np.int64)
+    _, kept = np.unique(squares[:, 0] * 2_000_003 + squares[:, 1], return_index=True)
+    shuffled = random.permutation(kept)
+    seeds = _coarse(field, ends[shuffled[: params.points]], params)
+    fine = shuffled[: 4 * params.points]
+    return _refine(field, starts[fine], ends[fine], np.array([*also, *seeds]), params)
 
 
 def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Array:
@@ -117,7 +128,7 @@ def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Arra
     _sweep(score, places, offsets, best)
     # The best of its neighbourhood in heading alone; the fine step makes one of neighbours in place.
     peak = (best >= np.roll(best, 1, axis=1)) & (best >= np.roll(best, -1, axis=1))
-    flat = np.where(peak, best, np.iinfo(np.int64).min).ravel()
+    flat = np.where(peak, best, -(2**40)).ravel()
     count = min(4 * params.seeds, flat.size)
     order = np.argpartition(-flat, count - 1)[:count]
     order = order[np.argsort(-flat[order], kind="stable")]

@@ -76,34 +76,23 @@ def likelihood_field(grid: GridMap, model: BeamModel | None = None) -> Likelihoo
 
 
 @compiled
-def _score(
-    log_likelihood: NDArray[np.float32],
-    known: NDArray[np.uint8],
-    unknown: float,
-    cells: Array,
-    points: Array,
-    total: Array,
-    in_known: Array,
-) -> None:
+def _score(log_likelihood: NDArray[np.float32], unknown: float, cells: Array, points: Array, total: Array) -> None:
     rows, columns = log_likelihood.shape
     for index in range(cells.shape[0]):
         cos, sin = math.cos(cells[index, 2]), math.sin(cells[index, 2])
         x, y = cells[index, 0], cells[index, 1]
         sum_all = 0.0
-        sum_known = 0
         for beam in range(points.shape[0]):
             column = math.floor(x + cos * points[beam, 0] - sin * points[beam, 1])
             row = math.floor(y + sin * points[beam, 0] + cos * points[beam, 1])
             if 0 <= row < rows and 0 <= column < columns:
                 sum_all += log_likelihood[row, column]
-                sum_known += known[row, column]
             else:
                 sum_all += unknown
         total[index] = sum_all
-        in_known[index] = sum_known
 
 
-def score_poses(field: LikelihoodField, poses: Array, points: Array) -> tuple[Array, Array]:
+def score_poses(field: LikelihoodField, poses: Array, points: Array) -> Array:
     """How well points fit the map from each of many poses.
 
     Args:
@@ -112,13 +101,13 @@ def score_poses(field: LikelihoodField, poses: Array, points: Array) -> tuple[Ar
         points: m by 2, in the robot's frame [m].
 
     Returns:
-        For each pose the sum of the points' log-likelihoods, and how many points lie where the map is known.
+        For each pose the sum of the points' log-likelihoods.
     """
     cells = to_cell_poses(field.grid, poses)
-    total, known = np.empty(len(poses)), np.empty(len(poses))
+    total = np.empty(len(poses))
     unknown = math.log(field.model.unknown)
-    _score(field.log_likelihood, field.known, unknown, cells, points / field.grid.resolution, total, known)
-    return total, known
+    _score(field.log_likelihood, unknown, cells, points / field.grid.resolution, total)
+    return total
 
 
 def to_cell_poses(grid: GridMap, poses: Array) -> Array:
@@ -126,8 +115,12 @@ def to_cell_poses(grid: GridMap, poses: Array) -> Array:
     return np.column_stack((grid.to_cells(poses[:, :2]), poses[:, 2] - grid.origin[2]))
 
 
+UNKNOWN, EXPLAINED, OPEN, THROUGH = 0, 1, 2, 3
+"""What a map says of a beam: nothing; ends at an obstacle, seen from its free side; ends in the open; passes one."""
+
+
 @compiled
-def _ends_and_walls(
+def _compare(
     distance: NDArray[np.float32],
     known: NDArray[np.uint8],
     cells: NDArray[np.int8],
@@ -136,37 +129,38 @@ def _ends_and_walls(
     ends: Array,
     near: float,
     short_of_end: float,
-) -> tuple[int, int, int]:
-    """Among points: in known cells, near an obstacle, seen through a wall."""
+) -> NDArray[np.int8]:
     rows, columns = distance.shape
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    in_known, explained, through = 0, 0, 0
+    result = np.zeros(ends.shape[0], np.int8)
     for beam in range(ends.shape[0]):
         ax = pose[0] + cos * starts[beam, 0] - sin * starts[beam, 1]
         ay = pose[1] + sin * starts[beam, 0] + cos * starts[beam, 1]
         bx = pose[0] + cos * ends[beam, 0] - sin * ends[beam, 1]
         by = pose[1] + sin * ends[beam, 0] + cos * ends[beam, 1]
-        column, row = math.floor(bx), math.floor(by)
-        seen = 0 <= row < rows and 0 <= column < columns and known[row, column] != 0
         length = math.hypot(bx - ax, by - ay)
         reach = length - short_of_end
-        blocked = False
-        steps = int(reach * 2)
-        for step in range(steps):
+        for step in range(int(reach * 2)):
             share = step / (2.0 * length)
-            column_at = math.floor(ax + share * (bx - ax))
-            row_at = math.floor(ay + share * (by - ay))
-            if 0 <= row_at < rows and 0 <= column_at < columns and cells[row_at, column_at] >= 50:
-                blocked = True
+            column = math.floor(ax + share * (bx - ax))
+            row = math.floor(ay + share * (by - ay))
+            if 0 <= row < rows and 0 <= column < columns and cells[row, column] >= 50:
+                result[beam] = THROUGH
                 break
-        if blocked:
-            through += 1
-            in_known += 1
-        elif seen:
-            in_known += 1
-            if distance[row, column] <= near:
-                explained += 1
-    return in_known, explained, through
+        if result[beam] == THROUGH:
+            continue
+        column, row = math.floor(bx), math.floor(by)
+        if not (0 <= row < rows and 0 <= column < columns and known[row, column] != 0):
+            continue
+        if distance[row, column] > near:
+            result[beam] = OPEN
+            continue
+        # A wall that was only ever seen from its other side says nothing exact: it is as far off as it is thick.
+        share = max(reach, 0.0) / max(length, 1e-9)
+        column, row = math.floor(ax + share * (bx - ax)), math.floor(ay + share * (by - ay))
+        if 0 <= row < rows and 0 <= column < columns and cells[row, column] >= 0:
+            result[beam] = EXPLAINED
+    return result
 
 
 @dataclass(frozen=True)
@@ -184,8 +178,8 @@ class Explained:
     through: float
 
 
-def explain(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> Explained:
-    """Compare beams with the map from one pose, walls that they would have to pass included.
+def compare_beams(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> NDArray[np.int8]:
+    """What the map says of each beam from one pose: ``UNKNOWN``, ``EXPLAINED``, ``OPEN`` or ``THROUGH``.
 
     Args:
         field: Of the map.
@@ -193,11 +187,9 @@ def explain(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> 
         starts: m by 2: where each beam starts, in the frame of ``pose`` [m].
         ends: m by 2: where it ends.
     """
-    if len(ends) == 0:
-        return Explained(0.0, 0.0, 0.0)
     resolution = field.grid.resolution
     at = to_cell_poses(field.grid, pose[None, :])[0]
-    known, good, through = _ends_and_walls(
+    return _compare(
         field.distance,
         field.known,
         field.grid.cells,
@@ -207,4 +199,17 @@ def explain(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> 
         field.model.explained,
         2 * field.model.explained / resolution,
     )
-    return Explained(known / len(ends), good / max(known, 1), through / max(known, 1))
+
+
+def explain(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> Explained:
+    """Compare beams with the map from one pose, walls that they would have to pass included; see `compare_beams`."""
+    if len(ends) == 0:
+        return Explained(0.0, 0.0, 0.0)
+    return summed_up(compare_beams(field, pose, starts, ends))
+
+
+def summed_up(beams: NDArray[np.int8]) -> Explained:
+    """Shares of what `compare_beams` said of each beam."""
+    _, good, in_open, through = np.bincount(beams, minlength=4).tolist()
+    known = good + in_open + through
+    return Explained(known / max(len(beams), 1), good / max(known, 1), through / max(known, 1))

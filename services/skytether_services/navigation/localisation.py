@@ -1,26 +1,38 @@
 """Adaptive Monte Carlo localisation: where in a known map the robot is, from odometry and laser.
 
-Tracking is a particle filter: the odometry motion model with noise, the likelihood field, low-variance resampling with
-as many particles as KLD sampling asks for, and random particles where the scan becomes unlikely (augmented MCL). Two
-things make it robust. Odometry is corrected by aligning scans with each other first, so it goes on through places that
-the map lacks. And where the pose is not known, or no longer explains what is seen, hypotheses come from a search of the
-whole map with the scans of the last metres put together.
+While a pose is believed, a particle filter tracks it: motion by wheels and laser (`scan_odometry`) with the error that
+the match of the scans had, the likelihood field of the beams that the map explains, low-variance resampling with as
+many particles as KLD sampling asks for. Where the map explains little, as in a room that it lacks, the particles are
+not weighed: then odometry alone carries the pose.
 
-It is sure only while its particles are in one place and the map explains the scans from there.
+Where no pose is believed, hypotheses come from a search of the whole map with the scans of the last metres put
+together. They are searched for again while the robot drives, until one explains more than every other. Where the map
+contradicts the pose that is believed, it is searched beside the tracking: the robot may have been carried away, or be
+in a room that the map lacks. The pose changes only where another place explains clearly more.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether_services.navigation.global_search import Hypothesis, SearchParams, judge, search
-from skytether_services.navigation.likelihood_field import LikelihoodField, explain, score_poses
-from skytether_services.navigation.motion_model import OdometryNoise, between, compose, move_particles, wrap
+from skytether_services.navigation.global_search import Hypothesis, SearchParams, distinct, search
+from skytether_services.navigation.likelihood_field import (
+    EXPLAINED,
+    Explained,
+    LikelihoodField,
+    compare_beams,
+    explain,
+    score_poses,
+)
+from skytether_services.navigation.motion_model import move_particles
 from skytether_services.navigation.particles import Cluster, bin_keys, heaviest_cluster, kld_count, low_variance_sample
+from skytether_services.navigation.poses import between, compose, wrap
+from skytether_services.navigation.scan_matching import with_normals
 from skytether_services.navigation.scan_odometry import ScanOdometry, ScanOdometryParams
 
 Array = NDArray[np.float64]
@@ -40,26 +52,30 @@ class LocalisationParams:
         beams: As many of a scan's beams are compared with the map.
         independent_beams: They count as much as so many independent ones: neighbours see the same wall, and err alike.
         max_beam: Longer beams are left out [m].
+        least_explained: The map is not asked where it explains no more of the beams than this share: there odometry
+            carries the pose, for what bits of map near by explain is explained wrongly.
+        well_explained: It is asked without reserve from this share on.
+        gathered: Up to this standard deviation the middle of the particles tells which beams the map explains [m].
         update_distance: The map is asked after so much motion [m].
         update_turn: Or after so much turning [rad].
-        alpha_slow: Weight of a new scan in the slow mean of its likelihood.
-        alpha_fast: And in the fast one. Where the fast mean falls below the slow one, random particles come in; 0 for
-            both switches them off.
-        random_share: They are not more than this share.
         cluster_radius: Particles as near as this are in the same place [m].
         cluster_turn: And in heading [rad].
-        wheels: How wheel odometry errs.
-        corrected: How odometry errs that the laser has corrected.
-        scans: How scans are aligned with each other.
+        scans: How scans are matched with each other.
         search: How the map is searched.
-        search_distance: While it is not sure, the map is searched each time after so much motion [m].
+        search_keys: With so many of the last kept scans.
+        search_distance: While no pose is believed, the map is searched each time after so much motion [m].
         sure_share: It becomes sure where the map explains this share of the beams.
         sure_known: And has something to say about this share of them.
         sure_lead: And every other place explains less, by so much of the score.
+        least_share: A search makes it sure with as little as this, too, by a larger lead: see `lead_needed`.
         sure_distance: After so much motion within one place [m].
         doubt_share: It doubts where the map explains less than this share.
         doubt_known: While the map has something to say about at least this share of the beams.
         doubt_distance: For so much motion on end [m].
+        doubt_search: Then the map is searched after so much motion, and each time in vain after twice as much [m].
+        doubt_search_most: But after so much at most [m].
+        carried_from: Share of all beams that the map explained before scans broke off, for a robot to be carried away.
+        carried_to: And at most this share after it.
         lost_deviation: Standard deviation of the position from which on it is not sure [m].
     """
 
@@ -69,32 +85,32 @@ class LocalisationParams:
     kld_quantile: float = 2.33
     bin_size: float = 0.25
     bin_turn: float = math.radians(10)
-    beams: int = 90
-    independent_beams: float = 18.0
+    beams: int = 120
+    independent_beams: float = 30.0
     max_beam: float = 25.0
+    least_explained: float = 0.5
+    well_explained: float = 0.8
+    gathered: float = 0.15
     update_distance: float = 0.05
     update_turn: float = 0.03
-    alpha_slow: float = 0.01
-    alpha_fast: float = 0.2
-    random_share: float = 0.2
     cluster_radius: float = 0.6
     cluster_turn: float = math.radians(30)
-    wheels: OdometryNoise = field(default_factory=OdometryNoise)
-    corrected: OdometryNoise = field(
-        default_factory=lambda: OdometryNoise(
-            alpha1=0.004, alpha2=0.002, alpha3=0.01, alpha4=0.001, floor_position=0.008, floor_heading=0.004
-        )
-    )
     scans: ScanOdometryParams = field(default_factory=ScanOdometryParams)
     search: SearchParams = field(default_factory=SearchParams)
-    search_distance: float = 0.5
+    search_keys: int = 40
+    search_distance: float = 0.4
     sure_share: float = 0.7
     sure_known: float = 0.6
     sure_lead: float = 0.25
+    least_share: float = 0.4
     sure_distance: float = 1.0
     doubt_share: float = 0.45
     doubt_known: float = 0.4
     doubt_distance: float = 0.5
+    doubt_search: float = 1.0
+    doubt_search_most: float = 4.0
+    carried_from: float = 0.5
+    carried_to: float = 0.35
     lost_deviation: float = 0.5
 
 
@@ -137,17 +153,15 @@ class Localisation:
         self.params = params or LocalisationParams()
         self._field = field
         self._random = random
-        self._odometry = ScanOdometry(self.params.scans, self.params.wheels)
-        self._sure = False
+        self._odometry = ScanOdometry(self.params.scans)
+        self._sure = self._believed = False
         self._since_asked = np.zeros(3)
         self._since_search = math.inf
-        self._agreed = 0.0
-        self._doubted = 0.0
-        self._regained = 0.0
-        self._leader: Array | None = None
-        self._slow = self._fast = 0.0
-        self._trust = 1.0
-        self._believed = False
+        self._search_wait = 0.0
+        self._kept_before = 0
+        self._agreed = self._doubted = self._regained = 0.0
+        self._hypotheses: list[Array] = []
+        self._before: deque[float] = deque(maxlen=10)
         self._estimate: Estimate | None = None
         self.particles: Array = np.zeros((0, 3))
         self.weights: Array = np.zeros(0)
@@ -155,12 +169,14 @@ class Localisation:
 
     def forget(self) -> None:
         """Begin anew without any pose: the robot may be anywhere in the map."""
-        self.particles = self._anywhere(self.params.max_particles)
-        self.weights = np.full(len(self.particles), 1 / len(self.particles))
-        self._odometry.keys.clear()
-        self._believed = False
-        self._trust = 1.0
-        self._unsure()
+        params = self.params
+        cells = self._field.free[self._random.integers(0, len(self._field.free), params.max_particles)]
+        places = self._field.grid.to_points(cells + self._random.random((params.max_particles, 2)))
+        headings = self._random.uniform(-np.pi, np.pi, params.max_particles)
+        self._spread(np.column_stack((places, headings)))
+        self._odometry.forget()
+        self._estimate = None
+        self._disbelieve()
 
     def place(self, pose: Array, covariance: Array) -> None:
         """Begin anew at a pose that somebody gave; it is believed until the scans say otherwise.
@@ -169,12 +185,8 @@ class Localisation:
             pose: x [m], y [m], heading [rad], map frame.
             covariance: Of it, 3 by 3 [m², rad²].
         """
-        self.particles = self._around(pose, covariance, self.params.max_particles)
-        self.weights = np.full(len(self.particles), 1 / len(self.particles))
-        self._sure = self._believed = True
-        self._trust = 1.0
-        self._doubted = 0.0
-        self._slow = self._fast = 0.0
+        self._spread(self._random.multivariate_normal(pose, covariance, self.params.max_particles, method="eigh"))
+        self._believe()
         self._estimate = None
 
     def update(self, step: Array, points: Array, origin: Array | None = None) -> Estimate:
@@ -183,7 +195,7 @@ class Localisation:
         Args:
             step: What odometry says of the motion since the last update, in the robot's frame before it: x [m], y [m],
                 heading [rad].
-            points: n by 2: ends of the beams that met something, in the robot's frame [m]. May be none.
+            points: n by 2: ends of the beams that met something, in the robot's frame, in their order [m]. May be none.
             origin: x, y of the laser in the robot's frame [m]; None: as the robot's.
         """
         params = self.params
@@ -192,180 +204,214 @@ class Localisation:
             step = np.zeros(3)
         points = points[np.isfinite(points).all(axis=1)]
         points = points[np.hypot(points[:, 0] - origin[0], points[:, 1] - origin[1]) <= params.max_beam]
-        moved, continues = self._odometry.update(step, points)
-        noise = params.corrected if continues and len(points) else params.wheels
-        self.particles = move_particles(self.particles, moved, noise, self._random)
-        travelled = math.hypot(moved[0], moved[1]) + 0.3 * abs(moved[2])
+        scan = self._odometry.update(step, with_normals(points, origin))
+        travelled = math.hypot(scan.motion[0], scan.motion[1]) + 0.3 * abs(float(scan.motion[2]))
+        # A robot that stands is matched with the same scans again and again: those errors do not add up.
+        covariance = scan.covariance * min(1.0, travelled / params.update_distance + 1e-6)
+        self.particles = move_particles(self.particles, scan.motion, covariance, self._random)
+        self._hypotheses = [compose(pose, scan.motion) for pose in self._hypotheses]
         self._since_search += travelled
-        self._since_asked = compose(self._since_asked, moved)
-        if self._leader is not None:
-            self._leader = compose(self._leader, moved)
+        self._since_asked = compose(self._since_asked, scan.motion)
         away = self._since_asked
         still = math.hypot(away[0], away[1]) < params.update_distance and abs(away[2]) < params.update_turn
-        if still and self._estimate is not None and continues:
-            return self._carried(moved)
+        if still and self._estimate is not None and not scan.broken:
+            pose = compose(self._estimate.pose, scan.motion)
+            self._estimate = replace(self._estimate, pose=pose, searched=False)
+            return self._estimate
         self._since_asked = np.zeros(3)
-        if len(points):
-            self._weigh(self._thin(points, params.beams))
-        cluster = heaviest_cluster(self.particles, self.weights, params.cluster_radius, params.cluster_turn)
-        seen = explain(self._field, cluster.mean, np.broadcast_to(origin, points.shape), points)
-        self._trust = max(0.1, seen.share * seen.known)
-        self._judge_tracking(cluster, seen.share, seen.known, travelled, continues)
-        searched = False
-        if not self._sure and len(points) and self._since_search >= params.search_distance:
-            searched = True
-            self._search(origin, cluster)
-            cluster = heaviest_cluster(self.particles, self.weights, params.cluster_radius, params.cluster_turn)
-        self._resample()
-        self._estimate = Estimate(
-            cluster.mean, cluster.covariance, self._sure, cluster.weight, seen.share, seen.known, searched
-        )
+        if self._believed:
+            self._estimate = self._track(points, origin, travelled, scan.broken)
+        if not self._believed:
+            self._estimate = self._find(points, origin)
+        assert self._estimate is not None  # noqa: S101 - one of both was done
         return self._estimate
 
-    def _carried(self, moved: Array) -> Estimate:
-        assert self._estimate is not None  # noqa: S101 - who calls has looked
-        pose = compose(self._estimate.pose, moved)
-        self._estimate = replace(self._estimate, pose=pose, searched=False)
-        return self._estimate
+    def _spread(self, particles: Array) -> None:
+        self.particles = particles
+        self.particles[:, 2] = wrap(self.particles[:, 2])
+        self.weights = np.full(len(particles), 1 / len(particles))
 
-    def _unsure(self) -> None:
-        self._sure = False
+    def _believe(self) -> None:
+        self._sure = self._believed = True
+        self._doubted = self._regained = 0.0
+        self._hypotheses = []
+        self._search_wait = self.params.doubt_search
+        self._kept_before = self._odometry.kept
+        self._before.clear()
+
+    def _disbelieve(self) -> None:
+        self._sure = self._believed = False
         self._since_search = math.inf
+        self._search_wait = self.params.search_distance
+        self._kept_before = 0
         self._agreed = 0.0
-        self._doubted = 0.0
-        self._regained = 0.0
-        self._leader = None
+        self._hypotheses = []
 
-    def _judge_tracking(self, cluster: Cluster, share: float, known: float, travelled: float, continues: bool) -> None:
+    def _cluster(self) -> Cluster:
+        return heaviest_cluster(self.particles, self.weights, self.params.cluster_radius, self.params.cluster_turn)
+
+    # Tracking
+
+    def _track(self, points: Array, origin: Array, travelled: float, broken: bool) -> Estimate:
         params = self.params
-        deviation = math.sqrt(max(cluster.covariance[0, 0], cluster.covariance[1, 1]))
-        contradicts = known >= params.doubt_known and share < params.doubt_share
-        if not self._sure:
-            # A pose that was doubted is sure again where the map explains it for long enough.
-            agrees = self._believed and known >= params.sure_known and share >= params.sure_share
-            self._regained = self._regained + travelled if agrees and cluster.weight > 0.9 else 0.0
-            if self._regained >= params.sure_distance and deviation <= params.lost_deviation:
-                self._sure = True
-                self._doubted = 0.0
+        if len(points) > params.beams:
+            points = points[np.linspace(0, len(points) - 1, params.beams).astype(np.int64)]
+        starts = np.broadcast_to(origin, points.shape)
+        cluster = self._cluster()
+        at = cluster.mean
+        if _deviation(cluster) > params.gathered:
+            # The middle of a wide cloud may explain nothing, though some particle is right.
+            at = self.particles[int(score_poses(self._field, self.particles, points).argmax())]
+        beams = compare_beams(self._field, at, starts, points)
+        share = float(np.mean(beams == EXPLAINED)) if len(beams) else 0.0
+        trust = (share - params.least_explained) / (params.well_explained - params.least_explained)
+        # What the map does not explain says nothing of where the robot is.
+        self._weigh(points[beams == EXPLAINED], min(max(trust, 0.0), 1.0))
+        cluster = self._cluster()
+        seen = explain(self._field, cluster.mean, starts, points)
+        self._judge(cluster, seen, travelled, broken)
+        searched = self._believed and not self._sure and self._since_search >= self._search_wait
+        if searched and self._search_beside(cluster.mean, origin):
+            cluster = self._cluster()
+            seen = explain(self._field, cluster.mean, starts, points)
+        elif self._believed:
+            self._resample()
+        return Estimate(cluster.mean, cluster.covariance, self._sure, cluster.weight, seen.share, seen.known, searched)
+
+    def _weigh(self, points: Array, trust: float) -> None:
+        if trust == 0 or len(points) == 0:
             return
-        self._doubted = self._doubted + travelled if contradicts else 0.0
-        carried_away = not continues and contradicts
-        if carried_away:
-            self._believed = False
-        if carried_away or self._doubted >= params.doubt_distance or deviation > params.lost_deviation:
-            self._unsure()
-
-    def _thin(self, points: Array, count: int) -> Array:
-        if len(points) <= count:
-            return points
-        return points[np.linspace(0, len(points) - 1, count).astype(np.int64)]
-
-    def _weigh(self, points: Array) -> None:
-        params = self.params
-        total, known = score_poses(self._field, self.particles, points)
-        mean = total / len(points)
-        # A map that explains little of what is seen is believed as little, and odometry more.
-        squash = min(params.independent_beams, float(len(points))) * (self._trust if self._believed else 1.0)
-        weights = self.weights * np.exp(squash * (mean - mean.max()))
-        if not self._sure or float(self.weights @ known) >= params.doubt_known * len(points):
-            likelihood = float(self.weights @ np.exp(mean))
-            if self._slow == 0:
-                self._slow = self._fast = likelihood
-            self._slow += params.alpha_slow * (likelihood - self._slow)
-            self._fast += params.alpha_fast * (likelihood - self._fast)
+        total = score_poses(self._field, self.particles, points)
+        total *= trust * min(1.0, self.params.independent_beams / len(points))
+        weights = self.weights * np.exp(total - total.max())
         self.weights = weights / weights.sum()
 
     def _resample(self) -> None:
         params = self.params
-        effective = 1 / float(np.sum(self.weights**2))
-        share = 0.0
-        if self._slow > 0 and not self._believed:
-            # Not against a pose that is believed: where the map lacks a room, strangers always fit better somewhere.
-            share = min(max(0.0, 1 - self._fast / self._slow), params.random_share)
-        if effective > len(self.weights) / 2 and share < 0.02:
+        if 1 / float(np.sum(self.weights**2)) > len(self.weights) / 2:
             return
         drawn = low_variance_sample(self.weights, params.max_particles, float(self._random.random()))
         bins = len(np.unique(bin_keys(self.particles[drawn], params.bin_size, params.bin_turn)))
         count = kld_count(bins, params.kld_error, params.kld_quantile)
         count = min(max(count, params.min_particles), params.max_particles)
-        strangers = int(share * count)
-        drawn = low_variance_sample(self.weights, count - strangers, float(self._random.random()))
-        self.particles = np.vstack((self.particles[drawn], self._anywhere(strangers)))
-        self.weights = np.full(count, 1 / count)
-        if strangers:
-            # As in nav2_amcl: they had their chance.
-            self._slow = self._fast
+        self._spread(self.particles[low_variance_sample(self.weights, count, float(self._random.random()))])
 
-    def _anywhere(self, count: int) -> Array:
-        cells = self._field.free[self._random.integers(0, len(self._field.free), count)]
-        places = self._field.grid.to_points(cells + self._random.random((count, 2)))
-        return np.column_stack((places, self._random.uniform(-np.pi, np.pi, count)))
+    def _judge(self, cluster: Cluster, seen: Explained, travelled: float, broken: bool) -> None:
+        """Whether the pose is still believed, and sure."""
+        params = self.params
+        explained = seen.share * seen.known
+        before = max(self._before, default=0.0)
+        if broken and before >= params.carried_from and explained <= params.carried_to:
+            self._disbelieve()
+            return
+        self._before.append(explained)
+        contradicts = seen.known >= params.doubt_known and seen.share < params.doubt_share
+        agrees = seen.known >= params.sure_known and seen.share >= params.sure_share and cluster.weight > 0.9
+        self._doubted = self._doubted + travelled if contradicts else 0.0
+        self._regained = self._regained + travelled if agrees else 0.0
+        wide = _deviation(cluster) > params.lost_deviation
+        if self._sure and not contradicts:
+            self._kept_before = self._odometry.kept
+        if self._sure and (wide or self._doubted >= params.doubt_distance):
+            self._sure = False
+            self._since_search, self._search_wait, self._agreed = 0.0, params.doubt_search, 0.0
+        elif not self._sure and not wide and self._regained >= params.sure_distance:
+            self._sure = True
 
-    def _around(self, pose: Array, covariance: Array, count: int) -> Array:
-        drawn = self._random.multivariate_normal(pose, covariance, count, method="eigh")
-        drawn[:, 2] = wrap(drawn[:, 2])
-        return drawn
+    # Search
+
+    def _find(self, points: Array, origin: Array) -> Estimate:
+        """Search the map if it is time to; the estimate is the best hypothesis."""
+        searched = len(points) > 0 and self._since_search >= self._search_wait
+        if searched:
+            self._sow(self._search(origin, self._hypotheses))
+        cluster = self._cluster()
+        if self._hypotheses:
+            cluster = replace(cluster, mean=self._hypotheses[0])
+        seen = explain(self._field, cluster.mean, np.broadcast_to(origin, points.shape), points)
+        return Estimate(cluster.mean, cluster.covariance, self._sure, cluster.weight, seen.share, seen.known, searched)
 
     def _recent(self, origin: Array) -> tuple[Array, Array]:
-        """Beams of the scans that are kept, as starts and ends in the robot's frame now [m]."""
+        """Beams of the scans that were kept last, as starts and ends in the robot's frame now [m].
+
+        What was kept while the pose was not in doubt is not among them: it may be of the place before.
+        """
         starts, ends = [], []
-        for key in self._odometry.keys:
+        keys = list(self._odometry.keys)
+        count = min(self.params.search_keys, self._odometry.kept - self._kept_before, len(keys))
+        for key in keys[len(keys) - count :]:
             at = between(self._odometry.pose, key.pose)
             cos, sin = math.cos(at[2]), math.sin(at[2])
             turn = np.array([[cos, sin], [-sin, cos]])
-            ends.append(key.points @ turn + at[:2])
-            starts.append(np.broadcast_to(origin @ turn + at[:2], key.points.shape))
+            ends.append(key.points[:, :2] @ turn + at[:2])
+            starts.append(np.broadcast_to(origin @ turn + at[:2], ends[-1].shape))
+        if not ends:
+            return np.zeros((0, 2)), np.zeros((0, 2))
         return np.vstack(starts), np.vstack(ends)
 
-    def _search(self, origin: Array, cluster: Cluster) -> None:
+    def _search(self, origin: Array, also: list[Array]) -> list[Hypothesis]:
+        """Search the map, and believe what was the best for long enough; the hypotheses if there is no such.
+
+        Args:
+            origin: x, y of the laser in the robot's frame [m].
+            also: Poses that are looked at in any case.
+        """
         params = self.params
         driven = self._since_search if math.isfinite(self._since_search) else 0.0
-        self._since_search = 0.0
         starts, ends = self._recent(origin)
-        found = search(self._field, starts, ends, self._random, params.search)
+        found = search(self._field, starts, ends, self._random, params.search, also)
         if not found:
-            return
-        chosen = self._random.permutation(len(ends))[: 4 * params.search.points]
-        here = judge(self._field, cluster.mean, starts[chosen], ends[chosen])
+            return []
+        self._since_search = 0.0
         first = found[0]
-        lead = self._lead(first, [*found[1:], here])
-        best = first.explained
-        good = best.share >= params.sure_share and best.known >= params.sure_known and lead >= params.sure_lead
-        if good and self._leader is not None and self._is_same(first.pose, self._leader):
-            self._agreed += driven
-        else:
-            self._agreed = 0.0
-        self._leader = first.pose if good else None
-        if not self._believed:
-            self._sow(found)
-        if good and self._agreed >= params.sure_distance:
-            self._sure = self._believed = True
-            self._trust = 1.0
-            self._slow = self._fast = 0.0
-            self._doubted = 0.0
-            self.particles = self._around(first.pose, np.diag([0.01, 0.01, 0.001]), params.max_particles)
-            self.weights = np.full(params.max_particles, 1 / params.max_particles)
+        lead = first.score - found[1].score if len(found) > 1 else math.inf
+        good = first.explained.known >= params.sure_known and lead >= lead_needed(first.explained.share, params)
+        same = bool(self._hypotheses) and self._is_same(first.pose, self._hypotheses[0])
+        self._agreed = self._agreed + driven if good and same else 0.0
+        self._hypotheses = [hypothesis.pose for hypothesis in found]
+        if self._agreed < params.sure_distance:
+            if self._believed:
+                # What looks good is soon looked at again.
+                wait = min(2 * max(self._search_wait, params.doubt_search / 2), params.doubt_search_most)
+                self._search_wait = params.search_distance if good else wait
+            return found
+        self._spread(self._random.multivariate_normal(first.pose, np.diag([0.01, 0.01, 0.001]), params.max_particles))
+        self._believe()
+        return []
 
-    def _lead(self, first: Hypothesis, others: list[Hypothesis]) -> float:
-        scores = [other.score for other in others if not self._is_same(other.pose, first.pose)]
-        return first.score - max(scores, default=-math.inf)
+    def _search_beside(self, pose: Array, origin: Array) -> bool:
+        """Search the map while a pose is believed but not sure; whether it now is, or another one in its place."""
+        self._search(origin, [pose, *self._hypotheses])
+        return self._sure
 
     def _is_same(self, a: Array, b: Array) -> bool:
         params = self.params
-        near = math.hypot(a[0] - b[0], a[1] - b[1]) <= params.cluster_radius
-        return near and abs(float(wrap(np.array(a[2] - b[2])))) <= params.cluster_turn
+        return len(distinct(np.stack((a, b)), params.search.apart, params.search.apart_turn, 2)) == 1
 
     def _sow(self, found: list[Hypothesis]) -> None:
-        """Give half of the particles to the hypotheses, by their scores; they replace the least likely."""
+        """Particles around the hypotheses, by their scores."""
         params = self.params
-        count = params.max_particles // 2
+        if not found:
+            return
         # A score is of one beam; as in weighing, they count as some independent ones.
         scores = np.array([hypothesis.score for hypothesis in found])
-        shares = np.exp(params.independent_beams / 2 * (scores - scores.max()))
-        drawn = low_variance_sample(shares, count, float(self._random.random()))
+        shares = np.exp(params.independent_beams * (scores - scores.max()))
+        drawn = low_variance_sample(shares, params.max_particles, float(self._random.random()))
         poses = np.array([found[index].pose for index in drawn])
-        poses = poses + self._random.standard_normal((count, 3)) * (0.1, 0.1, 0.03)
-        poses[:, 2] = wrap(poses[:, 2])
-        kept = low_variance_sample(self.weights, params.max_particles - count, float(self._random.random()))
-        self.particles = np.vstack((self.particles[kept], poses))
-        self.weights = np.full(len(self.particles), 1 / len(self.particles))
+        self._spread(poses + self._random.standard_normal(poses.shape) * (0.1, 0.1, 0.03))
+
+
+def lead_needed(share: float, params: LocalisationParams) -> float:
+    """By how much of the score the best place of a search has to lead, for the share of the beams that it explains.
+
+    Scans put together hold people, and what was moved since: then the right place explains little, but places that
+    are wrong explain much less, and all about as little as each other.
+    """
+    if share < params.least_share:
+        return math.inf
+    return params.sure_lead + max(0.0, params.sure_share - share)
+
+
+def _deviation(cluster: Cluster) -> float:
+    """Standard deviation of the position along the wider axis [m]."""
+    return math.sqrt(max(cluster.covariance[0, 0], cluster.covariance[1, 1]))

@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose_graph import Edges, between, compose, optimise, wrapped
+from .pose_graph import Edges, optimise
+from .poses import between, compose, wrap
+from .scan_following import match_next, odometry_information, turned
 from .scan_matching import REACH, Fit, Patch, make_patch, moved, rate, refine, scan_points, search, thin
 
 Floats = NDArray[np.float64]
@@ -80,7 +82,7 @@ class _Graph:
     def add(self, first: int, second: int, pose_first: Floats, fit: Fit, loop: bool) -> None:
         self.pairs.append((first, second))
         self.motions.append(between(pose_first, fit.pose))
-        self.information.append(_turned(_damped(fit.information), pose_first[2]))
+        self.information.append(turned(_damped(fit.information), pose_first[2]))
         self.loops.append(loop)
 
     def edges(self) -> Edges:
@@ -95,6 +97,19 @@ class _Graph:
         poses, errors = optimise(np.array(self.poses), self.edges())
         self.poses = list(poses)
         return errors
+
+    def copy(self) -> _Graph:
+        """One that can grow on its own; what it has is never changed in place."""
+        return _Graph(
+            list(self.points),
+            list(self.poses),
+            list(self.travel),
+            list(self.scan),
+            list(self.pairs),
+            list(self.motions),
+            list(self.information),
+            list(self.loops),
+        )
 
     def patch(self, keys: range, reach: int = REACH) -> Patch:
         return make_patch(np.vstack([moved(self.points[k], self.poses[k]) for k in keys]), reach)
@@ -113,6 +128,120 @@ class Trajectory:
     poses: Floats
     keyframes: NDArray[np.int64]
     loops: int
+
+
+class Mapper:
+    """Takes the scans of a drive one by one.
+
+    Attributes:
+        pose: Of the laser at the last scan, as far as it is known so far.
+        loops: Number of motions in the graph that close a loop, so far.
+    """
+
+    def __init__(self, params: MappingParams | None = None, start: Floats | None = None) -> None:
+        """Begin with the laser at ``start``, x [m], y [m], theta [rad]; None: at the origin."""
+        self._params = params or MappingParams()
+        self._graph = _Graph()
+        self._raw: list[Floats] = []  # as the front end saw it, relative to the keyframe before
+        self._owner: list[int] = []
+        self._velocity = np.zeros(3)
+        self._patch: Patch | None = None
+        self._looked = 0
+        self._stamp = 0.0
+        self._odometry: Floats | None = None
+        self.pose = np.zeros(3) if start is None else start
+        self.loops = 0
+
+    @property
+    def keyframes(self) -> int:
+        """How many scans are in the graph."""
+        return len(self._graph.poses)
+
+    @property
+    def travel(self) -> float:
+        """Way from keyframe to keyframe [m]."""
+        return self._graph.travel[-1] if self._graph.travel else 0.0
+
+    def add(
+        self, stamp: float, ranges: NDArray[np.float32], angles: Floats, max_range: float, odometry: Floats | None
+    ) -> bool:
+        """Take the next scan; returns whether it became a keyframe.
+
+        Args:
+            stamp: [s].
+            ranges: [m].
+            angles: Of the rays [rad].
+            max_range: Ranges from here on, and NaN, met nothing [m].
+            odometry: Pose of the robot at the scan; None, for all scans: from the laser alone.
+        """
+        params, graph = self._params, self._graph
+        points = scan_points(ranges, angles, min(max_range, params.usable_range))
+        first = not self._raw
+        dt = 0.0 if first else stamp - self._stamp
+        motion = self._velocity * dt
+        if odometry is not None and self._odometry is not None:
+            motion = between(self._odometry, odometry)
+        self._stamp, self._odometry = stamp, odometry
+        if self._patch is None:
+            fit = Fit(compose(self.pose, motion), np.zeros((3, 3)), 1.0, 0.0)
+        else:
+            fit = _follow(self._patch, points, self.pose, motion, dt, odometry is not None, params)
+        if dt > 1e-3 and odometry is None:
+            self._velocity = np.clip(between(self.pose, fit.pose) / dt, [-2, -2, -2], [2, 2, 2])
+        self.pose = fit.pose
+        new = self._is_new(points)
+        if new:
+            self._keep(len(self._raw), points, fit)
+        self._owner.append(max(len(graph.poses) - 1, 0))
+        self._raw.append(between(graph.poses[-1], self.pose) if graph.poses else self.pose)
+        return new
+
+    def _is_new(self, points: Floats) -> bool:
+        """Whether a scan from here becomes a keyframe."""
+        if len(points) < 10:
+            return False
+        if not self._graph.poses:
+            return True
+        since = between(self._graph.poses[-1], self.pose)
+        return bool(np.hypot(since[0], since[1]) > self._params.keyframe_m or abs(since[2]) > self._params.keyframe_rad)
+
+    def _keep(self, number: int, points: Floats, fit: Fit) -> None:
+        params, graph = self._params, self._graph
+        last = len(graph.poses) - 1
+        since = between(graph.poses[-1], self.pose) if last >= 0 else np.zeros(3)
+        graph.points.append(thin(points, 0.05))
+        graph.travel.append(graph.travel[-1] + float(np.hypot(since[0], since[1])) if last >= 0 else 0.0)
+        graph.scan.append(number)
+        graph.poses.append(self.pose)
+        if last >= 0:
+            graph.add(last, last + 1, graph.poses[last], _held(fit, _by_odometry(since, params)), False)
+        if last + 1 - self._looked >= 20:
+            self._looked = last + 1
+            found = _close_loops(graph, self._looked - 20 - _AROUND, self._looked - _AROUND, params)
+            if found:
+                graph.solve()
+                self.pose = graph.poses[-1]
+                self.loops += found
+        self._patch = graph.patch(range(max(0, len(graph.poses) - params.window), len(graph.poses)))
+
+    def finished(self, passes: int | None = None, progress: Callable[[str], None] = lambda _: None) -> Trajectory:
+        """The poses of all scans so far, at their best; more scans can come afterwards.
+
+        Args:
+            passes: How often all keyframes are matched anew; None: as the parameters say.
+            progress: Told now and then how far it is.
+        """
+        params, graph = self._params, self._graph.copy()
+        passes = params.passes if passes is None else passes
+        _close_loops(graph, self._looked - _AROUND, len(graph.poses), params)
+        graph.solve()
+        for turn in range(passes):
+            progress(f"all {len(graph.poses)} keyframes once more: {turn + 1} of {passes}")
+            graph = _matched_anew(graph, params)
+            graph.solve()
+        raw = np.array(self._raw).reshape(-1, 3)
+        poses = _all_poses(graph, raw, np.array(self._owner, dtype=np.int64))
+        return Trajectory(poses, np.array(graph.scan, dtype=np.int64), sum(graph.loops))
 
 
 def find_trajectory(
@@ -135,79 +264,25 @@ def find_trajectory(
         params: Settings.
         progress: Told now and then how far it is.
     """
-    params = params or MappingParams()
-    graph = _Graph()
-    raw = np.zeros((len(stamps), 3))  # as the front end saw it, relative to the keyframe before
-    owner = np.zeros(len(stamps), dtype=np.int64)
-    velocity = np.zeros(3)
-    pose = np.zeros(3)
-    far = min(max_range, params.usable_range)
-    patch: Patch | None = None
-    looked = 0
+    mapper = Mapper(params)
     for i in range(len(stamps)):
-        points = scan_points(ranges[i], angles, far)
-        dt = stamps[i] - stamps[i - 1] if i else 0.0
-        motion = velocity * dt
-        if odometry is not None and i:
-            motion = between(odometry[i - 1], odometry[i])
-        if patch is None:
-            fit = Fit(compose(pose, motion), np.zeros((3, 3)), 1.0, 0.0)
-        else:
-            fit = _follow(patch, points, pose, motion, dt, odometry is not None, params)
-        if i and dt > 1e-3 and odometry is None:
-            velocity = np.clip(between(pose, fit.pose) / dt, [-2, -2, -2], [2, 2, 2])
-        pose = fit.pose
-        new = patch is None and len(points) >= 10
-        if graph.poses:
-            since = between(graph.poses[-1], pose)
-            new = (
-                bool(np.hypot(since[0], since[1]) > params.keyframe_m or abs(since[2]) > params.keyframe_rad)
-                and len(points) >= 10
-            )
-        if new:
-            last = len(graph.poses) - 1
-            graph.points.append(thin(points, 0.05))
-            graph.travel.append(graph.travel[-1] + float(np.hypot(since[0], since[1])) if last >= 0 else 0.0)
-            graph.scan.append(i)
-            graph.poses.append(pose)
-            if last >= 0:
-                prior = _odometry_information(since, params)
-                graph.add(last, last + 1, graph.poses[last], _held(fit, prior), False)
-            if last + 1 - looked >= 20:
-                looked = last + 1
-                if _close_loops(graph, looked - 20 - _AROUND, looked - _AROUND, params):
-                    graph.solve()
-                    pose = graph.poses[-1]
-                progress(f"scan {i + 1} of {len(stamps)}, {sum(graph.loops)} loops")
-            patch = graph.patch(range(max(0, len(graph.poses) - params.window), len(graph.poses)))
-        owner[i] = max(len(graph.poses) - 1, 0)
-        raw[i] = between(graph.poses[-1], pose) if graph.poses else pose
-    _close_loops(graph, looked - _AROUND, len(graph.poses), params)
-    graph.solve()
-    for turn in range(params.passes):
-        progress(f"all {len(graph.poses)} keyframes once more: {turn + 1} of {params.passes}")
-        graph = _matched_anew(graph, params)
-        graph.solve()
-    return Trajectory(_all_poses(graph, raw, owner), np.array(graph.scan), sum(graph.loops))
+        loops = mapper.loops
+        mapper.add(stamps[i], ranges[i], angles, max_range, None if odometry is None else odometry[i])
+        if mapper.loops != loops:
+            progress(f"scan {i + 1} of {len(stamps)}, {mapper.loops} loops")
+    return mapper.finished(progress=progress)
 
 
 def _follow(
     patch: Patch, points: Floats, pose: Floats, motion: Floats, dt: float, measured: bool, params: MappingParams
 ) -> Fit:
-    """Match the next scan, from where odometry, or the velocity before, says that it was taken."""
-    guess = compose(pose, motion)
-    if len(points) < 10:
-        return Fit(guess, np.zeros((3, 3)), 0.0, 0.0)
-    by_velocity = np.diag([0.1**-2, 0.1**-2, 0.2**-2])
-    prior = _turned(_odometry_information(motion, params) if measured else by_velocity, -pose[2])
-    fit = refine(patch, points, guess, prior)
-    if measured and fit.overlap > 0.5:
-        return fit
-    size, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
-    reach = (0.1 + 0.5 * size, 0.05 + 0.5 * turn) if measured else (min(0.1 + 0.6 * dt, 0.5), min(0.1 + 1.5 * dt, 0.6))
-    start, _ = search(patch, thin(points, 0.1), guess, reach[0], reach[1])
-    other = refine(patch, points, start, prior * 0.01)
-    return other if rate(patch, points, other.pose) > rate(patch, points, fit.pose) else fit
+    """Match the next scan by what is known of its motion: by odometry, or by the velocity before."""
+    if not measured:
+        by_velocity = np.diag([0.1**-2, 0.1**-2, 0.2**-2])
+        reach = (min(0.1 + 0.6 * dt, 0.5), min(0.1 + 1.5 * dt, 0.6))
+        return match_next(patch, points, pose, motion, by_velocity, reach, None)
+    reach = (0.1 + 0.5 * float(np.hypot(motion[0], motion[1])), 0.05 + 0.5 * abs(float(motion[2])))
+    return match_next(patch, points, pose, motion, _by_odometry(motion, params), reach, 0.5)
 
 
 def _close_loops(graph: _Graph, first: int, last: int, params: MappingParams) -> int:
@@ -270,7 +345,7 @@ def _matched_anew(graph: _Graph, params: MappingParams) -> _Graph:
     for k in range(1, len(graph.poses)):
         points, pose = graph.points[k], graph.poses[k]
         before = seen[(k - 1, k)]
-        prior = _odometry_information(graph.motions[before], params)
+        prior = _by_odometry(graph.motions[before], params)
         guess = compose(graph.poses[k - 1], graph.motions[before])
         target = graph.patch(range(max(0, k - params.window), k), _NARROW)
         fit = refine(target, points, pose, np.zeros((3, 3)))
@@ -286,7 +361,7 @@ def _matched_anew(graph: _Graph, params: MappingParams) -> _Graph:
 
 
 def _close(a: Floats, b: Floats) -> bool:
-    return bool(np.hypot(a[0] - b[0], a[1] - b[1]) < _MOVE_M and abs(wrapped(a[2] - b[2])) < _MOVE_RAD)
+    return bool(np.hypot(a[0] - b[0], a[1] - b[1]) < _MOVE_M and abs(wrap(a[2] - b[2])) < _MOVE_RAD)
 
 
 def _held(fit: Fit, odometry: Floats) -> Fit:
@@ -294,27 +369,14 @@ def _held(fit: Fit, odometry: Floats) -> Fit:
     return Fit(fit.pose, fit.information + odometry / _INDEPENDENT, fit.overlap, fit.residual)
 
 
-def _odometry_information(motion: Floats, params: MappingParams) -> Floats:
-    """Information of a motion by odometry, in the frame where it began."""
-    size, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
-    # The laser is not where the robot turns about: 0.2 m off.
-    sigma = 0.01 + params.odometry_m * size + 0.2 * turn
-    sigma_turn = 0.005 + params.odometry_rad * turn + 0.02 * size
-    return np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
+def _by_odometry(motion: Floats, params: MappingParams) -> Floats:
+    return odometry_information(motion, params.odometry_m, params.odometry_rad)
 
 
 def _damped(information: Floats) -> Floats:
     """The information of a match of points that do not err independently, on a map that bends."""
     loose = information * _INDEPENDENT + np.diag([1e-3, 1e-3, 1e-3])
     return np.linalg.inv(np.linalg.inv(loose) + _FLOOR)
-
-
-def _turned(information: Floats, angle: float) -> Floats:
-    """Information of the map frame in one that is turned by the angle."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    result: Floats = turn.T @ information @ turn
-    return result
 
 
 def _all_poses(graph: _Graph, raw: Floats, owner: NDArray[np.int64]) -> Floats:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
 
-from .controller import Control, ControlStatus, FollowedPath, MotionLimits
+from .controller import Control, ControlStatus, FollowedPath, MotionLimits, PathController
 from .costmap import INSCRIBED, Costmap, InflationParams
 from .footprint import Footprint, FootprintChecks
 from .geometry import Pose
@@ -81,7 +81,7 @@ class MppiParams:
     wheel_speed: float = param(0.8, unit="m/s", gt=0, doc="largest of a wheel")
 
 
-class Mppi:
+class Mppi(PathController):
     """A `Controller`."""
 
     def __init__(
@@ -101,6 +101,7 @@ class Mppi:
             rng: For the noise.
             params: Sizes and weights.
         """
+        super().__init__()
         self._params = params = params or MppiParams()
         self._limits, self._rng = limits, rng
         self._checks = FootprintChecks(footprint, inflation)
@@ -115,21 +116,13 @@ class Mppi:
         self._planned = np.zeros((2, steps))
         self._before = np.zeros((2, len(_FILTER) // 2))
         self._fresh = True
-        self._path: FollowedPath | None = None
-
-    def set_path(self, path: NDArray[np.float64]) -> None:
-        self._path = FollowedPath(path) if len(path) else None
 
     def reset(self) -> None:
         self._fresh = True
 
-    def control(self, pose: Pose, velocity: Velocity, costmap: Costmap, *, speed_limit: float = math.inf) -> Control:
-        if self._path is None:
-            self.reset()
-            return Control(STANDSTILL, ControlStatus.NO_PATH)
-        if not all(math.isfinite(value) for value in (*pose, *velocity)) or math.isnan(speed_limit):
-            self.reset()
-            return Control(STANDSTILL, ControlStatus.NOT_FINITE)
+    def drive(
+        self, path: FollowedPath, pose: Pose, velocity: Velocity, costmap: Costmap, speed_limit: float
+    ) -> Control:
         params, limits = self._params, self._limits
         if self._fresh:
             # Go on from what the robot does.
@@ -149,7 +142,7 @@ class Mppi:
         )
         start = np.array([*pose, *velocity])
         rollout(self._planned, self._noise, start, params.step, bounds, self._controls, self._poses)
-        free = self._score(pose, self._path, costmap, fastest)
+        free = self._score(pose, path, costmap, fastest)
         if free == 0:
             self.reset()
             return Control(STANDSTILL, ControlStatus.BLOCKED)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
-from skytether_services.navigation.motion_model import wrap
+from skytether_services.navigation.poses import wrap
 
 Array = NDArray[np.float64]
 

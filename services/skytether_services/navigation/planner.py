@@ -21,7 +21,7 @@ class PlannerParams:
     """How paths are searched and smoothed."""
 
     tolerance: float = param(
-        0.5, unit="m", ge=0, doc="if the goal cannot be reached, go to the nearest place that can within this; 0: never"
+        0.25, unit="m", ge=0, doc="go to the nearest place within this, where the goal cannot be reached; 0: never"
     )
     start_tolerance: float = param(
         0.3, unit="m", ge=0, doc="a start in an obstacle (a pose is not exact) leaves it within this"

@@ -9,27 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
+from .poses import between, wrap
+
 Floats = NDArray[np.float64]
-
-
-def between(a: Floats, b: Floats) -> Floats:
-    """Poses b seen from poses a; arrays of (x [m], y [m], theta [rad]) in the last axis, theta in [-pi, pi)."""
-    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
-    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, wrapped(b[..., 2] - a[..., 2])], axis=-1)
-
-
-def compose(a: Floats, b: Floats) -> Floats:
-    """Poses b, seen from poses a, in the frame of a."""
-    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
-    y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
-    return np.stack([x, y, wrapped(a[..., 2] + b[..., 2])], axis=-1)
-
-
-def wrapped(angle: Floats) -> Floats:
-    """The angle in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 @dataclass(frozen=True)
@@ -81,7 +63,7 @@ def optimise(poses: Floats, edges: Edges, *, kernel: float = 3.0, iterations: in
         matrix.setdiag(matrix.diagonal() * (1 + 1e-9) + 1e-9)
         step = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(-gradient.ravel()[3:])
         poses[1:] += step.reshape(-1, 3)
-        poses[:, 2] = wrapped(poses[:, 2])
+        poses[:, 2] = wrap(poses[:, 2])
         errors = _errors(poses, edges)
         if np.abs(step).max() < 1e-4:
             break
@@ -91,7 +73,7 @@ def optimise(poses: Floats, edges: Edges, *, kernel: float = 3.0, iterations: in
 def _errors(poses: Floats, edges: Edges) -> Floats:
     found = between(poses[edges.pairs[:, 0]], poses[edges.pairs[:, 1]])
     errors = found - edges.motions
-    errors[:, 2] = wrapped(errors[:, 2])
+    errors[:, 2] = wrap(errors[:, 2])
     return errors
 
 

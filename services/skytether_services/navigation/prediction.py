@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import pairwise
 
@@ -54,11 +54,19 @@ class DelayParams:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Of the robot at one moment: pose, velocity, and the time they are of [s]."""
+    """Of the robot at one moment.
+
+    Attributes:
+        pose: On the map.
+        velocity: Measured.
+        time: They are of this time, on the service's clock [s].
+        velocity_age: But the velocity is older than the pose by this [s].
+    """
 
     pose: Pose
     velocity: Velocity
     time: float
+    velocity_age: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,15 +157,19 @@ class PredictedState:
         if params.compensation is Compensation.FIXED:
             # The sum alone matters: what was sent within the delay has not acted yet when the pose was true.
             begin = now - min(params.fixed_delay, params.max_delay)
-            return replay(
-                State(state.pose, state.velocity, begin),
-                _acting([(entry.sent, entry.velocity) for entry in self._sent], begin, state.velocity),
-                now,
-                params,
-            )
+            sent = [(entry.sent, entry.velocity) for entry in self._sent]
+            return self._replayed(replace(state, time=begin), sent, now)
         delay = max(delay, 0.0) if math.isfinite(delay) else 0.0
         until = min(now + delay, state.time + params.max_delay)
-        return replay(state, _acting(self._arrivals(), state.time, state.velocity), until, params)
+        return self._replayed(state, self._arrivals(), until)
+
+    def _replayed(self, state: State, arrivals: list[tuple[float, Velocity]], until: float) -> State:
+        """Velocities are often measured less often than poses: first that one is made as new as the pose is."""
+        if 0 < state.velocity_age <= self._params.max_delay:
+            old = State(state.pose, state.velocity, state.time - state.velocity_age)
+            newer = replay(old, _acting(arrivals, old.time, old.velocity), state.time, self._params)
+            state = State(state.pose, newer.velocity, state.time)
+        return replay(state, _acting(arrivals, state.time, state.velocity), until, self._params)
 
     def _arrivals(self) -> list[tuple[float, Velocity]]:
         """In order of arrival, without those that a newer one overtook: the robot drops them."""

@@ -410,15 +410,28 @@ def scan_points(ranges: NDArray[np.float32], angles: Floats, max_range: float, m
     Returns:
         n by (x, y, nx, ny) in the frame of the laser. Normals look at the laser; (0, 0): the neighbours are no line.
     """
-    return _points(ranges.astype(np.float64), angles, max_range, min_range)
+    length = ranges.astype(np.float64)
+    return _points(length, length * np.cos(angles), length * np.sin(angles), max_range, min_range)
+
+
+def with_normals(points: Floats, origin: Floats) -> Floats:
+    """Ends of a scan's beams with normals, as `scan_points` makes them.
+
+    Args:
+        points: n by (x, y) in the order of the beams; those that met nothing are left out.
+        origin: x, y of the laser in the same frame.
+    """
+    away = points - origin
+    result = _points(np.hypot(away[:, 0], away[:, 1]), away[:, 0], away[:, 1], np.inf, 0.0)
+    result[:, :2] += origin
+    return result
 
 
 @compiled
-def _points(ranges: Floats, angles: Floats, max_range: float, min_range: float) -> Floats:
+def _points(ranges: Floats, xs: Floats, ys: Floats, max_range: float, min_range: float) -> Floats:
     n = ranges.size
     out = np.zeros((n, 4))
     kept = 0
-    xs, ys = ranges * np.cos(angles), ranges * np.sin(angles)
     for i in range(n):
         if not (min_range < ranges[i] < max_range):
             continue

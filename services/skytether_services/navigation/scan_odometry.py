@@ -1,7 +1,7 @@
-"""Odometry made better by the laser: each scan is aligned with what the last few metres showed.
+"""Odometry made better by the laser: each scan is matched with what the scans before it saw near by.
 
-It needs no map, so it goes on where the map ends; and it says when a scan does not continue what was seen before, as
-when the robot was carried away.
+It needs no map, so it goes on where the map ends; and it says when scans do not continue what was seen before, as when
+the robot was carried away.
 """
 
 from __future__ import annotations
@@ -10,41 +10,46 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether_services.navigation.motion_model import OdometryNoise, between, compose, step_deviations
-from skytether_services.navigation.scan_align import align
+from skytether_services.navigation.poses import between, compose
+from skytether_services.navigation.scan_following import FEWEST, match_next, odometry_information, turned
+from skytether_services.navigation.scan_matching import Patch, make_patch, moved, thin
 
 Array = NDArray[np.float64]
+
+_INDEPENDENT = 0.1
+"""Part of a scan's points that err independently of their neighbours."""
+_FLOOR = np.diag([0.005**2, 0.005**2, 0.0015**2])
+"""Covariance of a perfect match [m², rad²]."""
 
 
 @dataclass(frozen=True)
 class ScanOdometryParams:
-    """How scans are aligned with each other.
+    """How scans are matched with those before.
 
     Attributes:
-        resolution: Side of a cell of what was seen last [m].
-        half_size: It reaches so far from the robot [m].
-        sigma: Standard deviation of a point from an obstacle [m].
-        point_weight: What one point counts beside odometry; neighbouring points err alike.
+        odometry_m: Error of the wheels' motion, for each metre [m/m].
+        odometry_rad: Error of their turn, for each radian [rad/rad].
         key_distance: A scan is kept after so much motion [m].
         key_turn: Or after so much turning [rad].
-        key_scans: So many scans are kept.
-        continues: Share of points that have to be near what was seen last, for a scan to continue it.
-        iterations: Of the alignment.
+        key_scans: So many scans are kept: with them a room that was left is known when the robot comes back.
+        near_scans: So many of them, the nearest, are what the next scan is matched with.
+        continues: Share of the points on surfaces that have to lie on what was seen before, for a scan to continue it.
+        trusted: With this share a match from where the wheels say is good enough; below it, others are looked for.
+        strange: After so many scans on end that do not continue it, what was seen before is forgotten.
     """
 
-    resolution: float = 0.05
-    half_size: float = 8.0
-    sigma: float = 0.08
-    point_weight: float = 0.2
-    key_distance: float = 0.3
-    key_turn: float = 0.3
-    key_scans: int = 12
+    odometry_m: float = 0.1
+    odometry_rad: float = 0.1
+    key_distance: float = 0.2
+    key_turn: float = 0.15
+    key_scans: int = 300
+    near_scans: int = 40
     continues: float = 0.3
-    iterations: int = 8
+    trusted: float = 0.3
+    strange: int = 4
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,29 @@ class KeyScan:
 
     Attributes:
         pose: Of the robot, in the frame of this odometry: x [m], y [m], heading [rad].
-        points: n by 2, in the robot's frame then [m].
+        points: n by (x, y, nx, ny), in the robot's frame then [m].
     """
 
     pose: Array
     points: Array
+
+
+@dataclass(frozen=True)
+class ScanStep:
+    """A step of the robot by wheels and laser.
+
+    Attributes:
+        motion: In the robot's frame before it: x [m], y [m], heading [rad].
+        covariance: Of it, 3 by 3 [m², rad²].
+        overlap: Share of the scan's points on surfaces that lie on what was seen before; 1 if there is nothing to
+            compare with.
+        broken: Whether what was seen before was forgotten, because too many scans did not continue it.
+    """
+
+    motion: Array
+    covariance: Array
+    overlap: float
+    broken: bool
 
 
 class ScanOdometry:
@@ -66,73 +89,69 @@ class ScanOdometry:
     Attributes:
         pose: x [m], y [m], heading [rad], from where it began.
         keys: The scans that are kept, oldest first.
+        kept: So many were kept since it was made, those included that were dropped or forgotten.
     """
 
-    def __init__(self, params: ScanOdometryParams | None = None, noise: OdometryNoise | None = None) -> None:
+    def __init__(self, params: ScanOdometryParams | None = None) -> None:
         self.params = params or ScanOdometryParams()
-        self.noise = noise or OdometryNoise()
         self.pose: Array = np.zeros(3)
         self.keys: deque[KeyScan] = deque(maxlen=self.params.key_scans)
-        self._distance: NDArray[np.float32] | None = None
-        self._corner: Array = np.zeros(2)
+        self.kept = 0
+        self._patch: Patch | None = None
+        self._last: Array = np.zeros(3)
+        self._strange = 0
 
-    def update(self, step: Array, points: Array) -> tuple[Array, bool]:
+    def forget(self) -> None:
+        """Begin anew: the next scan continues nothing."""
+        self.keys.clear()
+        self._patch = None
+        self._strange = 0
+
+    def update(self, step: Array, points: Array) -> ScanStep:
         """Take a step of the wheels and the scan after it.
 
         Args:
             step: In the robot's frame before it: x [m], y [m], heading [rad].
-            points: n by 2: the scan in the robot's frame [m].
-
-        Returns:
-            The step as the laser corrects it, and whether the scan continues what was seen before. Where it does not,
-            what was seen before is forgotten.
+            points: n by (x, y, nx, ny): the scan in the robot's frame [m].
         """
+        params = self.params
         before = self.pose
-        guess = compose(before, step)
-        continues = True
-        if self._distance is not None and len(points):
-            cell = self.params.resolution
-            information = self._information(step) * np.array([cell, cell, 1.0])
-            information *= np.array([[cell], [cell], [1.0]])
-            at = np.array([*((guess[:2] - self._corner) / cell), guess[2]])
-            found, _, near = align(
-                self._distance,
-                points / cell,
-                at,
-                information,
-                self.params.sigma / cell,
-                self.params.point_weight,
-                self.params.iterations,
-            )
-            continues = near >= self.params.continues
-            if continues:
-                guess = np.array([*(found[:2] * cell + self._corner), found[2]])
+        prior = odometry_information(step, params.odometry_m, params.odometry_rad)
+        motion, covariance = step, np.asarray(np.linalg.inv(prior), np.float64)
+        overlap, broken = 1.0, False
+        if self._patch is not None and len(points) >= FEWEST:
+            reach = (0.1 + 0.5 * math.hypot(step[0], step[1]), 0.05 + 0.5 * abs(float(step[2])))
+            # Only points on a surface can lie on one.
+            on_surfaces = max(float(np.any(points[:, 2:] != 0, axis=1).mean()), 0.1)
+            held = prior / _INDEPENDENT
+            fit = match_next(self._patch, points, before, step, held, reach, params.trusted * on_surfaces)
+            overlap = fit.overlap / on_surfaces
+            if overlap >= params.continues:
+                self._strange = 0
+                motion = between(before, fit.pose)
+                information = turned(fit.information, float(before[2])) * _INDEPENDENT
+                covariance = np.asarray(np.linalg.inv(information) + _FLOOR, np.float64)
             else:
-                self.keys.clear()
-        self.pose = guess
-        self._keep(points)
-        return between(before, guess), continues
-
-    def _information(self, step: Array) -> Array:
-        along, across, turn = step_deviations(step, self.noise)
-        # The wider of both, so that the direction of the step does not matter.
-        wide = max(along, across, 0.02)
-        return np.diag([1 / wide**2, 1 / wide**2, 1 / max(turn, 0.01) ** 2])
+                self._strange += 1
+                broken = self._strange >= params.strange
+        self.pose = compose(before, motion)
+        if broken:
+            self.forget()
+        if not self._strange and len(points) >= FEWEST:
+            self._keep(points)
+        return ScanStep(motion, covariance, overlap, broken)
 
     def _keep(self, points: Array) -> None:
+        params = self.params
         if self.keys:
-            moved = between(self.keys[-1].pose, self.pose)
-            far = math.hypot(moved[0], moved[1]) >= self.params.key_distance
-            if not far and abs(moved[2]) < self.params.key_turn:
+            away = between(self._last, self.pose)
+            if math.hypot(away[0], away[1]) < params.key_distance and abs(away[2]) < params.key_turn:
                 return
-        self.keys.append(KeyScan(self.pose.copy(), points))
-        size = 2 * round(self.params.half_size / self.params.resolution)
-        self._corner = self.pose[:2] - self.params.half_size
-        empty = np.ones((size, size), np.uint8)
-        for key in self.keys:
-            cos, sin = math.cos(key.pose[2]), math.sin(key.pose[2])
-            turned = key.points @ np.array([[cos, sin], [-sin, cos]]) + key.pose[:2]
-            cells = np.floor((turned - self._corner) / self.params.resolution).astype(np.int64)
-            inside = ((cells >= 0) & (cells < size)).all(axis=1)
-            empty[cells[inside, 1], cells[inside, 0]] = 0
-        self._distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float32)
+        self._last = self.pose
+        self.keys.append(KeyScan(self.pose, thin(points, 0.05)))
+        self.kept += 1
+        poses = np.array([key.pose for key in self.keys])
+        far = np.hypot(poses[:, 0] - self.pose[0], poses[:, 1] - self.pose[1])
+        near = np.argsort(far, kind="stable")[: params.near_scans]
+        seen = [moved(self.keys[index].points, self.keys[index].pose) for index in near]
+        self._patch = make_patch(np.vstack(seen))

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from skytether_services.navigation.pose_graph import Edges, between, compose, optimise
+from skytether_services.navigation.pose_graph import Edges, optimise
+from skytether_services.navigation.poses import between, compose
 
 
 def test_compose_undoes_between() -> None:

@@ -69,6 +69,18 @@ def test_measured_compensation_replays_what_is_on_its_way() -> None:
     assert predicted.at_arrival(seen, 2.0, 0.1).pose.x == pytest.approx(0.35 * 0.6)
 
 
+@pytest.mark.parametrize("compensation", [Compensation.MEASURED, Compensation.FIXED])
+def test_a_velocity_that_is_older_than_the_pose_follows_the_commands_since(compensation: Compensation) -> None:
+    predicted = PredictedState(DelayParams(compensation=compensation))
+    for n in range(4):
+        predicted.sent(n, Velocity(0.4 - 0.03 * n, 0.0), 1.0 + 0.03 * n, 0.0)
+    # Commands of 1.00, 1.03, 1.06 and 1.09 s, each 0.03 m/s slower; the pose is of 1.1 s, the velocity of 1.02 s.
+    seen = State(ORIGIN, Velocity(0.4, 0.0), 1.1, 0.08)
+    after = predicted.at_arrival(seen, 1.1, 0.0)
+    assert after.velocity.linear == pytest.approx(0.32, abs=0.011)
+    assert after.pose == ORIGIN
+
+
 def test_an_overtaken_command_never_acts() -> None:
     predicted = PredictedState(DelayParams(**PROMPT))
     predicted.sent(1, Velocity(0.5, 0.0), 0.0, 0.3)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.mapping import find_trajectory
-from skytether_services.navigation.pose_graph import between
+from skytether_services.navigation.poses import between
 from skytether_services.navigation.scan_matching import make_patch, moved, rate, refine, scan_points, search, thin
 
 pytestmark = pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Benchmarks of the service ``navigation`` on recorded logs; the algorithms are found by entry point.
+"""Benchmarks of the service ``navigation``, on recorded logs and in the simulated world, found by entry point.
 
 The platform imports no service: what is measured belongs to whoever installs an entry point of the group
 ``skytether.benches``, in ``pyproject.toml``::
@@ -6,10 +6,14 @@ The platform imports no service: what is measured belongs to whoever installs an
     [project.entry-points."skytether.benches"]
     mapping = "skytether_services.navigation.bench_mapping:build"
     localisation = "skytether_services.navigation.bench_localisation:run"
+    navigation = "skytether_services.navigation.bench_loop:measure_steps"
+    navigation-cluttered = "skytether_services.navigation.bench_courses:measure_cluttered"
+    navigation-delays = "skytether_services.navigation.bench_courses:measure_delays"
 
-Each is a function of plain arrays (a service cannot import `skytether.lab`): `MappingBench` and `LocalisationBench` are
-their shapes. To add the localisation bench, write that function and its line in ``pyproject.toml``, then reinstall
-(``pip install -e .``); `skytether lab bench localisation` calls it.
+Those on logs are functions of plain arrays (a service cannot import `skytether.lab`): `MappingBench` and
+`LocalisationBench` are their shapes. `StepBench`, `DelaysBench` and `ClutteredBench` drive the service in the simulated
+world. After adding a line to
+``pyproject.toml``, reinstall (``pip install -e .``).
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.lab.carmen import CarmenLog
+from skytether.lab.world.model import WorldError
 
 GROUP = "skytether.benches"
 
@@ -109,6 +114,70 @@ class LocalisationBench(Protocol):
         ...
 
 
+class StepBench(Protocol):
+    """The entry point ``navigation``."""
+
+    def __call__(self, *, trajectories: int, goals: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+        """Measure the time of the loop's steps while the robot drives through the simulated building.
+
+        Args:
+            trajectories: Tried in each step.
+            goals: So many of the building's.
+            seed: Of the world's noise.
+            progress: Told now and then how far it is.
+
+        Returns:
+            What is printed: ``wall_p50_ms, wall_p99_ms, cpu_p50_ms, cpu_p99_ms, bar_p99_ms, within_bar``, and what was
+            driven.
+
+        Raises:
+            skytether.lab.world.model.WorldError: The simulated world cannot be made.
+        """
+        ...
+
+
+class DelaysBench(Protocol):
+    """The entry point ``navigation-delays``."""
+
+    def __call__(self, *, goals: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+        """Drive over links of more and more delay, with each compensation.
+
+        Args:
+            goals: So many of the building's.
+            seed: Of the world's noise and the link's.
+            progress: Told before each drive.
+
+        Returns:
+            ``time_within_bar, measured_beats_fixed, measured_halves_off``, and ``rows``, each a drive: ``round_trip,
+            jitter, loss, compensation, state, seconds, path_error, contacts``.
+
+        Raises:
+            skytether.lab.world.model.WorldError: The simulated world cannot be made.
+        """
+        ...
+
+
+class ClutteredBench(Protocol):
+    """The entry point ``navigation-cluttered``."""
+
+    def __call__(self, *, worlds: int, runs: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+        """Drive through cluttered fields.
+
+        Args:
+            worlds: So many fields.
+            runs: In each.
+            seed: Of the fields, and the first of the noise.
+            progress: Told before each world.
+
+        Returns:
+            ``success, score, within_bar``, and ``rows``, each a drive.
+
+        Raises:
+            skytether.lab.world.model.WorldError: The simulated world cannot be made.
+        """
+        ...
+
+
 class NavigationBenchError(Exception):
     """The benchmark's algorithm cannot be had; the text says why and what to do."""
 
@@ -157,4 +226,21 @@ def bench_localisation(
             kidnaps=kidnaps,
         )
     except ValueError as error:
+        raise NavigationBenchError(str(error)) from error
+
+
+def bench_driving(name: str, **given: Any) -> dict[str, Any]:
+    """Call one of the entry points that drive in the simulated world.
+
+    Args:
+        name: ``navigation``, ``navigation-delays`` or ``navigation-cluttered``.
+        given: What it takes: `StepBench`, `DelaysBench`, `ClutteredBench`.
+
+    Raises:
+        NavigationBenchError: It is not installed, or the simulated world is not.
+    """
+    run = cast(Callable[..., dict[str, Any]], load(name))
+    try:
+        return run(**given)
+    except WorldError as error:
         raise NavigationBenchError(str(error)) from error

@@ -1,0 +1,187 @@
+"""Closed loops of the whole service over courses: with delay and its compensation, and through cluttered fields.
+
+``skytether lab bench navigation --delays`` and ``--cluttered``. As `bench_loop` it is no part of the service.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.lab.link_model import LinkConditions
+from skytether.lab.world.cluttered import field
+from skytether.lab.world.plan import Plan, building
+from skytether.testing.drive import Drive
+
+from .controller import MotionLimits
+from .prediction import Compensation
+from .service import Navigation
+
+Progress = Callable[[str], None]
+
+ROUND_TRIPS = (0.0, 0.05, 0.1, 0.15, 0.2)
+"""Without jitter and loss [s]."""
+JITTER, LOSS = 0.04, 0.02
+"""Of the last rows, at the longest round trip: standard deviation of a round trip [s], and share lost on each way."""
+TIME_MARGIN = 1.05
+"""The compensated drive at the longest round trip may take so many times what it takes without delay."""
+SUCCESS_BAR, SCORE_BAR = 0.95, 0.44
+_MOVING = 0.02
+"""A robot slower than this does not follow its path [m/s]."""
+_PATIENCE = 400.0
+_ENDED = ("succeeded", "failed")
+
+
+@dataclass(frozen=True)
+class Course:
+    """What came of one drive.
+
+    Attributes:
+        state: In the end.
+        seconds: Until then, in simulated time.
+        path_error: Mean distance of the robot's true place from the newest plan while it moves [m]; NaN: it never did.
+        contacts: With walls, things and people.
+    """
+
+    state: str
+    seconds: float
+    path_error: float
+    contacts: int
+
+
+def drive_course(drive: Drive, patience: float) -> Course:
+    """Drive until the service is done, for ``patience`` seconds at most."""
+    errors: list[float] = []
+    shown: Any = None
+    path = np.empty((0, 2))
+    began = drive.world.time
+
+    def is_over() -> bool:
+        nonlocal shown, path
+        if drive.world.ticks % 10 == 0 and abs(drive.robot.motion.forward) > _MOVING:
+            newest = drive.harness.newest("plan")
+            if newest is not shown:
+                shown = newest
+                path = np.array([(p.pose.position.x, p.pose.position.y) for p in newest.poses]).reshape(-1, 2)
+            if len(path) > 1:
+                errors.append(distance_from(path, drive.robot.pose[:2]))
+        return drive.state in _ENDED
+
+    drive.run(patience, is_over)
+    error = float(np.mean(errors)) if errors else math.nan
+    return Course(drive.state, drive.world.time - began, error, len(drive.world.contacts))
+
+
+def distance_from(path: NDArray[np.float64], point: tuple[float, float]) -> float:
+    """Of a point from a polyline, n by 2 [m]."""
+    starts, pieces = path[:-1], np.diff(path, axis=0)
+    to_point = np.array(point) - starts
+    squares = np.maximum((pieces**2).sum(axis=1), 1e-12)
+    along = np.clip((to_point * pieces).sum(axis=1) / squares, 0.0, 1.0)
+    return float(np.linalg.norm(to_point - along[:, None] * pieces, axis=1).min())
+
+
+def measure_delays(*, goals: int, seed: int, progress: Progress) -> dict[str, Any]:
+    """Time and path error with each compensation over links of more and more delay; nobody walks there.
+
+    Args:
+        goals: So many of the building's are driven to, at most.
+        seed: Of the world's noise, and of the link's.
+        progress: Told before each drive.
+    """
+    plan = replace(building(), people=())
+    longest = ROUND_TRIPS[-1]
+    links = [(trip, 0.0, 0.0) for trip in ROUND_TRIPS] + [(longest, JITTER, LOSS)]
+    rows = []
+    for trip, jitter, loss in links:
+        for compensation in Compensation:
+            progress(f"{1000 * trip:.0f} ms, jitter {1000 * jitter:.0f} ms, loss {100 * loss:g} %: {compensation}")
+            # Each way has its own jitter: those of both add up by their squares.
+            link = LinkConditions(delay=trip / 2, jitter=jitter / math.sqrt(2), loss=loss, seed=seed)
+            delay = {"compensation": str(compensation), "fixed_delay": trip}
+            course = _to_goals(plan, goals, {"delay": delay}, seed, link)
+            rows.append({"round_trip": trip, "jitter": jitter, "loss": loss, "compensation": str(compensation)})
+            rows[-1].update(asdict(course))
+    return {"goals": min(goals, len(plan.goals)), "seed": seed, "rows": rows, **delay_verdict(rows)}
+
+
+def delay_verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the rows say of the three bars. A drive that did not succeed meets none."""
+    by = {(row["round_trip"], row["jitter"], row["compensation"]): row for row in rows}
+    longest = ROUND_TRIPS[-1]
+
+    def row(trip: float, jitter: float, compensation: Compensation) -> dict[str, Any]:
+        return by[trip, jitter, str(compensation)]
+
+    prompt, late = (row(trip, 0.0, Compensation.MEASURED) for trip in (0.0, longest))
+    off, fixed, measured = (row(longest, JITTER, kind) for kind in Compensation)
+
+    def succeeded(*wanted: dict[str, Any]) -> bool:
+        return all(each["state"] == "succeeded" for each in wanted)
+
+    return {
+        "time_within_bar": succeeded(prompt, late) and late["seconds"] <= TIME_MARGIN * prompt["seconds"],
+        "measured_beats_fixed": succeeded(measured) and measured["path_error"] < fixed["path_error"],
+        "measured_halves_off": succeeded(measured) and measured["path_error"] <= off["path_error"] / 2,
+    }
+
+
+def _to_goals(plan: Plan, goals: int, params: dict[str, Any], seed: int, link: LinkConditions | None = None) -> Course:
+    wanted = [{"x": goal.x, "y": goal.y, "yaw": goal.heading} for goal in plan.goals[:goals]]
+    with TemporaryDirectory() as folder:
+        drive = Drive(Navigation, Path(folder), {"goals": wanted, **params}, plan, seed=seed, link=link)
+        return drive_course(drive, _PATIENCE)
+
+
+def measure_cluttered(*, worlds: int, runs: int, seed: int, progress: Progress) -> dict[str, Any]:
+    """Success and score through fields of cylinders. They are made by a generator of our own: it is no BARN score.
+
+    Args:
+        worlds: So many fields, from sparse to dense.
+        runs: In each, with the next seed of the world's noise.
+        seed: Of the fields, and the first of the noise.
+        progress: Told before each world.
+    """
+    top_speed = MotionLimits().max_linear
+    rows = []
+    for number in range(worlds):
+        made = field(number, seed=seed, worlds=worlds)
+        optimal = made.length / top_speed
+        progress(f"world {number + 1} of {worlds}")
+        for run in range(runs):
+            course = _to_goals(made.plan, 1, {"seed": seed + run}, seed + run)
+            passed = course.state == "succeeded" and not course.contacts
+            rows.append(
+                {
+                    "world": number,
+                    "run": run,
+                    "optimal": optimal,
+                    **asdict(course),
+                    "passed": passed,
+                    "score": score(passed, optimal, course.seconds),
+                }
+            )
+    success = float(np.mean([row["passed"] for row in rows]))
+    mean = float(np.mean([row["score"] for row in rows]))
+    return {
+        "worlds": worlds,
+        "runs": runs,
+        "seed": seed,
+        "top_speed": top_speed,
+        "success": success,
+        "score": mean,
+        "within_bar": success >= SUCCESS_BAR and mean >= SCORE_BAR,
+        "rows": rows,
+    }
+
+
+def score(passed: bool, optimal: float, actual: float) -> float:
+    """The optimal time over the actual one, which counts as 2 times the optimal at least and 8 times at most [s]."""
+    return optimal / min(max(actual, 2 * optimal), 8 * optimal) if passed else 0.0

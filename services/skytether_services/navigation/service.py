@@ -1,0 +1,300 @@
+"""The shell of navigation: topics and calls in, `Navigator`, topics out."""
+
+from __future__ import annotations
+
+import json
+import math
+from concurrent.futures import Executor, ThreadPoolExecutor
+
+import numpy as np
+
+from skytether.control.admittance import Velocity
+from skytether.messages import (
+    LaserScan,
+    OccupancyGrid,
+    Odometry,
+    PoseArray,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    SetBool,
+    SetBoolRequest,
+    SetBoolResponse,
+    String,
+    TFMessage,
+    Trigger,
+    TriggerRequest,
+    TriggerResponse,
+    Twist,
+    Vector3,
+)
+from skytether.messages import Path as PathMessage
+from skytether.service import ConfigError, Input, Output, Received, Service, answers
+
+from . import conversions as convert
+from .frames import Frames
+from .grid_map import GridMap, MapError, load_map
+from .mapping_mode import MappingMode
+from .navigator import Navigator, Report
+from .params import ModeName, Params
+from .senses import LaserScan as Scan
+from .senses import Senses
+from .status import Code, State, Trouble
+from .surroundings import Rate, mask_of
+from .zones import Mask
+
+_SMOOTH = 0.1
+"""Weight of a new delay in the mean of those before."""
+_LASTS = 1.0
+"""What lasts for so long [s] is reported; an end is at once."""
+PARTICLES = 200
+"""Shown of all."""
+
+
+class Navigation(Service[Params]):
+    """Drives a robot to goals on a map."""
+
+    tf = Input(TFMessage)
+    odom = Input(Odometry)
+    scan = Input(LaserScan)
+    map = Input(OccupancyGrid)
+    initialpose = Input(PoseWithCovarianceStamped)
+    goal = Input(PoseStamped)
+    goals = Input(PathMessage)
+
+    cmd_vel = Output(Twist)
+    status = Output(String)
+    plan = Output(PathMessage)
+    pose = Output(PoseWithCovarianceStamped)
+    particle_cloud = Output(PoseArray)
+    local_costmap = Output(OccupancyGrid)
+    global_costmap = Output(OccupancyGrid)
+    new_map = Output(OccupancyGrid)
+
+    def start(self) -> None:
+        params = self.params
+        try:
+            self._navigator = navigator = Navigator(params)
+            is_mapping = params.mode is ModeName.MAP
+            self._mapping = MappingMode(params, self.context.data_dir, self.executor()) if is_mapping else None
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        rates = params.rates
+        self.rate_hz = rates.control
+        self._due = {
+            "status": Rate(rates.publish_status),
+            "particles": Rate(rates.publish_particles),
+            "local": Rate(rates.publish_local_costmap),
+            "global": Rate(rates.publish_global_costmap),
+        }
+        self._frames = Frames()
+        self._odom_frame, self._base_frame = "odom", "base_link"
+        self._delay = 0.0
+        self._stamp = 0.0
+        self._told: tuple[object, ...] = ()
+        self._new: tuple[object, ...] = (State.WAITING, str(Code.OK), None)
+        self._new_at = math.inf
+        self._shown_path: object = None
+        self._shown_estimate: object = None
+        self._shown_map: object = None
+        if is_mapping:
+            return
+        if params.start is not None:
+            navigator.place(params.start.pose)
+        if params.map:
+            self._load(params.map)
+        if params.goals:
+            goals = [goal.pose for goal in params.goals]
+            navigator.go(goals, rounds=params.rounds, stop_at_each=params.stop_at_each)
+
+    def executor(self) -> Executor:
+        """Does what would hold up the loop in the mode that maps."""
+        return ThreadPoolExecutor(1, thread_name_prefix="mapping")
+
+    def step(self, now: float) -> None:
+        if self._mapping is not None:
+            # No velocity, not even zero: whoever drives the robot when no service does, drives it.
+            self._sense(self._mapping.senses)
+            self._mapping.step(now)
+            self._tell_mapping(self._mapping, now)
+            return
+        self._sense(self._navigator.whereabouts)
+        self._listen()
+        velocity = self._navigator.step(now, self._delay)
+        self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
+        self._tell(now)
+
+    @answers(Trigger)
+    def cancel(self, request: TriggerRequest) -> TriggerResponse:
+        """Stand, and forget the goals."""
+        del request
+        done = self._navigator.cancel()
+        return TriggerResponse(done, "The goals were called off." if done else "There are no goals to call off.")
+
+    @answers(SetBool)
+    def pause(self, request: SetBoolRequest) -> SetBoolResponse:
+        """Stand until told to go on."""
+        if not self._navigator.pause(request.data):
+            return SetBoolResponse(False, "There are no goals that the robot is on its way to.")
+        return SetBoolResponse(True, "The robot waits." if request.data else "The robot goes on.")
+
+    @answers(Trigger)
+    def clear_costmaps(self, request: TriggerRequest) -> TriggerResponse:
+        """Forget what the laser saw."""
+        del request
+        self._navigator.clear(whole=True, near=True)
+        return TriggerResponse(True, "What is still there is seen again.")
+
+    @answers(Trigger)
+    def save_map(self, request: TriggerRequest) -> TriggerResponse:
+        """Save the map that is being built, and say where."""
+        del request
+        if self._mapping is None:
+            return TriggerResponse(False, "No map is being built: the parameter mode is 'navigate'.")
+        return TriggerResponse(*self._mapping.save())
+
+    def stop(self) -> None:
+        """Save the map."""
+        if self._mapping is not None:
+            done, text = self._mapping.close()
+            self.report("map_saved" if done else str(Code.NOT_SAVED), text)
+
+    def _sense(self, senses: Senses) -> None:
+        """Hand what the robot measured on."""
+        if tf := self.tf.take():
+            self._frames.hear(tf.message)
+            self._note(tf)
+            if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
+                senses.odometry(found[1], found[0], tf.sent_at)
+                self._stamp = found[1]
+        if odom := self.odom.take():
+            message = odom.message
+            self._note(odom)
+            self._odom_frame = message.header.frame_id or self._odom_frame
+            self._base_frame = message.child_frame_id or self._base_frame
+            twist = message.twist.twist
+            velocity = Velocity(twist.linear.x, twist.angular.z)
+            stamp = message.header.stamp.seconds()
+            senses.odometry(stamp, convert.pose_of(message.pose.pose), odom.sent_at, velocity)
+        if scan := self.scan.take():
+            self._note(scan)
+            self._see(scan, senses)
+
+    def _listen(self) -> None:
+        """Hand what people ask for on to the navigator."""
+        navigator = self._navigator
+        if map_ := self.map.take():
+            self._use(convert.grid_of(map_.message), "the topic map")
+        if first := self.initialpose.take():
+            pose, deviation, turn = convert.first_pose(first.message)
+            navigator.place(pose, deviation, turn)
+        if (goal := self.goal.take()) and self._is_on_map(goal.message.header.frame_id):
+            navigator.go([convert.pose_of(goal.message.pose)])
+        if goals := self.goals.take():
+            frames = {goals.message.header.frame_id, *(pose.header.frame_id for pose in goals.message.poses)}
+            if all(self._is_on_map(frame) for frame in frames):
+                poses = [convert.pose_of(pose.pose) for pose in goals.message.poses]
+                navigator.go(poses, rounds=self.params.rounds, stop_at_each=self.params.stop_at_each)
+
+    def _note(self, message: Received[TFMessage] | Received[Odometry] | Received[LaserScan]) -> None:
+        """Learn how long messages take. Those to the robot take as long, as far as a service can know."""
+        taken = message.received_at - message.sent_at
+        if math.isfinite(message.sent_at_error) and 0 <= taken < 10:
+            self._delay += _SMOOTH * (taken - self._delay)
+
+    def _see(self, received: Received[LaserScan], senses: Senses) -> None:
+        scan = received.message
+        laser = self.params.sensors.laser
+        found = self._frames.lookup(self._base_frame, scan.header.frame_id) if laser is None else (laser.pose, 0.0)
+        senses.laser_frame = None if found else scan.header.frame_id
+        if found is None:
+            return
+        senses.scan(
+            Scan(
+                scan.header.stamp.seconds(),
+                received.sent_at,
+                scan.ranges,
+                scan.angle_min,
+                scan.angle_increment,
+                scan.range_min,
+                scan.range_max,
+                found[0],
+            )
+        )
+
+    def _is_on_map(self, frame: str) -> bool:
+        if frame.removeprefix("/") in ("", convert.MAP_FRAME):
+            return True
+        text = f"A goal is in the frame '{frame}'; give it in '{convert.MAP_FRAME}'."
+        self._navigator.refuse(Trouble(Code.BAD_GOAL, text))
+        return False
+
+    def _load(self, name: str) -> None:
+        """The map of a file. A broken one is told; another may come by topic."""
+        try:
+            self._use(load_map(self.context.data_dir / name), name)
+        except MapError as error:
+            self._navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map cannot be used: {error}")
+
+    def _use(self, grid: GridMap | None, source: str) -> None:
+        try:
+            if grid is None:
+                raise MapError("its size does not fit its cells")
+            self._navigator.use_map(grid, self._mask(self.params.keep_out), self._mask(self.params.speed_zones))
+        except ValueError as error:  # a MapError is one
+            self._navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map of {source} cannot be used: {error}")
+
+    def _mask(self, name: str) -> Mask | None:
+        return mask_of(load_map(self.context.data_dir / name)) if name else None
+
+    def _report(self, now: float, report: Report) -> None:
+        """Make an event of what lasts, or is an end. That there is no goal yet is none."""
+        is_end = report.doing in (State.SUCCEEDED, State.FAILED, State.CANCELED)
+        new = (report.doing, report.code, report.task, *([report.message] if is_end else []))
+        if new != self._new:
+            self._new, self._new_at = new, now
+        if now - self._new_at >= (0.0 if is_end else _LASTS):
+            self._new_at = math.inf
+            self.report(report.code if report.trouble is not None else str(report.doing), report.message)
+
+    def _tell(self, now: float) -> None:
+        """Publish what people and programs want to see."""
+        navigator = self._navigator
+        report = navigator.report()
+        self._report(now, report)
+        told = (report.doing, report.code, report.task)
+        if told != self._told or self._due["status"].due(now):
+            self._told = told
+            self.status.publish(String(json.dumps(convert.document(report, navigator.whereabouts))))
+        if navigator.path is not self._shown_path:
+            self._shown_path = navigator.path
+            self.plan.publish(convert.path_message(navigator.path, self._stamp))
+        estimate = navigator.whereabouts.estimate
+        if estimate is not None and estimate is not self._shown_estimate:
+            self._shown_estimate = estimate
+            self.pose.publish(convert.pose_message(estimate.pose, estimate.covariance, self._stamp))
+        particles = navigator.whereabouts.particles
+        if len(particles) and self._due["particles"].due(now):
+            shown = particles[np.linspace(0, len(particles) - 1, min(len(particles), PARTICLES)).astype(int)]
+            self.particle_cloud.publish(convert.particles_message(shown, self._stamp))
+        surroundings = navigator.surroundings
+        if surroundings is not None:
+            if surroundings.near is not None and self._due["local"].due(now):
+                self.local_costmap.publish(convert.costmap_message(surroundings.near, self._stamp))
+            if surroundings.whole is not None and self._due["global"].due(now):
+                self.global_costmap.publish(convert.costmap_message(surroundings.whole, self._stamp))
+
+    def _tell_mapping(self, mapping: MappingMode, now: float) -> None:
+        """Likewise, of the mode that maps."""
+        trouble = mapping.trouble(now)
+        message = trouble.message if trouble is not None else "A map is built of what the laser sees."
+        report = Report(State.MAPPING, trouble, message, None, "", 0, math.nan)
+        self._report(now, report)
+        if report.code not in self._told or self._due["status"].due(now):
+            self._told = (report.code,)
+            self.status.publish(String(json.dumps(convert.mapping_document(report, mapping))))
+        if mapping.progress is not self._shown_estimate and (pose := mapping.pose()) is not None:
+            self._shown_estimate = mapping.progress
+            self.pose.publish(convert.pose_message(np.array(pose), np.zeros((3, 3)), self._stamp))
+        if mapping.new_map is not None and mapping.new_map is not self._shown_map:
+            self._shown_map = mapping.new_map
+            self.new_map.publish(convert.map_message(mapping.new_map, self._stamp))

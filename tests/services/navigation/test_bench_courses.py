@@ -1,0 +1,46 @@
+"""The figures of ``skytether lab bench navigation --delays`` and ``--cluttered``, by hand."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skytether_services.navigation.bench_courses import delay_verdict, distance_from, score
+
+
+def test_distance_from_a_path() -> None:
+    path = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 0.0), (2.0, 2.0)])
+    assert distance_from(path, (1.0, 0.3)) == pytest.approx(0.3)
+    assert distance_from(path, (2.5, 1.0)) == pytest.approx(0.5)
+    assert distance_from(path, (-3.0, -4.0)) == pytest.approx(5.0)
+
+
+def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
+    assert score(True, 10.0, 12.0) == pytest.approx(1 / 2)
+    assert score(True, 10.0, 40.0) == pytest.approx(1 / 4)
+    assert score(True, 10.0, 900.0) == pytest.approx(1 / 8)
+    assert score(False, 10.0, 12.0) == 0.0
+
+
+def rows(off: float, fixed: float, measured: float, late: float, state: str = "succeeded") -> list[dict[str, Any]]:
+    def row(trip: float, jitter: float, kind: str, error: float, seconds: float) -> dict[str, Any]:
+        told = {"round_trip": trip, "jitter": jitter, "compensation": kind}
+        return {**told, "path_error": error, "seconds": seconds, "state": state}
+
+    plain = [row(0.0, 0.0, "measured", 0.02, 100.0), row(0.2, 0.0, "measured", 0.02, late)]
+    errors = {"off": off, "fixed": fixed, "measured": measured}
+    return plain + [row(0.2, 0.04, kind, error, late) for kind, error in errors.items()]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ((0.1, 0.06, 0.05, 105.0), (True, True, True)),
+        ((0.1, 0.04, 0.05, 106.0), (False, False, True)),
+        ((0.1, 0.07, 0.06, 104.0), (True, True, False)),
+        ((0.1, 0.06, 0.05, 105.0, "failed"), (False, False, False)),
+    ],
+)
+def test_verdict_of_the_delays(given: Any, expected: tuple[bool, bool, bool]) -> None:
+    found = delay_verdict(rows(*given))
+    assert (found["time_within_bar"], found["measured_beats_fixed"], found["measured_halves_off"]) == expected

@@ -1,0 +1,51 @@
+"""The search of a whole map, in the room of `test_scan_matching`. Its functions compile for a while."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from skytether_services.navigation.global_search import search
+from skytether_services.navigation.grid_map import GridMap
+from skytether_services.navigation.likelihood_field import likelihood_field
+from skytether_services.navigation.localisation import Localisation
+from skytether_services.navigation.occupancy import Beams, map_from_scans
+from skytether_services.navigation.poses import between, compose
+from skytether_services.navigation.scan_matching import scan_points
+
+from .test_scan_matching import ANGLES, room
+
+pytestmark = pytest.mark.slow
+
+
+def room_map() -> GridMap:
+    seen = np.array([[0.0, 0.0, turn] for turn in (0.0, math.pi / 2, math.pi, -math.pi / 2)])
+    beams = Beams(float(ANGLES[0]), float(ANGLES[1] - ANGLES[0]), 30.0)
+    return map_from_scans(np.array([room(pose) for pose in seen], np.float64), seen, beams)
+
+
+def test_the_place_of_a_scan_is_found_in_the_whole_map() -> None:
+    # From here it sees the box, without which the room looks the same from its other end.
+    truth = np.array([-1.3, 0.4, 0.2])
+    ends = scan_points(room(truth), ANGLES, 30.0)[:, :2]
+    found = search(likelihood_field(room_map()), np.zeros(ends.shape), ends, np.random.default_rng(1))
+    # Half a step of the grid and of the headings is what the search itself is wrong by; then it is made fine.
+    np.testing.assert_allclose(found[0].pose, truth, atol=0.05)
+    assert found[0].explained.share > 0.9
+
+
+def test_a_pose_that_the_map_contradicts_gives_way_to_one_that_it_explains() -> None:
+    localisation = Localisation(likelihood_field(room_map()), np.random.default_rng(1))
+    truth = np.array([-1.3, 0.4, 0.2])
+    # Through the walls, from the begin: nothing breaks.
+    localisation.place(np.array([1.0, 0.4, 1.5]), np.diag([0.0001, 0.0001, 0.0001]))
+    step = np.array([0.1, 0.0, 0.03])
+    estimates = []
+    for _ in range(30):
+        truth = compose(truth, step)
+        estimates.append(localisation.update(step, scan_points(room(truth), ANGLES, 30.0)[:, :2]))
+    assert not any(estimate.sure for estimate in estimates[8:12])
+    assert estimates[-1].sure
+    np.testing.assert_allclose(between(truth, estimates[-1].pose), 0.0, atol=0.1)
