@@ -23,13 +23,16 @@ from .rest import (
     InstanceCreate,
     InstanceEvent,
     Migrate,
+    Neighbours,
     Problem,
     Renew,
     Robot,
     RobotCreate,
     RobotCreated,
+    RobotGroup,
     SessionClaim,
     SessionKey,
+    Share,
     Site,
     SiteCreate,
     State,
@@ -307,6 +310,14 @@ class Client(Connection):
     def report_gate(self, name: str, report: GateReport) -> None:
         """A robot says how the gate before its wheels is; with its own token only."""
         self._request("PUT", _at("robots", name, "gate"), report)
+
+    def set_group(self, name: str, group: str | None) -> None:
+        """With whom a robot's services share what they see; None: with nobody."""
+        self._request("PUT", _at("robots", name, "group"), RobotGroup(group=group))
+
+    def share(self, instance_id: str, share: Share) -> Neighbours:
+        """Tell what an instance's service shares, and hear what others of the group do; with the robot's token only."""
+        return self._one(Neighbours, "POST", _at("instances", instance_id, "share"), share)
 
     # Everything
 

@@ -29,6 +29,8 @@ CALL_DEPTH = 64
 """Requests, and answers, that may be under way by default."""
 ACTION_NEWEST_LIFESPAN_MS = 1000
 """Of an action's feedback and status, which come again and again."""
+SHARED_TYPE = "std_msgs/msg/String"
+"""Of what robots share: text that only the services understand."""
 RESULT_LIFESPAN_MS = 3_600_000
 """How long an action of ROS 2 may take: its result is asked for at the start, and answered at the end."""
 
@@ -88,6 +90,10 @@ class TopicSpec(Strict):
     """Not for what is compressed already, such as camera images."""
     paths: Literal["failover", "redundant"] = "failover"
     """``redundant``: every message by two of the robot's networks, where it has several."""
+    shared: bool = False
+    """Between the robots of one group, not with the robot's graph: what the service says on such a topic (``out``, of
+    type `SHARED_TYPE`) is told to the instances of the same service that the group's other robots have, and what those
+    said comes on the other (``in``). The robots' agents carry it, by way of the orchestrator."""
 
     @model_validator(mode="before")
     @classmethod
@@ -104,6 +110,8 @@ class TopicSpec(Strict):
             raise ValueError("latched: true needs reliable: true")
         if self.kind != "topic" and (not self.reliable or self.latched or self.name == ANY_TOPIC):
             raise ValueError(f"kind: {self.kind} is reliable and not latched, and has a name of its own")
+        if self.shared and (self.kind != "topic" or self.type != SHARED_TYPE):
+            raise ValueError(f"shared: true is for a topic of type {SHARED_TYPE}")
         return self
 
     def parts(self) -> tuple[TopicSpec, ...]:
@@ -295,7 +303,20 @@ class ServiceSpec(Strict):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"topic '{name}' is listed twice")
+        for direction in ("in", "out"):
+            shared = [t.name for t in self.topics if t.shared and t.direction == direction]
+            if len(shared) > 1:
+                raise ValueError(f"'{shared[0]}' and '{shared[1]}': one topic of each direction may be shared")
         return self
+
+    @property
+    def robot_topics(self) -> Topics:
+        """Those between the service and its robot's graph."""
+        return tuple(topic for topic in self.topics if not topic.shared)
+
+    def shared(self, direction: Literal["in", "out"]) -> str | None:
+        """The topic of this direction that is shared between robots; None: there is none."""
+        return next((t.name for t in self.topics if t.shared and t.direction == direction), None)
 
 
 class Manifest(Strict):

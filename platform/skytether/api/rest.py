@@ -279,6 +279,38 @@ class Renew(Strict):
     report: Report | None = None
 
 
+MOST_SHARED = 8192
+"""Characters that a service may share at a time; with them a robot's request counts as one or two."""
+MOST_NEIGHBOURS = 15
+"""Robots of a group whose words one of them gets: those heard last."""
+
+
+class Share(Strict):
+    """What an instance's service shares, and what it hears for it."""
+
+    text: Annotated[str, Field(max_length=MOST_SHARED)] | None = None
+    """Instead of what it said before; None: nothing new."""
+    age_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    """How long ago the robot got it of its service."""
+
+
+class Shared(Strict):
+    """What the same service of another robot of the group said last."""
+
+    robot: str
+    age_s: float
+    """How long ago it did, but for the way to its robot and from there."""
+    text: str
+
+
+class Neighbours(Strict):
+    """What a robot's neighbours share with it."""
+
+    group: str | None = None
+    """The robot's; None: it is in none, and nothing is kept of what it said."""
+    others: tuple[Shared, ...] = ()
+
+
 class SiteCreate(Strict):
     """A place where instances run."""
 
@@ -342,6 +374,14 @@ class RobotBase(Strict):
     name: Name
     services: tuple[str, ...] = ("*",)
     """What it may ask for; ``*``: anything."""
+    group: Name | None = None
+    """With whom its services share what they see: with the same services of the group's other robots. None: nobody."""
+
+
+class RobotGroup(Strict):
+    """Put a robot into a group, or out of its group."""
+
+    group: Name | None
 
 
 class RobotCreate(RobotBase):

@@ -308,6 +308,7 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
         (
             r.name,
             ", ".join(r.services),
+            or_dash(r.group),
             or_dash(r.created_at),
             or_dash(r.last_seen_at),
             f"{r.use.instances} of {r.quota.instances}",
@@ -323,6 +324,7 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
     head = (
         "robot",
         "may ask for",
+        "group",
         "registered",
         "last seen",
         "instances",
@@ -386,6 +388,9 @@ def add_robot(
         list[str] | None,
         typer.Option(help="What it may ask for; may be given again; all else.", autocompletion=names.services),
     ] = None,
+    group: Annotated[
+        str | None, typer.Option(help="With whose robots its services share what they see; nobody's else.")
+    ] = None,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
@@ -396,9 +401,10 @@ def add_robot(
     from skytether.api.rest import RobotCreate
 
     try:
-        request = RobotCreate(name=name, services=tuple(service or ("*",)))
-    except ValidationError:
-        fail(f"'{name}' is no name: lower-case letters, digits and '-', at most 63", 2)
+        request = RobotCreate(name=name, services=tuple(service or ("*",)), group=group)
+    except ValidationError as error:
+        wrong = group if error.errors()[0]["loc"] == ("group",) else name
+        fail(f"'{wrong}' is no name: lower-case letters, digits and '-', at most 63", 2)
     with connected(url, token_file) as client:
         made = client.create_robot(request)
     if json:
@@ -406,6 +412,24 @@ def add_robot(
         return
     console.print(f"robot {made.name} is registered; its token, which cannot be shown again:")
     typer.echo(made.token)
+
+
+@robot_app.command("group")
+def group_robot(
+    name: Annotated[str, typer.Argument(help="Its name.", autocompletion=names.robots)],
+    group: Annotated[str | None, typer.Argument(help="The group's name; nothing: out of its group.")] = None,
+    url: Url = None,
+    token_file: TokenFile = None,
+) -> None:
+    """Say with whose robots its services share what they see: with the same services of all robots of the group."""
+    from skytether.api.manifest import NAME
+
+    if group is not None and not NAME.fullmatch(group):
+        fail(f"'{group}' is no name: lower-case letters, digits and '-', at most 63", 2)
+    with connected(url, token_file) as client:
+        need("robot", name, lambda: [robot.name for robot in client.robots()])
+        client.set_group(name, group)
+    console.print(f"robot {name} is in no group" if group is None else f"robot {name} is in group {group}")
 
 
 @robot_app.command("delete")

@@ -56,7 +56,7 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
     manifest, findings = look_at_orchestrator(settings, token)
     findings.append(_master(node))
     if manifest is not None and findings[-1].good:
-        specs = manifest.spec.topics
+        specs = manifest.spec.robot_topics
         names = graph.names(specs)
         findings += _topics(settings, names, node, specs)
         findings += forbidden(graph.permissions(), specs, names, settings.command_topic)

@@ -96,7 +96,7 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
             says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
             findings.append(Finding("ROS 2 router", router, "", says))
         if manifest is not None and joined:
-            specs = manifest.spec.topics
+            specs = manifest.spec.robot_topics
             names = config.names(specs)
             findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]

@@ -204,14 +204,16 @@ class Access:
             if row.robot is not None:
                 self._store.seen(row.robot, now)
 
-    def register(self, name: str, services: tuple[str, ...], ttl_s: float | None) -> tuple[RobotRow, str]:
+    def register(
+        self, name: str, services: tuple[str, ...], ttl_s: float | None, group: str | None = None
+    ) -> tuple[RobotRow, str]:
         """A new robot and its token, which cannot be shown again.
 
         Raises:
             ConflictError: There is one of that name.
         """
         row, token = self._new(name, name, (), ttl_s)
-        robot = RobotRow(name, services, row.created_at)
+        robot = RobotRow(name, services, row.created_at, group=group)
         if not self._store.add_robot(robot, row):
             raise ConflictError(f"there is a robot '{name}' already: give it another token, or delete it first")
         return robot, token

@@ -22,6 +22,7 @@ from .db import GONE
 from .discovery import advertised, named, targets
 from .errors import OutdatedError
 from .events import Broker
+from .exchange import Exchange
 from .gates import Gates
 from .instances import Instances
 from .leader import Leadership
@@ -86,6 +87,7 @@ class Orchestrator:
         self.quotas = Quotas(self.store, settings.quotas, self.stored)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
+        self.exchange = Exchange(self.store, clock)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -222,6 +224,7 @@ class Orchestrator:
     def _write(self) -> None:
         self.reports.write()
         self.gates.write()
+        self.exchange.sync()
 
     def _elect(self) -> float:
         if self.look_outdated():

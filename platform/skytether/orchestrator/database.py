@@ -16,7 +16,7 @@ from skytether.api.rest import GateReport, Scope, SiteCreate
 from .db import SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
-from .models import facts, gates, robots, services, sites, stops, tokens
+from .models import facts, gates, robots, services, shared, sites, stops, tokens
 from .security import TokenHash
 
 
@@ -28,6 +28,20 @@ class RobotRow:
     services: tuple[str, ...]
     created_at: float
     last_seen_at: float | None = None
+    group: str | None = None
+    """With whom its services share what they see."""
+
+
+@dataclass(frozen=True, slots=True)
+class SharedRow:
+    """What a robot's service told the others of its group last."""
+
+    robot: str
+    service: str
+    group: str
+    """To which it was told."""
+    at: float
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +104,13 @@ _HEAR_GATE = text(
     " ON CONFLICT (robot) DO UPDATE SET at = excluded.at, report = excluded.report"
 ).bindparams(bindparam("report", type_=gates.c.report.type))
 """Nothing for a robot that was deleted meanwhile."""
+_HEAR_SHARED = text(
+    "INSERT INTO shared (robot, service, share_group, at, text)"
+    " SELECT name, :service, :in_group, :at, :text FROM robots WHERE name = :of_robot"
+    " ON CONFLICT (robot, service)"
+    " DO UPDATE SET share_group = excluded.share_group, at = excluded.at, text = excluded.text"
+)
+"""Likewise."""
 
 
 class Database:
@@ -229,7 +250,12 @@ class Database:
 
     def add_robot(self, robot: RobotRow, token: TokenRow) -> bool:
         """With its first token; False if there is one of that name."""
-        row = {"name": robot.name, "services": list(robot.services), "created_at": robot.created_at}
+        row = {
+            "name": robot.name,
+            "services": list(robot.services),
+            "created_at": robot.created_at,
+            "share_group": robot.group,
+        }
         try:
             with self._writing() as connection:
                 connection.execute(insert(robots).values(**row))
@@ -245,6 +271,37 @@ class Database:
     def seen(self, robot: str, now: float) -> None:
         with self._writing() as connection:
             connection.execute(update(robots).where(robots.c.name == robot).values(last_seen_at=now))
+
+    def set_group(self, name: str, group: str | None) -> bool:
+        """False: there is no such robot."""
+        with self._writing() as connection:
+            changed = connection.execute(update(robots).where(robots.c.name == name).values(share_group=group))
+        return changed.rowcount > 0
+
+    def groups(self) -> dict[str, str]:
+        """By robot, of those that are in one."""
+        with self._reader.connect() as connection:
+            found = connection.execute(
+                select(robots.c.name, robots.c.share_group).where(robots.c.share_group.is_not(None))
+            )
+            return {row.name: row.share_group for row in found}
+
+    def shared(self) -> list[SharedRow]:
+        """What robots told those of their groups."""
+        with self._reader.connect() as connection:
+            return [SharedRow(*row) for row in connection.execute(select(shared)).all()]
+
+    def hear_shared(self, heard: Iterable[SharedRow], before: float) -> None:
+        """Instead of what they told before, in order, as gates; what was told before a time is forgotten."""
+        ordered = sorted(heard, key=lambda row: (row.robot, row.service))
+        rows = [
+            {"of_robot": row.robot, "service": row.service, "in_group": row.group, "at": row.at, "text": row.text}
+            for row in ordered
+        ]
+        with self._writing() as connection:
+            if rows:
+                connection.execute(_HEAR_SHARED, rows)
+            connection.execute(delete(shared).where(shared.c.at < before))
 
     def stops(self) -> dict[str, StopRow]:
         """The last order to each robot to stop."""
@@ -361,7 +418,7 @@ class Database:
 
 
 def _robot(row: Row[Any]) -> RobotRow:
-    return RobotRow(row.name, tuple(row.services), row.created_at, row.last_seen_at)
+    return RobotRow(row.name, tuple(row.services), row.created_at, row.last_seen_at, row.share_group)
 
 
 def _stop(row: Row[Any]) -> StopRow:

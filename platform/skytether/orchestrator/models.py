@@ -15,6 +15,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
+    Text,
     false,
 )
 
@@ -57,6 +58,18 @@ robots = Table(
     Column("services", JSON, nullable=False),
     Column("created_at", Float, nullable=False),
     Column("last_seen_at", Float),
+    Column("share_group", String(63), comment="With whom it shares what it sees; NULL: with nobody"),
+)
+
+shared = Table(
+    "shared",
+    metadata,
+    Column("robot", String(63), ForeignKey("robots.name", ondelete="CASCADE"), primary_key=True),
+    Column("service", String(63), primary_key=True),
+    Column("share_group", String(63), nullable=False, comment="To which it was told"),
+    Column("at", Float, nullable=False),
+    Column("text", Text, nullable=False),
+    comment="What each robot's services told the others of its group last",
 )
 
 stops = Table(

@@ -27,7 +27,7 @@ from skytether.bridge import Bridge, BridgeError, SessionSpec
 from skytether.bridge.interfaces import Wanted
 from skytether.bridge.port import Port
 from skytether.bridge.spec import parse_id, parse_key
-from skytether.messages import Message, Twist, type_hash, warm
+from skytether.messages import Encoding, Message, Twist, type_hash, warm
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
 
@@ -46,6 +46,7 @@ from .safety.gate_report import SaysGate
 from .safety.watch import GateWatch
 from .service_manager import ServiceManager, Terms, terms
 from .session import Endpoint, LiveSession
+from .sharing import Serving, SharedTopics, Sharing
 from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
 from .supervisor import Limits
@@ -136,6 +137,7 @@ class _Opened:
     session: LiveSession
     instance: rest.Instance
     terms: Terms
+    shared: SharedTopics
 
 
 MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
@@ -229,6 +231,7 @@ class Agent:
             if config.gate is not None and config.stop_from_afar
             else None
         )
+        self._sharing = Sharing(speaks, self._shares, on_refused=self._another_token, clock=clock)
         self._token = config.token
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
@@ -263,6 +266,7 @@ class Agent:
             "control": self._control,
             "ask": self._ask,
             "watch": self._watch,
+            "share": partial(self._sharing.run, self._stop),
             **({"decide": partial(self._tasks.run, self._stop)} if self._tasks else {}),
             **({"gate": partial(self._gate.run, self._stop)} if self._gate else {}),
             **({"say_gate": partial(self._says_gate.run, self._stop)} if self._says_gate else {}),
@@ -499,7 +503,7 @@ class Agent:
             return
         self._trouble = ""
         held_to = terms(granted.needs, granted.topics, self._config.command_topic)
-        self._open_sessions[granted.id] = _Opened(session, instance, held_to)
+        self._open_sessions[granted.id] = _Opened(session, instance, held_to, SharedTopics.of(granted.topics))
         self._driver.offer(session)
 
     def _told(self, instance: rest.Instance) -> None:
@@ -528,17 +532,34 @@ class Agent:
                 # Bytes of another type may well decode: a Wrench has the shape of a Twist.
                 raise ValueError(f"the service's {topic.name} is a {topic.type}, and only a {Twist.TYPE} may drive")
         command = self._config.command_topic
+        shared = SharedTopics.of(granted.topics)
         if self._graph is None:
-            topics = robot_table(granted.topics, offers(self._base.topics))
+            topics = robot_table(granted.topics, offers({**self._base.topics, **shared.readings}))
             names = frozenset(topic.name for topic in topics)
-            session = LiveSession(granted.id, names, command, self._epochs)
+            session = LiveSession(granted.id, names, command, self._epochs, shared_topic=shared.said)
         else:
-            topics, port = self._graph.open(granted.topics, command)
             encoding = self._graph.encoding
-            session = LiveSession(granted.id, frozenset(), command, self._epochs, encoding=encoding, graph=port)
+            topics, port = self._graph.open([topic for topic in granted.topics if not topic.shared], command)
+            between = [topic for topic in granted.topics if topic.shared]
+            topics += robot_table(between, offers(shared.readings, encoding), encoding=encoding)
+            session = LiveSession(
+                granted.id,
+                frozenset(shared.readings),
+                command,
+                self._epochs,
+                encoding=encoding,
+                graph=port,
+                shared_topic=shared.said,
+            )
         spec = SessionSpec(parse_id(granted.id), parse_key(granted.key or ""), Role.ROBOT, topics)
         session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
         return session
+
+    def _shares(self) -> Serving | None:
+        """What serves the robot now, for sharing."""
+        session = self._driver.session
+        opened = self._open_sessions.get(session.id) if session is not None else None
+        return None if opened is None else Serving(opened.session, opened.instance.id, opened.shared)
 
     def __enter__(self) -> Agent:
         self.start()
@@ -550,6 +571,6 @@ class Agent:
         self.close()
 
 
-def offers(topics: Mapping[str, type[Message]]) -> dict[str, Offer]:
+def offers(topics: Mapping[str, type[Message]], encoding: Encoding = "cdr") -> dict[str, Offer]:
     """What a robot with these message classes can send."""
-    return {name: Offer(cls.TYPE, type_hash(cls, "cdr"), "cdr") for name, cls in topics.items()}
+    return {name: Offer(cls.TYPE, type_hash(cls, encoding), encoding) for name, cls in topics.items()}

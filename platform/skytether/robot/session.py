@@ -52,6 +52,10 @@ class LiveSession:
         epochs: Numbers of handshakes, shared with the sessions before and after it.
         encoding: Of its messages, both ways.
         graph: Port of the robot's graph, which takes every other message and is told every event.
+        shared_topic: What the service tells other robots, which is not the graph's either; None: nothing.
+
+    Attributes:
+        said: The newest message of that topic, until somebody takes it.
     """
 
     def __init__(
@@ -63,6 +67,7 @@ class LiveSession:
         *,
         encoding: Encoding = "cdr",
         graph: Port | None = None,
+        shared_topic: str | None = None,
     ) -> None:
         self.id = id
         self.encoding = encoding
@@ -74,6 +79,8 @@ class LiveSession:
         self.peer: tuple[str, int] | None = None
         self._topics = topics
         self._command_topic = command_topic
+        self._shared_topic = shared_topic
+        self.said: MessageReceived | None = None
         self._epochs = epochs
         self._epoch = next(epochs)
         self._arrived: deque[tuple[int, MessageReceived]] = deque(maxlen=_WAITING_COMMANDS)
@@ -119,9 +126,11 @@ class LiveSession:
             self._graph.attach(publisher)
 
     def deliver(self, message: MessageReceived) -> None:
-        """Port: keep commands; the rest is the graph's."""
+        """Port: keep commands, and what is for other robots; the rest is the graph's."""
         if message.topic == self._command_topic:
             self._arrived.append((self._epoch, message))
+        elif message.topic == self._shared_topic:
+            self.said = message
         elif self._graph is not None:
             self._graph.deliver(message)
 

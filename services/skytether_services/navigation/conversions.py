@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -117,7 +118,7 @@ def mapping_document(report: Report, mapping: MappingMode) -> dict[str, Any]:
     }
 
 
-def document(report: Report, whereabouts: Whereabouts) -> dict[str, Any]:
+def document(report: Report, whereabouts: Whereabouts, neighbours: Mapping[str, str]) -> dict[str, Any]:
     """The status, for programs; documented in docs/navigation.md."""
     task, estimate, state = report.task, whereabouts.estimate, whereabouts.state()
     # As new as odometry is: the estimate is of the last scan, 0.1 s old and more.
@@ -136,6 +137,7 @@ def document(report: Report, whereabouts: Whereabouts) -> dict[str, Any]:
         "recoveries": report.recoveries,
         "pose": pose,
         "localised": estimate is not None and estimate.sure,
+        "neighbours": dict(neighbours),
     }
 
 

@@ -77,6 +77,8 @@ class LayeredCostmap:
         self._inscribed = footprint.inscribed
         self._base = self._static if rolling is None else window(static, *static.origin, rolling.width, rolling.height)
         self._marks = np.full_like(self._base.costs, UNKNOWN)
+        self.others: Costs | None = None
+        """What others say, on the cells of the whole map, not of a window; None: nothing."""
 
     @property
     def marks(self) -> Costs:
@@ -102,10 +104,12 @@ class LayeredCostmap:
             mark_and_clear(self._marks, self._base.resolution, self._base.origin, scan, self._obstacles)
         self._free_below(pose)
 
-    def compose(self) -> Costmap:
-        """All layers together, inflated."""
-        costs = inflate(combine(self._base.costs, self._marks), self._table)
-        return Costmap(costs, self._base.resolution, self._base.origin)
+    def compose(self, *, with_others: bool = True) -> Costmap:
+        """All layers together, inflated; or all but what others say."""
+        costs = combine(self._base.costs, self._marks)
+        if with_others and self.others is not None:
+            costs = combine(costs, self.others)
+        return Costmap(inflate(costs, self._table), self._base.resolution, self._base.origin)
 
     def update(self, pose: Pose, scan: Scan | None = None) -> Costmap:
         """``observe``, then ``compose``."""

@@ -20,7 +20,7 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from .behaviour_tree import BUILT_IN, load_tree
 from .checkers import GoalChecker, ProgressChecker
 from .controller import Controller, ControlStatus, FollowedPath, turn_towards
-from .costmap import INSCRIBED, LETHAL
+from .costmap import INSCRIBED, LETHAL, Costmap
 from .dwa import Dwa
 from .footprint import cost_at
 from .geometry import Pose, advance
@@ -29,6 +29,7 @@ from .mppi import Mppi
 from .params import ControllerName, Params
 from .planner import PlanStatus, plan
 from .prediction import PredictedState, State
+from .shared_word import Said
 from .status import Code, Trouble
 from .status import State as Doing
 from .surroundings import Surroundings
@@ -110,6 +111,8 @@ class Navigator:
         self._aim: Pose | None = None
         self._planned_at = -math.inf
         self._no_way = False
+        self._on_own = False
+        """The path leads where other robots say that there is no way: there was no other."""
         self.trajectory: NDArray[np.float64] = np.empty((0, 3))
 
     def _make_controller(self, random: np.random.Generator) -> Controller:
@@ -307,7 +310,9 @@ class Navigator:
         return self._no_way or self._is_path_blocked()
 
     def _is_path_blocked(self) -> bool:
-        whole = self.surroundings.whole if self.surroundings is not None else None
+        whole = None
+        if self.surroundings is not None:
+            whole = self.surroundings.own if self._on_own else self.surroundings.whole
         if self._followed is None or whole is None:
             return False
         ahead = self._followed.ahead(self.pose.x, self.pose.y, _LOOK, whole.resolution)
@@ -315,9 +320,15 @@ class Navigator:
         return any(whole.at(x, y) in (INSCRIBED, LETHAL) for x, y, _ in ahead[4:])
 
     def plan(self) -> Trouble | None:
-        whole = self._around.whole
-        if whole is None:
+        whole, own = self._around.whole, self._around.own
+        if whole is None or own is None:
             return Trouble(Code.NO_MAP, "The costmap is not ready yet.")
+        trouble = self._plan_on(whole)
+        self._on_own = trouble is not None and own is not whole and self._hopeless is None
+        # What others say makes no goal unreachable: where they leave no way, the robot goes and looks for itself.
+        return self._plan_on(own) if self._on_own else trouble
+
+    def _plan_on(self, whole: Costmap) -> Trouble | None:
         start = self.pose
         pieces: list[NDArray[np.float64]] = []
         for goal in self._asked.until_stop(_LEGS):
@@ -392,6 +403,18 @@ class Navigator:
         self._recoveries += 1
         self._progress.reset()
         self._planned_at = -math.inf
+
+    def hear(self, now: float, said: Sequence[Said]) -> None:
+        """Other robots of the group said something (`neighbours`)."""
+        if self.surroundings is not None:
+            self.surroundings.neighbours.hear(now, said)
+
+    def word(self, now: float) -> str | None:
+        """What to tell them; None: there are none, or this robot does not know where it is."""
+        state = self.whereabouts.state()
+        if self.surroundings is None or state is None or self.whereabouts.trouble(now) is not None:
+            return None
+        return self.surroundings.word(now, state.pose)
 
     def report(self) -> Report:
         """What to tell."""

@@ -16,6 +16,7 @@ from .geometry import Pose
 from .layers import WindowParams
 from .localisation import LocalisationParams
 from .mppi import MppiParams
+from .neighbours import SharingParams
 from .obstacles import ObstacleParams
 from .planner import PlannerParams
 from .prediction import DelayParams
@@ -188,5 +189,6 @@ class Params:
     delay: DelayParams = param(DelayParams(), doc="how the delay of the link is made up for")  # noqa: RUF009
     mppi: MppiParams = param(MppiParams(), doc="of this controller; its period is that of the loop")  # noqa: RUF009
     dwa: DwaParams = param(DwaParams(), doc="of this controller")  # noqa: RUF009
+    sharing: SharingParams = param(SharingParams(), doc="with the other robots of the group")  # noqa: RUF009 - immutable
     mapping: MappingModeParams = param(MappingModeParams(), doc="of the mode `map`")  # noqa: RUF009 - immutable
     seed: int = param(1, ge=0, doc="of particles and trajectories")

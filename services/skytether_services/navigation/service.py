@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from .navigator import Navigator, Report
 from .params import ModeName, Params
 from .senses import LaserScan as Scan
 from .senses import Senses
+from .shared_word import read_said
 from .status import Code, State, Trouble
 from .surroundings import Rate, mask_of
 from .zones import Mask
@@ -46,6 +48,8 @@ _SMOOTH = 0.1
 """Weight of a new delay in the mean of those before."""
 _LASTS = 1.0
 """What lasts for so long [s] is reported; an end is at once."""
+_TELLS = 1.0
+"""How often the group is told what this robot sees [Hz]: as often as its agent brings what the others do."""
 PARTICLES = 200
 """Shown of all."""
 
@@ -60,6 +64,7 @@ class Navigation(Service[Params]):
     initialpose = Input(PoseWithCovarianceStamped)
     goal = Input(PoseStamped)
     goals = Input(PathMessage)
+    obstacles_shared = Input(String)
 
     cmd_vel = Output(Twist)
     status = Output(String)
@@ -69,6 +74,7 @@ class Navigation(Service[Params]):
     local_costmap = Output(OccupancyGrid)
     global_costmap = Output(OccupancyGrid)
     new_map = Output(OccupancyGrid)
+    obstacles_seen = Output(String)
 
     def start(self) -> None:
         params = self.params
@@ -85,6 +91,7 @@ class Navigation(Service[Params]):
             "particles": Rate(rates.publish_particles),
             "local": Rate(rates.publish_local_costmap),
             "global": Rate(rates.publish_global_costmap),
+            "word": Rate(_TELLS),
         }
         self._frames = Frames()
         self._odom_frame, self._base_frame = "odom", "base_link"
@@ -119,6 +126,10 @@ class Navigation(Service[Params]):
             return
         self._sense(self._navigator.whereabouts)
         self._listen()
+        if heard := self.obstacles_shared.take():
+            late = max(0.0, heard.age(now))
+            said = [replace(one, age=one.age + late) for one in read_said(heard.message.data)]
+            self._navigator.hear(now, said)
         velocity = self._navigator.step(now, self._delay)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
         self._tell(now)
@@ -264,7 +275,9 @@ class Navigation(Service[Params]):
         told = (report.doing, report.code, report.task)
         if told != self._told or self._due["status"].due(now):
             self._told = told
-            self.status.publish(String(json.dumps(convert.document(report, navigator.whereabouts))))
+            around = navigator.surroundings
+            neighbours = around.neighbours.names(now) if around is not None else {}
+            self.status.publish(String(json.dumps(convert.document(report, navigator.whereabouts, neighbours))))
         if navigator.path is not self._shown_path:
             self._shown_path = navigator.path
             self.plan.publish(convert.path_message(navigator.path, self._stamp))
@@ -276,6 +289,8 @@ class Navigation(Service[Params]):
         if len(particles) and self._due["particles"].due(now):
             shown = particles[np.linspace(0, len(particles) - 1, min(len(particles), PARTICLES)).astype(int)]
             self.particle_cloud.publish(convert.particles_message(shown, self._stamp))
+        if self._due["word"].due(now) and (word := navigator.word(now)) is not None:
+            self.obstacles_seen.publish(String(word))
         surroundings = navigator.surroundings
         if surroundings is not None:
             if surroundings.near is not None and self._due["local"].due(now):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
-from .costmap import INSCRIBED, LETHAL, Costmap, static_costs
+from .costmap import INSCRIBED, LETHAL, Costmap, Costs, static_costs
 from .footprint import Footprint
 from .geometry import Pose
 from .grid_map import GridMap
 from .layers import LayeredCostmap
+from .neighbours import Neighbours
 from .params import Params
 from .status import Code
 from .whereabouts import Sighting
@@ -42,18 +44,31 @@ class _Layers:
     def __init__(self, layers: LayeredCostmap, hertz: float) -> None:
         self.layers = layers
         self.costmap: Costmap | None = None
+        self._own: Costmap | None = None
         self._rate = Rate(hertz)
         self._newest: Sighting | None = None
 
-    def update(self, now: float, sighting: Sighting | None, pose: Pose) -> None:
-        """Take the newest scan in, if it is time to."""
+    def update(
+        self, now: float, sighting: Sighting | None, pose: Pose, others: Callable[[], Costs | None] = lambda: None
+    ) -> None:
+        """Take the newest scan in, and what others say, if it is time to."""
         self._newest = sighting or self._newest
         if not self._rate.due(now):
             return
+        self.layers.others, self._own = others(), None
         if self._newest is not None:
             self.layers.observe(self._newest.pose, self._newest.scan)
             self._newest = None
         self.costmap = self.layers.update(pose)
+
+    @property
+    def own(self) -> Costmap | None:
+        """The costmap without what others say; made when somebody asks."""
+        if self.layers.others is None:
+            return self.costmap
+        if self._own is None:
+            self._own = self.layers.compose(with_others=False)
+        return self._own
 
 
 class Surroundings:
@@ -81,6 +96,7 @@ class Surroundings:
         self._global = _Layers(LayeredCostmap(static, footprint, **common), params.rates.global_costmap)  # type: ignore[arg-type]
         near = LayeredCostmap(static, footprint, **common, rolling=params.window)  # type: ignore[arg-type]
         self._local = _Layers(near, params.rates.local_costmap)
+        self.neighbours = Neighbours(params.sharing, static, footprint, params.obstacles)
         self.known = self._global.layers.compose()
         """What the map and the zones alone say."""
         self._speed = speed
@@ -94,13 +110,24 @@ class Surroundings:
             pose: Of the robot on the map.
             sighting: A new scan.
         """
-        self._global.update(now, sighting, pose)
+        if sighting is not None:
+            self.neighbours.look(now, sighting.pose, sighting.scan)
+        self._global.update(now, sighting, pose, lambda: self.neighbours.costs(now, pose))
         self._local.update(now, sighting, pose)
 
     @property
     def whole(self) -> Costmap | None:
         """The planner's; None before the first update."""
         return self._global.costmap
+
+    @property
+    def own(self) -> Costmap | None:
+        """The planner's without what other robots say: the same one where they say nothing."""
+        return self._global.own
+
+    def word(self, now: float, pose: Pose) -> str | None:
+        """What to tell the other robots of the group; None: there is no group."""
+        return self.neighbours.word(now, pose, self._global.layers.marks)
 
     @property
     def near(self) -> Costmap | None:

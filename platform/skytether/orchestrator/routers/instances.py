@@ -12,7 +12,17 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from skytether.api.rest import Instance, InstanceCreate, InstanceEvent, Migrate, Renew, SessionClaim, SessionKey
+from skytether.api.rest import (
+    Instance,
+    InstanceCreate,
+    InstanceEvent,
+    Migrate,
+    Neighbours,
+    Renew,
+    SessionClaim,
+    SessionKey,
+    Share,
+)
 
 from ..core import Orchestrator
 from ..db import GONE
@@ -86,6 +96,12 @@ async def renew(core: Core, caller: Actor, run: InThread, instance: str, asked: 
     """Keep the lease, and report how well it goes; look at the answer's state, for what has ended stays ended."""
     renewed: Instance = await run(core.instances.renew, caller, instance, asked)
     return renewed
+
+
+@router.post("/{instance}/share", responses=says(403, 404, 409, 422))
+def share(core: Core, caller: Actor, instance: str, asked: Share) -> Neighbours:
+    """Tell what the instance's service shares with the robot's group, and hear what others do; of its robot only."""
+    return core.exchange.share(caller, core.instances.get(caller, instance), asked)
 
 
 @router.post("/{instance}/session", responses=says(403, 404, 409, 422))

@@ -6,7 +6,16 @@ from collections.abc import Mapping
 
 from fastapi import APIRouter, Response
 
-from skytether.api.rest import GateReport, Robot, RobotCreate, RobotCreated, RobotUse, StopOrder, StopRobot
+from skytether.api.rest import (
+    GateReport,
+    Robot,
+    RobotCreate,
+    RobotCreated,
+    RobotGroup,
+    RobotUse,
+    StopOrder,
+    StopRobot,
+)
 
 from ..core import Orchestrator
 from ..database import GateRow, RobotRow, StopRow
@@ -29,6 +38,7 @@ def _show(
     return Robot(
         name=row.name,
         services=row.services,
+        group=row.group,
         created_at=utc(row.created_at),
         last_seen_at=seen,
         use=core.quotas.with_rest(row.name, use or RobotUse(), data),
@@ -57,7 +67,8 @@ def list_robots(core: Core, _: Reader) -> list[Robot]:
 @router.post("", status_code=201, responses=says(409, 422))
 def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate, response: Response) -> RobotCreated:
     """Register a robot. Its token is in the answer and cannot be shown again."""
-    row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s)
+    row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s, asked.group)
+    core.exchange.learn_groups()
     made(response, "robots", row.name)
     return RobotCreated(**_show(core, row, core.quotas.data()).model_dump(), token=token)
 
@@ -67,6 +78,12 @@ def delete_robot(core: Core, _: RobotsOperator, robot: str) -> None:
     """Revoke a robot's tokens and end what it holds."""
     core.access.revoke(robot)
     core.instances.end_all(robot)
+
+
+@router.put("/{robot}/group", status_code=204, responses=says(404, 422))
+def set_group(core: Core, _: RobotsOperator, robot: str, asked: RobotGroup) -> None:
+    """With whom a robot's services share what they see; it holds within a second."""
+    core.exchange.put(robot, asked.group)
 
 
 @router.post("/stop", responses=says(422))
