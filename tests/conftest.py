@@ -83,6 +83,7 @@ TOGETHER = (
     "ros/ros1/",
     "ros/ros2/test_display.py",
     "ros/ros2/test_gate.py",
+    "ros/ros2/test_navigation_action.py",
     "ros/ros2/test_node.py",
     "ros/ros2/test_own_gate.py",
     "ros/ros2/test_parameters.py",

@@ -45,6 +45,7 @@ from skytether.messages import (
     type_of,
     warm,
 )
+from skytether.messages.action_definitions import ACTIONS
 from skytether.messages.codec import typestore
 from skytether.messages.definitions import definitions
 from skytether.messages.services import BOTH, service_types
@@ -53,6 +54,8 @@ ENCODINGS: tuple[Encoding, ...] = ("cdr", "ros1")
 INTEGERS = {
     "int8": (-(2**7), 2**7 - 1),
     "uint8": (0, 2**8 - 1),
+    "int16": (-(2**15), 2**15 - 1),
+    "uint16": (0, 2**16 - 1),
     "int32": (-(2**31), 2**31 - 1),
     "uint32": (0, 2**32 - 1),
 }
@@ -68,6 +71,9 @@ def untouched_store(encoding: Encoding) -> Typestore:
         store.register(get_types_from_msg("string filename\nuint8[] data", "visualization_msgs/msg/MeshFile"))
     for name, parts in BOTH.items():
         store.register(service_types(name, *parts, hashed=False))
+    for name, fields in ACTIONS.items():
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(fields.replace(", ", "\n"), name))
     return store
 
 
@@ -255,6 +261,15 @@ def test_hashes_are_those_that_ros_uses() -> None:
     assert type_hash(TFMessage, "ros1") == "94810edda583a504dfda3829e70d7eec"
     assert type_hash(MarkerArray, "ros1") == "d155b9ce5188fbaf89745847fd5882d7"
     assert type_hash(Twist, "cdr") == "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
+
+
+def test_hashes_of_actions() -> None:
+    """As the messages of Debian's python3-move-base-msgs have them; of ROS 2's calls there is one from their parts."""
+    assert hash_of("move_base_msgs/msg/MoveBaseActionGoal", "ros1") == "660d6895a1b9a16dce51fbdd9a64a56b"
+    assert hash_of("move_base_msgs/msg/MoveBaseActionResult", "ros1") == "1eb06eeff08fa7ea874431638cb52332"
+    assert hash_of("move_base_msgs/msg/MoveBaseActionFeedback", "ros1") == "7d1870ff6e0decea702b943b5af0b42e"
+    for part in ("SendGoal", "GetResult", "FeedbackMessage"):
+        assert hash_of(f"nav2_msgs/action/NavigateToPose_{part}", "cdr").startswith("RIHS01_")
 
 
 def test_hashes_and_definitions_of_types_that_have_no_class_here() -> None:

@@ -35,6 +35,7 @@ def shown(document: Path) -> dict[str, str]:
     [
         *(f"wall_stop/{name}" for name in ("service.py", "__main__.py", "service.yaml", "test_wall_stop.py")),
         "patrol/service.py",
+        "errand/service.py",
     ],
 )
 def test_the_page_shows_the_files_as_they_are(name: str) -> None:

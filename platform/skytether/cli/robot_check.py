@@ -16,6 +16,7 @@ from skytether.guard.record import lost_at_reboot
 from skytether.messages import hash_of
 from skytether.robot.ros1 import Ros1RobotConfig
 from skytether.robot.safety.client import GateError, ask, listens
+from skytether.robot.table import spoken
 from skytether.robot.wheels_watch import sentence, strangers
 from skytether.ros.names import Names, resolve
 from skytether.ros.permissions import Permissions, refused
@@ -56,7 +57,7 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
     manifest, findings = look_at_orchestrator(settings, token)
     findings.append(_master(node))
     if manifest is not None and findings[-1].good:
-        specs = manifest.spec.robot_topics
+        specs = spoken(manifest.spec.robot_topics, "action")
         names = graph.names(specs)
         findings += _topics(settings, names, node, specs)
         findings += forbidden(graph.permissions(), specs, names, settings.command_topic)

@@ -9,6 +9,7 @@ from pathlib import Path
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.messages import hash_of
 from skytether.robot.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.table import spoken
 from skytether.ros.names import Names
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
@@ -96,7 +97,7 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
             says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
             findings.append(Finding("ROS 2 router", router, "", says))
         if manifest is not None and joined:
-            specs = manifest.spec.robot_topics
+            specs = spoken(manifest.spec.robot_topics, "ros2_action")
             names = config.names(specs)
             findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]

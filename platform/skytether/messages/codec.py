@@ -19,6 +19,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from .action_definitions import ACTIONS, ONE_GENERATION
 from .base import Message, all_types, type_of
 from .definitions import ROS2_PARTS, definitions
 from .services import BOTH, ROS2_ONLY, service_types, without_char
@@ -112,6 +113,8 @@ def transcodes(typename: str) -> bool:
 
 def _same_fields(typename: str, above: frozenset[str]) -> bool:
     """Whether a type has the same fields in both generations (but for upper case), all the way down."""
+    if typename.partition("/")[0] in ONE_GENERATION:
+        return False
     if typename in _types_with_class():
         return True
     both = [typestore(e).fielddefs.get(typename) for e in ("ros1", "cdr")]
@@ -186,6 +189,8 @@ def typestore(encoding: Encoding) -> Typestore:
             store.register(get_types_from_msg(fields.replace(", ", "\n"), name))
     else:
         raise _unknown(encoding)
+    kept = definitions(encoding)
+    store.fielddefs.update({name: kept[name] for name in ACTIONS if name not in store.fielddefs})
     for name, (request, response) in (BOTH | ROS2_ONLY if encoding == "cdr" else BOTH).items():
         store.register(service_types(name, request, response, hashed=encoding == "cdr"))
     return _with_ours(store, encoding)

@@ -10,6 +10,8 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
+from .action_definitions import ACTIONS
+
 ROS2_PARTS = {
     "visualization_msgs/msg/MeshFile": "string filename, uint8[] data",
     "visualization_msgs/msg/UVCoordinate": "float32 u, float32 v",
@@ -89,6 +91,7 @@ _BOTH = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/msg/TransformStamped[] transforms",
     "visualization_msgs/msg/MarkerArray": "visualization_msgs/msg/Marker[] markers",
     **ROS2_PARTS,
+    **ACTIONS,
 }
 """Of types that are the same in ROS 1 and ROS 2, in the words of ``.msg`` files."""
 

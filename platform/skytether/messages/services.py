@@ -7,6 +7,8 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 
+from .action_definitions import ROS2_ACTIONS
+
 BOTH = {
     "std_srvs/srv/Empty": ("", ""),
     "std_srvs/srv/SetBool": ("bool data", "bool success\nstring message"),
@@ -29,6 +31,14 @@ ROS2_ONLY = {
         "rcl_interfaces/Parameter[] parameters",
         "rcl_interfaces/SetParametersResult[] results",
     ),
+    **{
+        f"{action}_{call}": (f"unique_identifier_msgs/UUID goal_id{more.format(action)}", response.format(action))
+        for action in ROS2_ACTIONS
+        for call, more, response in (
+            ("SendGoal", "\n{}_Goal goal", "bool accepted\nbuiltin_interfaces/Time stamp"),
+            ("GetResult", "", "int8 status\n{}_Result result"),
+        )
+    },
 }
 
 

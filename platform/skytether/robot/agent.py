@@ -50,7 +50,7 @@ from .sharing import Serving, SharedTopics, Sharing
 from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
 from .supervisor import Limits
-from .table import Offer, robot_table
+from .table import Offer, robot_table, spoken
 from .tally import Tally
 from .task_manager import PathQuality, RobotView
 from .tasks import TaskConfig, Tasks
@@ -534,7 +534,8 @@ class Agent:
         command = self._config.command_topic
         shared = SharedTopics.of(granted.topics)
         if self._graph is None:
-            topics = robot_table(granted.topics, offers({**self._base.topics, **shared.readings}))
+            readings = offers({**self._base.topics, **shared.readings})
+            topics = robot_table(spoken(granted.topics, None), readings)
             names = frozenset(topic.name for topic in topics)
             session = LiveSession(granted.id, names, command, self._epochs, shared_topic=shared.said)
         else:

@@ -22,7 +22,7 @@ from skytether.ros.ros2.qos import Qos
 from skytether.wire.topic import Role, Topic
 
 from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
-from .table import Offer, robot_table
+from .table import Offer, robot_table, spoken
 from .wheels_watch import NOBODY, Others, WheelsWatch
 
 _log = logging.getLogger(__name__)
@@ -133,6 +133,7 @@ class Ros2Robot:
         return self._watch.others if self._watch is not None else NOBODY
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
+        specs = spoken(specs, "ros2_action")
         names = self._config.names(specs)
         may = self._config.permissions()
         permissions.check(may, specs, names, command_topic)

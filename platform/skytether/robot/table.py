@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.spec import topic_from_api
@@ -23,6 +24,16 @@ class Offer:
     type: str
     type_hash: str = ""
     encoding: str = "cdr"
+
+
+def spoken(specs: Iterable[TopicSpec], actions: Literal["action", "ros2_action"] | None) -> list[TopicSpec]:
+    """Of a service's rows those that a robot can speak: one manifest is for robots of either ROS, and of none.
+
+    Args:
+        specs: All of them.
+        actions: The kind of the actions in the robot's graph; None: it has no graph, and so none.
+    """
+    return [spec for spec in specs if spec.kind in ("topic", "call", actions)]
 
 
 def robot_table(specs: Iterable[TopicSpec], offers: Mapping[str, Offer], *, encoding: str = "cdr") -> tuple[Topic, ...]:

@@ -6,19 +6,24 @@ Everything that knows of sockets, sessions or the orchestrator is behind it; a s
 
 from .calls import Caller
 from .errors import CallError, ConfigError, ServiceError
+from .goals import ActionServer, Goal, GoalError
 from .mailbox import RawReceived, Received
 from .main import run
 from .params import NoParams, param
 from .service import Context, Service, params_schema
-from .topics import AnyInput, Call, Input, Output, answers
+from .topics import Action, AnyInput, Call, Input, Output, answers
 
 __all__ = [
+    "Action",
+    "ActionServer",
     "AnyInput",
     "Call",
     "CallError",
     "Caller",
     "ConfigError",
     "Context",
+    "Goal",
+    "GoalError",
     "Input",
     "NoParams",
     "Output",

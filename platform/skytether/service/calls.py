@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 from skytether.messages import DecodeError, Encoding, Message, ServiceType, decode, encode
@@ -99,7 +100,7 @@ class Caller(Generic[Q, A]):
             raise CallError(str(error)) from error
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Asked:
     """A call of the robot that waits for the service's thread."""
 
@@ -120,6 +121,7 @@ class Desk:
         self._wake = wake
         self._handlers: dict[str, tuple[ServiceType[Any, Any], Callable[[Any], Any]]] = {}
         self._waiting: deque[Asked] = deque()
+        self._later: set[Asked] = set()
         self._lock = threading.Lock()
         self._closed = False
 
@@ -128,8 +130,8 @@ class Desk:
         """Calls that are answered here."""
         return tuple(self._handlers)
 
-    def open(self, name: str, srv: ServiceType[Q, A], handler: Callable[[Q], A]) -> None:
-        """Have a call answered by a function."""
+    def open(self, name: str, srv: ServiceType[Q, A], handler: Callable[[Q], A | Future[A]]) -> None:
+        """Have a call answered by a function, now or (a future that is set in the service's thread) later."""
         self._handlers[name] = (srv, handler)
 
     def ask(self, name: str, payload: bytes, encoding: Encoding) -> Future[bytes]:
@@ -150,20 +152,38 @@ class Desk:
             srv, handler = self._handlers[asked.name]
             try:
                 answer = handler(decode(srv.request, asked.payload, asked.encoding))
-                if type(answer) is not srv.response:
-                    raise TypeError(
-                        f"call {asked.name} is answered by {srv.response.TYPE}, not {type(answer).__name__}"
-                    )
-                asked.answer.set_result(encode(answer, asked.encoding))
+                if isinstance(answer, Future):
+                    self._later.add(asked)
+                    answer.add_done_callback(partial(self._finish, asked, srv))
+                else:
+                    asked.answer.set_result(_encoded(asked, srv, answer))
             except (CallError, DecodeError) as error:
                 asked.answer.set_exception(CallError(str(error)))
             except BaseException as error:
                 asked.answer.set_exception(CallError(f"its handler failed: {type(error).__name__}"))
                 raise
 
+    def _finish(self, asked: Asked, srv: ServiceType[Any, Any], answer: Future[Any]) -> None:
+        """What was to be answered later is answered now, in the service's thread."""
+        if asked not in self._later:
+            return  # closed meanwhile
+        self._later.remove(asked)
+        try:
+            asked.answer.set_result(_encoded(asked, srv, answer.result()))
+        except (CallError, ValueError, TypeError) as error:
+            asked.answer.set_exception(CallError(str(error)))
+
     def close(self) -> None:
         """Nobody answers any more."""
         with self._lock:
             self._closed = True
+        while self._later:
+            self._later.pop().answer.set_exception(CallError("the service ends"))
         while self._waiting:
             self._waiting.popleft().answer.set_exception(CallError("the service ends"))
+
+
+def _encoded(asked: Asked, srv: ServiceType[Any, Any], answer: Message) -> bytes:
+    if type(answer) is not srv.response:
+        raise TypeError(f"call {asked.name} is answered by {srv.response.TYPE}, not {type(answer).__name__}")
+    return encode(answer, asked.encoding)

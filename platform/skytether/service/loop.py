@@ -68,7 +68,7 @@ class Loop:
             now = self._clock.now()
             due = begin + index * period
             if now < due:
-                self._clock.sleep_until(due)
+                self._clock.sleep_until(min(due, self._port.due()))
                 continue
             missed = int((now - due) / period)
             if missed:
@@ -92,7 +92,7 @@ class Loop:
                 stepped = newest
                 self._step(now)
             elif self._port.connected:
-                self._clock.sleep_until(math.inf)
+                self._clock.sleep_until(self._port.due())
                 idle_since = self._clock.now()
             elif self._idle(now, idle_since):
                 return
@@ -101,12 +101,12 @@ class Loop:
 
     def _answer(self) -> None:
         """What the robot asked since the last look."""
-        self._port.settle()
+        self._port.settle(self._clock.now())
         self._port.desk.work()
 
     def _step(self, now: float) -> None:
         self._step_began = now
-        self._port.settle()
+        self._port.settle(now)
         self._service.step(now)
         self._step_began = None
         self.steps += 1

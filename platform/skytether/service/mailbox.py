@@ -168,6 +168,11 @@ class Sender(Generic[M]):
         """The bridge, once it is attached."""
         self._cls = cls
 
+    @property
+    def type_name(self) -> str:
+        """Of its messages."""
+        return self._cls.TYPE
+
     def publish(self, message: M) -> bool:
         """Send to the robot; encoded here, in the caller's thread.
 

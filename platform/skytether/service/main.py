@@ -152,6 +152,8 @@ def warm_up(service: Service[Any], grant: Grant) -> None:
     """Compile what the granted encodings need; another one that the robot chooses is compiled when it connects."""
     encodings = {topic.name: topic.encoding for topic in grant.topics}
     for declared in service.declared:
+        if declared.kind.endswith("action"):
+            continue  # no robot speaks all of them: what one speaks is compiled when it connects
         warm(classes_of(declared), encodings[declared.topic])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast, get_args
@@ -13,16 +14,21 @@ from skytether.wire.topic import Topic
 from .calls import CallPublisher, Desk, Spawn, Threads
 from .errors import CallError
 from .service import Service
-from .topics import Answer, Call, Declared, Typed
+from .topics import Action, Answer, Call, Declared, Typed
 
 if TYPE_CHECKING:
     from skytether.bridge.port import Publisher
+
+_FIRST = {"topic": "", "call": "/request", "action": "/goal", "ros2_action": "/_action/send_goal/request"}
+"""Of what carries a declaration, the topic that tells its encoding."""
 
 
 def classes_of(declared: Declared) -> list[type[Message]]:
     """Messages that a declaration stands for."""
     if isinstance(declared, Typed):
         return [declared.cls]
+    if isinstance(declared, Action):
+        return declared.action.classes
     return [declared.srv.request, declared.srv.response] if isinstance(declared, Answer | Call) else []
 
 
@@ -67,6 +73,8 @@ class ServicePort:
         mailbox = self._service.mailboxes.get(message.topic)
         if mailbox is not None:
             mailbox.put(message, encoding)
+        elif (asked_for := self._service.asked_for.get(message.topic)) is not None:
+            self._service.inbox.put(asked_for, message.payload, encoding)
         elif self._service.anything is not None:
             self._service.anything.put(message, type_name, encoding)
         self._wake()
@@ -86,10 +94,17 @@ class ServicePort:
                 self._log.error("robot refused: %s", reason)
         self._wake()
 
-    def settle(self) -> None:
-        """From the service's thread, before a step: compile what a newly agreed encoding needs."""
+    def settle(self, now: float) -> None:
+        """From the service's thread, before a step: compile what a newly agreed encoding needs, and serve actions."""
         while self._cold:
             warm(*self._cold.pop())
+        for server in self._service.actions:
+            server.tick(now)
+        self._service.inbox.work()
+
+    def due(self) -> float:
+        """When an action wants `settle` again [s of the monotonic clock]; inf without any."""
+        return min((server.due() for server in self._service.actions), default=math.inf)
 
     def close(self) -> None:
         """No call is answered or made any more; before the bridge stops."""
@@ -122,7 +137,9 @@ class ServicePort:
             sender.encoding = table[name][1] if name in table else None
         for name, caller in self._service.callers.items():
             caller.encoding = table[name + "/request"][1] if name + "/request" in table else None
+        for server in self._service.actions:
+            server.renew()
         for declared in self._service.declared:
-            row = table.get(declared.topic + "/request" if declared.kind == "call" else declared.topic)
+            row = table.get(declared.topic + _FIRST[declared.kind])
             if row is not None:
                 self._cold.append((classes_of(declared), row[1]))

@@ -10,13 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
-from skytether.messages import ServiceType
+from skytether.messages import Message, ServiceType
 
+from .actions import Handler, Inbox, join
 from .calls import Caller
+from .goals import ActionServer
 from .mailbox import Mailbox, RawQueue, Sender
 from .params import NoParams, schema_of
 from .reports import Reports
-from .topics import Answer, AnyInput, Call, Declared, Input, Output
+from .topics import Action, Answer, AnyInput, Call, Declared, Input, Output
 
 P = TypeVar("P")
 
@@ -80,6 +82,10 @@ class Service(ABC, Generic[P]):
         self.anything: RawQueue | None = None
         self.callers: dict[str, Caller[Any, Any]] = {}
         self.answers: dict[str, tuple[ServiceType[Any, Any], Callable[[Any], Any]]] = {}
+        self.actions: list[ActionServer[Any, Any, Any]] = []
+        self.asked_for: dict[str, tuple[type[Message], Handler]] = {}
+        """Topics of actions, each message of which counts; by `inbox`."""
+        self.inbox = Inbox(self.log)
         for declared in self.declared:
             self.__dict__[declared.attribute] = self._open(declared)
 
@@ -132,7 +138,20 @@ class Service(ABC, Generic[P]):
                 handler = partial(declared.method, self)
                 self.answers[declared.topic] = declared.srv, handler
                 return handler
-        raise TypeError(f"{type(declared).__name__} is no Input, AnyInput, Output, Call or answer")
+            case Action():
+                return self._serve(declared)
+        raise TypeError(f"{type(declared).__name__} is no Input, AnyInput, Output, Call, Action or answer")
+
+    def _serve(self, declared: Action[Any, Any, Any]) -> ActionServer[Any, Any, Any]:
+        joined = join(declared.action, declared.topic, self.context.epoch)
+        own = {name: Sender(name, cls) for name, cls in joined.outputs.items()}
+        by_part = {name.rpartition("/")[2]: sender for name, sender in own.items()}
+        joined.server.send = lambda part, message: by_part[part].publish(message)
+        self.senders.update(own)
+        self.answers.update(joined.calls)
+        self.asked_for.update(joined.inputs)
+        self.actions.append(joined.server)
+        return joined.server
 
 
 def params_schema(cls: type[Service[Any]]) -> dict[str, Any]:

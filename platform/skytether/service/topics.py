@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, overload
 
-from skytether.messages import Message, ServiceType
+from skytether.messages import ActionType, Message, ServiceType
 from skytether.wire.topic import Direction
 
 from .calls import Caller
+from .goals import ActionServer, F, G, R
 from .mailbox import Mailbox, RawQueue, Sender
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ class Declared:
     """Base of the declarations in a service's class body. The topic's name is the attribute's unless given."""
 
     direction: ClassVar[Direction]
-    kind: ClassVar[Literal["topic", "call"]] = "topic"
+    kind: Literal["topic", "call", "action", "ros2_action"] = "topic"
 
     def __init__(self, type_name: str, topic: str | None) -> None:
         self.type_name = type_name
@@ -108,6 +109,24 @@ class Call(Declared, Generic[Q, A]):
     @overload
     def __get__(self, service: Service[Any], owner: type[Any]) -> Caller[Q, A]: ...
     def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Caller[Q, A]:
+        return self
+
+
+class Action(Declared, Generic[G, R, F]):
+    """An action that the service serves and the robot's clients ask for: ``move_base = Action(MoveBase)``."""
+
+    direction = Direction.IN
+
+    def __init__(self, action: ActionType[G, R, F], name: str | None = None) -> None:
+        super().__init__(action.name, name)
+        self.action = action
+        self.kind = action.kind
+
+    @overload
+    def __get__(self, service: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, service: Service[Any], owner: type[Any]) -> ActionServer[G, R, F]: ...
+    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | ActionServer[G, R, F]:
         return self
 
 

@@ -18,7 +18,7 @@ from skytether.lab.link_model import LinkConditions, LinkModel
 from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.plan import Plan
 from skytether.lab.world.simulation import TICK, Robot, Simulation
-from skytether.messages import Message
+from skytether.messages import Encoding, Message
 from skytether.service import Service
 
 from .service import Harness
@@ -63,6 +63,7 @@ class Drive:
         *,
         seed: int = 1,
         link: LinkConditions | None = None,
+        encoding: Encoding = "cdr",
     ) -> None:
         """Put the robot at the plan's first start, and tell the service.
 
@@ -73,12 +74,13 @@ class Drive:
             plan: With all that stands there.
             seed: Of the world's noise.
             link: Each way of it; None: nothing is delayed.
+            encoding: What the robot speaks.
         """
         Occupancy(plan).save(folder / "map")
         self.world = Simulation(plan, seed=seed)
         start = plan.starts[0]
         known = {"start": {"x": start.x, "y": start.y, "yaw": start.heading}}
-        self.harness = Harness(service, {"map": "map.yaml", **known, **params}, data_dir=folder)
+        self.harness = Harness(service, {"map": "map.yaml", **known, **params}, data_dir=folder, encoding=encoding)
         self.alter: Alter = lambda _, message: message
         self.statuses: list[tuple[str, str]] = []
         self.times: list[StepTime] = []

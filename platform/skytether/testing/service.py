@@ -14,16 +14,19 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
+from skytether.api.manifest import TopicSpec
 from skytether.bridge import CallError as BridgeCallError
+from skytether.bridge.spec import topics_from_api
 from skytether.messages import Encoding, Message, decode, encode
 from skytether.service import Context, Service
 from skytether.service.errors import CallError
 from skytether.service.params import read_params
 from skytether.service.port import ServicePort
-from skytether.service.topics import Answer, Call, Typed
+from skytether.service.topics import Action, Answer, Call, Typed
 from skytether.wire.events import Connected, Disconnected, MessageReceived
 from skytether.wire.topic import Topic
 
@@ -96,7 +99,7 @@ class Harness(Generic[S]):
         Args:
             cls: The service.
             params: As a robot would give them, checked the same way.
-            encoding: What the robot speaks.
+            encoding: What the robot speaks. It has the actions of ROS 1 with ``ros1``, else those of ROS 2.
             data_dir: Where the service may write.
             now: First time, s.
             epoch: Unix time at which the made-up clock stood at 0.
@@ -111,12 +114,17 @@ class Harness(Generic[S]):
         self._sequence: defaultdict[str, int] = defaultdict(int)
         context = Context("robot", "instance", data_dir or Path(), epoch)
         self.service = cls(read_params(cls.params_type, params or {}), context)
-        self._types = {d.topic: d.type_name for d in cls.declared}
+        self._types = {name: sender.type_name for name, sender in self.service.senders.items()}
         self._robots: dict[str, Callable[[Any], Message]] = {}
         self._port = ServicePort(self.service, lambda: None, _at_once)
         self._port.attach(_Robot(self))
         self.connect()
         self.service.start()
+
+    @property
+    def encoding(self) -> Encoding:
+        """What the robot speaks."""
+        return self._encoding
 
     def connect(self, *extra: Topic) -> None:
         """The robot is there; ``extra``: topics that only an `AnyInput` takes."""
@@ -124,7 +132,11 @@ class Harness(Generic[S]):
         typed = [Topic(d.topic, d.type_name, d.direction, encoding=self._encoding) for d in declared]
         calls = [d for d in self.service.declared if isinstance(d, Call | Answer)]
         asked = [Topic(f"{d.topic}/request", d.type_name, d.direction, encoding=self._encoding) for d in calls]
-        self._port.notify(Connected((*typed, *asked, *extra)))
+        kind: Literal["action", "ros2_action"] = "action" if self._encoding == "ros1" else "ros2_action"
+        served = [d for d in self.service.declared if isinstance(d, Action) and d.kind == kind]
+        rows = [TopicSpec(name=d.topic, kind=kind, type=d.type_name, direction="in") for d in served]
+        parts = [replace(topic, encoding=self._encoding) for topic in topics_from_api(rows)]
+        self._port.notify(Connected((*typed, *asked, *parts, *extra)))
 
     def disconnect(self) -> None:
         """The robot is gone."""
@@ -147,11 +159,25 @@ class Harness(Generic[S]):
         Raises:
             CallError: The service does not answer; the text says why.
         """
-        answer = self._port.desk.ask(name, encode(request, self._encoding), self._encoding)
-        self._port.settle()
-        self._port.desk.work()
+        return self.ask(name, request).result(timeout=0)
+
+    def ask(self, name: str, request: Message) -> Future[Any]:
+        """The robot calls the service, which may answer in a later step, as with an action's result."""
+        answer: Future[Any] = Future()
         srv, _ = self.service.answers[name]
-        return decode(srv.response, answer.result(), self._encoding)
+
+        def on_answer(raw: Future[bytes]) -> None:
+            error = raw.exception()
+            if error is not None:
+                answer.set_exception(error)
+            else:
+                answer.set_result(decode(srv.response, raw.result(), self._encoding))
+
+        asked = self._port.desk.ask(name, encode(request, self._encoding), self._encoding)
+        asked.add_done_callback(on_answer)
+        self._port.settle(self.now)
+        self._port.desk.work()
+        return answer
 
     def answers(self, name: str, robot: Callable[[Any], Message]) -> None:
         """From now on the robot answers a call of the service by a function: request in, response out.
@@ -164,7 +190,8 @@ class Harness(Generic[S]):
         """Let time pass (one period of the rate; nothing for a service with a trigger), then step once."""
         rate = self.service.rate_hz
         self.now += elapsed if elapsed is not None else 1 / rate if rate else 0.0
-        self._port.settle()
+        self._port.settle(self.now)
+        self._port.desk.work()
         self.service.step(self.now)
 
     def newest(self, topic: str) -> Any:

@@ -64,6 +64,21 @@ def grid_of(message: OccupancyGrid) -> GridMap | None:
         return None
 
 
+def is_map(frame: str) -> bool:
+    """Whether a goal in this frame is on the map."""
+    return frame.removeprefix("/") in ("", MAP_FRAME)
+
+
+def other_frame(frame: str) -> str:
+    """What to say of one that is not."""
+    return f"A goal is in the frame '{frame}'; give it in '{MAP_FRAME}'."
+
+
+def pose_stamped(pose: Pose, stamp: float) -> PoseStamped:
+    """A pose on the map."""
+    return PoseStamped(_header(stamp), _pose(np.array(pose)))
+
+
 def path_message(path: NDArray[np.float64], stamp: float) -> Path:
     """A path on the map."""
     header = _header(stamp)

@@ -96,6 +96,8 @@ class Navigator:
         path = Path(params.behaviours) if params.behaviours else BUILT_IN
         self._tree = load_tree(path, self, 1 / params.rates.planner)
         self.now = 0.0
+        self.requests = 0
+        """How often somebody gave goals, or tried to."""
         self._state = self._arrival = State(Pose(0.0, 0.0, 0.0), STANDSTILL, 0.0)
         self._command = STANDSTILL
         self._number = 0
@@ -144,6 +146,7 @@ class Navigator:
 
     def go(self, goals: Sequence[Pose], *, rounds: int = 1, stop_at_each: bool = True) -> None:
         """Go there, whatever the robot does now. A list that cannot be one is told as failed, and the robot stands."""
+        self.requests += 1
         self._paused = False
         wrong = refusal(goals)
         if wrong is not None:
@@ -169,6 +172,7 @@ class Navigator:
 
     def refuse(self, trouble: Trouble) -> None:
         """A request could not even be read: the robot stands, and says so."""
+        self.requests += 1
         self._paused = False
         self._end(Doing.FAILED, trouble)
 

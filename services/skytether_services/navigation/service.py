@@ -12,6 +12,9 @@ import numpy as np
 from skytether.control.admittance import Velocity
 from skytether.messages import (
     LaserScan,
+    MoveBase,
+    NavigateThroughPoses,
+    NavigateToPose,
     OccupancyGrid,
     Odometry,
     PoseArray,
@@ -29,9 +32,10 @@ from skytether.messages import (
     Vector3,
 )
 from skytether.messages import Path as PathMessage
-from skytether.service import ConfigError, Input, Output, Received, Service, answers
+from skytether.service import Action, ConfigError, Input, Output, Received, Service, answers
 
 from . import conversions as convert
+from .action_goals import ActionGoals
 from .frames import Frames
 from .grid_map import GridMap, MapError, load_map
 from .mapping_mode import MappingMode
@@ -66,6 +70,10 @@ class Navigation(Service[Params]):
     goals = Input(PathMessage)
     obstacles_shared = Input(String)
 
+    move_base = Action(MoveBase)
+    navigate_to_pose = Action(NavigateToPose)
+    navigate_through_poses = Action(NavigateThroughPoses)
+
     cmd_vel = Output(Twist)
     status = Output(String)
     plan = Output(PathMessage)
@@ -84,6 +92,7 @@ class Navigation(Service[Params]):
             self._mapping = MappingMode(params, self.context.data_dir, self.executor()) if is_mapping else None
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        self._clients = ActionGoals(self.actions, params.limits.max_linear, self.report)
         rates = params.rates
         self.rate_hz = rates.control
         self._due = {
@@ -120,6 +129,7 @@ class Navigation(Service[Params]):
     def step(self, now: float) -> None:
         if self._mapping is not None:
             # No velocity, not even zero: whoever drives the robot when no service does, drives it.
+            self._clients.refuse("A map is being built: the robot takes no goals.")
             self._sense(self._mapping.senses)
             self._mapping.step(now)
             self._tell_mapping(self._mapping, now)
@@ -130,9 +140,11 @@ class Navigation(Service[Params]):
             late = max(0.0, heard.age(now))
             said = [replace(one, age=one.age + late) for one in read_said(heard.message.data)]
             self._navigator.hear(now, said)
+        self._clients.listen(self._navigator, now)
         velocity = self._navigator.step(now, self._delay)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
         self._tell(now)
+        self._clients.tell(self._navigator, now, self._stamp)
 
     @answers(Trigger)
     def cancel(self, request: TriggerRequest) -> TriggerResponse:
@@ -233,10 +245,9 @@ class Navigation(Service[Params]):
         )
 
     def _is_on_map(self, frame: str) -> bool:
-        if frame.removeprefix("/") in ("", convert.MAP_FRAME):
+        if convert.is_map(frame):
             return True
-        text = f"A goal is in the frame '{frame}'; give it in '{convert.MAP_FRAME}'."
-        self._navigator.refuse(Trouble(Code.BAD_GOAL, text))
+        self._navigator.refuse(Trouble(Code.BAD_GOAL, convert.other_frame(frame)))
         return False
 
     def _load(self, name: str) -> None:

@@ -17,7 +17,7 @@ from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.local import LocalGraph
 from skytether.bridge.port import Port, Publisher
 from skytether.messages import Encoding, Message, Twist, encode, hash_of
-from skytether.robot.table import Offer, robot_table
+from skytether.robot.table import Offer, robot_table, spoken
 from skytether.wire.events import Event, MessageReceived
 from skytether.wire.topic import Role, Topic
 
@@ -130,6 +130,7 @@ class WorldGraph:
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         """Graph: join it for a new session. The velocity's topic is in the table, and the port never sees it."""
+        specs = spoken(specs, None)
         rows = [row for spec in specs if spec.kind != "call" for row in spec.rows()]
         taken = {row.name: row.type for row in rows if row.direction == "in"}
         if taken.pop(ANY_TOPIC, None) is not None:

@@ -1,0 +1,1 @@
+"""Example service with an action. Walked through in ``docs/writing-a-service.md``."""
