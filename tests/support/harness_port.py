@@ -19,11 +19,11 @@ KEY = bytes(32)
 
 
 class HarnessPort:
-    """The service's end: hands on what belongs to its actions, both ways."""
+    """The service's end: hands on all that the robot says, and what actions answer."""
 
     def __init__(self, harness: Harness[Any]) -> None:
         self._harness = harness
-        self._carried = {*harness.service.asked_for, *(s for s in harness.service.senders if "/" in s)}
+        self._carried = [name for name in harness.service.senders if "/" in name]
         self._calls = [name for name in harness.service.answers if "/_action/" in name]
 
     def attach(self, publisher: Any) -> None:
@@ -39,8 +39,7 @@ class HarnessPort:
             publisher.answer(name, partial(self._answer, name))
 
     def deliver(self, message: MessageReceived) -> None:
-        if message.topic in self._carried:
-            self._harness._port.deliver(message)
+        self._harness._port.deliver(message)
 
     def notify(self, event: Event) -> None:
         pass

@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
+import skytether_services.navigation as package
+from skytether.api.manifest import Manifest
 from skytether.lab.world.plan import building
 from skytether.messages import (
     Header,
@@ -26,6 +29,7 @@ from skytether.messages import (
     TriggerRequest,
     Twist,
 )
+from skytether.robot.table import robot_table, spoken
 from skytether.testing.actions import ActionClient
 from skytether.testing.drive import Drive
 from skytether.testing.service import Harness
@@ -159,6 +163,18 @@ def test_the_way_that_is_left_goes_along_the_path_and_then_straight() -> None:
     assert way_left(math.nan, path[:0], At(0.0, 0.0, 0.0), goals) == pytest.approx(2.0 + 3.0 + 4.0)
 
 
+def followed(drive: Drive, client: ActionClient, sent: str) -> list[Any]:
+    """Drive to the goal's end, and give all feedback: of what is published, a drive keeps the newest alone."""
+    fed: list[Any] = []
+
+    def has_ended() -> bool:
+        fed.extend(told for told in client.feedback(sent) if not fed or told is not fed[-1])
+        return client.end(sent) is not None
+
+    assert drive.run(40.0, has_ended), drive.status
+    return fed
+
+
 @pytest.mark.slow  # in the simulated building
 def test_goals_are_reached_and_what_cannot_be_is_aborted_with_the_reason(tmp_path: Path) -> None:
     start = building().starts[0]
@@ -166,18 +182,16 @@ def test_goals_are_reached_and_what_cannot_be_is_aborted_with_the_reason(tmp_pat
     to, through = (ActionClient(drive.harness, f"navigate_{part}") for part in ("to_pose", "through_poses"))
     drive.run(0.5)
     sent = to.send(goal("navigate_to_pose", at(start.x + 1.0, start.y)))
-    assert drive.run(30.0, lambda: to.end(sent) is not None), drive.status
+    fed: list[NavigateToPoseFeedback] = followed(drive, to, sent)
     assert to.end(sent) == ("succeeded", "", NavigateToPoseResult())
-    fed: list[NavigateToPoseFeedback] = to.feedback(sent)
     assert len(fed) >= 5
     assert fed[0].distance_remaining == pytest.approx(1.0, abs=0.4)
     assert fed[-1].distance_remaining < 0.4
     assert fed[-1].current_pose.pose.position.x == pytest.approx(start.x + 1.0, abs=0.4)
     assert fed[-1].navigation_time.seconds() == pytest.approx(0.2 * (len(fed) - 1), abs=0.3)
-    back = through.send(goal("navigate_through_poses", at(start.x + 0.5, start.y), at(start.x, start.y)))
-    assert drive.run(40.0, lambda: through.end(back) is not None), drive.status
-    assert through.state(back) == "succeeded"
-    counted: list[NavigateThroughPosesFeedback] = through.feedback(back)
+    on = through.send(goal("navigate_through_poses", at(start.x + 2.0, start.y), at(start.x + 3.0, start.y)))
+    counted: list[NavigateThroughPosesFeedback] = followed(drive, through, on)
+    assert through.state(on) == "succeeded"
     assert [counted[0].number_of_poses_remaining, counted[-1].number_of_poses_remaining] == [2, 1]
     off = to.send(goal("navigate_to_pose", at(-50.0, 0.0)))
     assert drive.run(2.0, lambda: to.end(off) is not None)
@@ -186,3 +200,17 @@ def test_goals_are_reached_and_what_cannot_be_is_aborted_with_the_reason(tmp_pat
     assert (end[0], end[2].error_code) == ("aborted", 204)
     assert "is not on the map" in end[2].error_msg
     assert not drive.world.contacts
+
+
+def test_each_robot_has_the_actions_of_its_own_generation_and_one_without_ros_has_none() -> None:
+    text = Path(package.__file__).with_name("service.yaml").read_text()
+    specs = Manifest.model_validate(yaml.safe_load(text)).spec.topics
+
+    def actions(kind: Any) -> set[str]:
+        table = robot_table(spoken(specs, kind), {})
+        return {topic.name.split("/")[0] for topic in table if "/" in topic.name}
+
+    calls = {"cancel", "pause", "clear_costmaps", "save_map"}
+    assert actions("action") - calls == {"move_base"}
+    assert actions("ros2_action") - calls == {"navigate_to_pose", "navigate_through_poses"}
+    assert actions(None) - calls == set()
