@@ -73,7 +73,8 @@ def untouched_store(encoding: Encoding) -> Typestore:
         store.register(service_types(name, *parts, hashed=False))
     for name, fields in ACTIONS.items():
         if name not in store.fielddefs:
-            store.register(get_types_from_msg(fields.replace(", ", "\n"), name))
+            ((_, definition),) = get_types_from_msg(fields.replace(", ", "\n"), "any/msg/Part").items()
+            store.register({name: definition})
     return store
 
 
