@@ -204,6 +204,8 @@ class Navigator:
         """
         self.now = now
         self._command = STANDSTILL
+        if self.surroundings is not None:
+            self.surroundings.neighbours.read(now)
         sighting = self.whereabouts.look(now)
         state = self.whereabouts.state()
         trouble = self.no_map or self.whereabouts.trouble(now)

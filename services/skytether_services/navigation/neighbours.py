@@ -94,7 +94,9 @@ class Neighbours:
         self._clears = replace(obstacles, mark_range=1e-9)
         self._heard_at = -math.inf
         self._heard: dict[str, _Heard] = {}
-        self._unheard: dict[str, Unheard] = {}
+        self._unheard: dict[str, tuple[float, Unheard]] = {}
+        self._waiting: deque[tuple[float, Said]] = deque()
+        """Words that were not read yet, and when they were said."""
         self._trail: deque[tuple[float, float, float]] = deque(maxlen=_TRAIL)
         self._away: NDArray[np.bool_] | None = None
         """Cells that the map knows as free, away from its walls; None: not needed yet. So are these:"""
@@ -112,30 +114,39 @@ class Neighbours:
         if not self.is_listening(now):
             return {}
         heard = {robot: "heard" for robot, one in self._heard.items() if now - one.at <= _LISTENING}
-        return {**heard, **{robot: str(why) for robot, why in self._unheard.items()}}
+        return {**heard, **{robot: str(why) for robot, (at, why) in self._unheard.items() if now - at <= _LISTENING}}
 
     def hear(self, now: float, said: Sequence[Said]) -> None:
-        """Take what the others said; each one's newest word takes the place of its last."""
+        """Take what the others said, for `read`; while something waits to be read, nothing more is taken."""
         if now - self._heard_at < _LEAST:
             return
         if self._away is None:
             self._prepare(now)
         self._heard_at = now
-        self._unheard = {}
-        for one in said[:MOST_ROBOTS]:
-            word = read_word(one.text, self._id, self._static.costs.shape)
-            if isinstance(word, Unheard):
-                self._unheard[one.robot] = word
-                continue
-            at = now - one.age
-            seen = at - word.ages
-            self._heard[one.robot] = self._without_me(_Heard(at, word, seen, self._below(word)))
-        newest = sorted(self._heard, key=lambda robot: -self._heard[robot].at)
-        self._heard = {
-            robot: self._heard[robot]
-            for robot in newest[:MOST_ROBOTS]
-            if now - self._heard[robot].at <= self._params.obstacles_last
-        }
+        self._unheard = {robot: one for robot, one in self._unheard.items() if now - one[0] <= _LISTENING}
+        if not self._waiting:
+            self._waiting.extend((now - one.age, one) for one in said[:MOST_ROBOTS])
+
+    def read(self, now: float) -> bool:
+        """Read one word that waits, which takes the place of its robot's last one: a crowd is not to hold up the loop.
+
+        Returns:
+            Whether more wait.
+        """
+        if not self._waiting:
+            return False
+        at, one = self._waiting.popleft()
+        self._unheard.pop(one.robot, None)
+        word = read_word(one.text, self._id, self._static.costs.shape)
+        if isinstance(word, Unheard):
+            self._unheard[one.robot] = (at, word)
+            self._unheard = dict(list(self._unheard.items())[-MOST_ROBOTS:])
+        else:
+            self._heard[one.robot] = self._without_me(_Heard(at, word, at - word.ages, self._below(word)))
+            newest = sorted(self._heard, key=lambda robot: -self._heard[robot].at)[:MOST_ROBOTS]
+            lasts = self._params.obstacles_last
+            self._heard = {robot: self._heard[robot] for robot in newest if now - self._heard[robot].at <= lasts}
+        return bool(self._waiting)
 
     def look(self, now: float, pose: Pose, scan: Scan) -> None:
         """Note what this robot's own laser sees: what it can tell, and what of the others' word is not so."""

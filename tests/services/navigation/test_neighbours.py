@@ -51,6 +51,12 @@ def tells(pose: Pose = THERE, cells: list[list[int]] | None = None, age: float =
     return write_word(map_id(STATIC), Word(pose, corners, at, np.full(len(at), age)))
 
 
+def hear(me: Neighbours, now: float, said: list[Said]) -> None:
+    me.hear(now, said)
+    while me.read(now):
+        pass
+
+
 def lethal(layer: Costs | None) -> NDArray[np.intp]:
     return np.empty((0, 2), dtype=np.intp) if layer is None else np.argwhere(layer == LETHAL)
 
@@ -69,12 +75,12 @@ def test_without_a_group_nothing_is_told_and_nothing_counts() -> None:
 
 def test_what_one_sees_the_other_plans_round() -> None:
     one, other = neighbours(), neighbours()
-    one.hear(0.0, [])
+    hear(one, 0.0, [])
     one.look(0.1, ME, scan(ME, (3.0, 2.0)))
     seen = [(row, column) for row in range(15, 26) for column in range(25, 36)]
     text = one.word(0.6, ME, marks(*seen))
     assert text is not None
-    other.hear(100.0, [Said("one", 0.5, text)])
+    hear(other, 100.0, [Said("one", 0.5, text)])
     found = lethal(other.costs(100.0, Pose(8.0, 8.0, 0.0)))
     disk = found[found[:, 1] > 24]
     # The near side of the disk: its edge is 0.7 m ahead, at x = 2.7 m.
@@ -90,7 +96,7 @@ def test_what_one_sees_the_other_plans_round() -> None:
 
 def test_walls_of_the_map_are_no_obstacles_and_neither_is_what_was_not_just_seen() -> None:
     one = neighbours(obstacles_last=60.0)
-    one.hear(0.0, [])
+    hear(one, 0.0, [])
     near_wall = Pose(1.0, 5.0, math.pi)
     one.look(0.1, near_wall, scan(near_wall, (0.0, 5.0), side=0.2))
     text = one.word(0.2, near_wall, marks((50, 1), (50, 2), (30, 30)))
@@ -102,41 +108,41 @@ def test_walls_of_the_map_are_no_obstacles_and_neither_is_what_was_not_just_seen
 
 def test_what_others_see_lasts_for_its_time_and_where_they_are_for_less() -> None:
     me = neighbours(obstacles_last=60.0, robots_last=5.0)
-    me.hear(0.0, [Said("other", 1.0, tells(cells=[[50, 70]], age=20.0))])
+    hear(me, 0.0, [Said("other", 1.0, tells(cells=[[50, 70]], age=20.0))])
     assert has(me.costs(0.0, ME), 50, 70)
     assert has(me.costs(3.9, ME), 50, 50)
     assert not has(me.costs(4.1, ME), 50, 50), "it said 5.1 s ago where it was"
     assert has(me.costs(38.9, ME), 50, 70)
     assert me.costs(39.1, ME) is None, "it was seen 60.1 s ago"
-    me.hear(39.2, [])
+    hear(me, 39.2, [])
     assert me.names(39.2) == {}
 
 
 def test_a_newer_word_takes_the_place_of_the_last_one() -> None:
     me = neighbours()
-    me.hear(0.0, [Said("other", 0.0, tells(cells=[[50, 70]]))])
-    me.hear(1.0, [Said("other", 0.0, tells(cells=[[50, 80]]))])
+    hear(me, 0.0, [Said("other", 0.0, tells(cells=[[50, 70]]))])
+    hear(me, 1.0, [Said("other", 0.0, tells(cells=[[50, 80]]))])
     assert not has(me.costs(1.0, ME), 50, 70)
     assert has(me.costs(1.0, ME), 50, 80)
 
 
 def test_what_ones_own_laser_finds_free_is_free_until_another_sees_something_later() -> None:
     me = neighbours()
-    me.hear(0.0, [Said("other", 0.0, tells(cells=[[20, 40], [20, 70]]))])
+    hear(me, 0.0, [Said("other", 0.0, tells(cells=[[20, 40], [20, 70]]))])
     me.look(0.5, ME, scan(ME))
     layer = me.costs(0.5, ME)
     assert not has(layer, 20, 40), "2 m ahead, and nothing is there"
     assert has(layer, 20, 70), "beyond the range in which rays clear"
-    me.hear(1.0, [Said("other", 0.0, tells(cells=[[20, 40]], age=0.8))])
+    hear(me, 1.0, [Said("other", 0.0, tells(cells=[[20, 40]], age=0.8))])
     assert not has(me.costs(1.0, ME), 20, 40), "the same old word again"
-    me.hear(2.0, [Said("other", 0.0, tells(cells=[[20, 40]], age=0.2))])
+    hear(me, 2.0, [Said("other", 0.0, tells(cells=[[20, 40]], age=0.2))])
     assert has(me.costs(2.0, ME), 20, 40)
 
 
 def test_nothing_counts_where_the_robot_itself_stands_or_far_away() -> None:
     me = neighbours(reach=5.0)
     liar = [[row, column] for row in range(15, 26) for column in range(15, 26)]
-    me.hear(0.0, [Said("liar", 0.0, tells(Pose(2.1, 2.0, 0.0), cells=[*liar, [50, 50], [90, 90]]))])
+    hear(me, 0.0, [Said("liar", 0.0, tells(Pose(2.1, 2.0, 0.0), cells=[*liar, [50, 50], [90, 90]]))])
     layer = me.costs(0.0, ME)
     for row, column in lethal(layer):
         assert 0.3 < math.hypot(row / 10 + 0.05 - 2.0, column / 10 + 0.05 - 2.0) <= 5.0
@@ -146,11 +152,11 @@ def test_nothing_counts_where_the_robot_itself_stands_or_far_away() -> None:
 
 def test_a_robot_is_not_told_of_itself() -> None:
     me = neighbours()
-    me.hear(0.0, [])
+    hear(me, 0.0, [])
     for n in range(50):
         me.look(0.1 * n, Pose(2.0 + 0.05 * n, 2.0, 0.0), scan(ME))
     # At 2.0 s it was at x = 3 m, and another one saw it there; at 5 s it is elsewhere. What is at x = 4.5 m is real.
-    me.hear(5.0, [Said("other", 1.0, tells(cells=[[20, 30], [20, 45]], age=2.0))])
+    hear(me, 5.0, [Said("other", 1.0, tells(cells=[[20, 30], [20, 45]], age=2.0))])
     layer = me.costs(5.0, Pose(7.0, 7.0, 0.0))
     assert not has(layer, 20, 30)
     assert has(layer, 20, 45)
@@ -159,7 +165,7 @@ def test_a_robot_is_not_told_of_itself() -> None:
 def test_a_robot_is_no_obstacle_to_be_told_of() -> None:
     me = neighbours()
     there = Pose(3.0, 2.0, 0.0)
-    me.hear(0.0, [Said("other", 0.0, tells(there))])
+    hear(me, 0.0, [Said("other", 0.0, tells(there))])
     me.look(0.1, ME, scan(ME, (3.0, 2.0)))
     seen = marks(*[(row, column) for row in range(16, 25) for column in range(25, 35)])
     text = me.word(0.2, ME, seen)
@@ -168,7 +174,7 @@ def test_a_robot_is_no_obstacle_to_be_told_of() -> None:
     assert isinstance(read, Word)
     assert read.cells.tolist() == []
     # When it has said nothing for long, what is seen there is something.
-    me.hear(9.0, [])
+    hear(me, 9.0, [])
     me.look(9.1, ME, scan(ME, (3.0, 2.0)))
     text = me.word(9.2, ME, seen)
     assert text is not None
@@ -180,24 +186,37 @@ def test_a_robot_is_no_obstacle_to_be_told_of() -> None:
 def test_words_of_another_map_and_nonsense_count_for_nothing_and_are_named() -> None:
     me = neighbours()
     theirs = write_word("x", Word(THERE, np.eye(3)[:, :2], np.array([[50, 70]]), np.zeros(1)))
-    me.hear(0.0, [Said("a", 0.0, theirs), Said("b", 0.0, "nonsense")])
+    hear(me, 0.0, [Said("a", 0.0, theirs), Said("b", 0.0, "nonsense")])
     assert me.costs(0.0, ME) is None
     assert me.names(0.0) == {"a": "another map", "b": "unreadable"}
 
 
 def test_news_that_come_too_often_are_not_read() -> None:
     me = neighbours()
-    me.hear(0.0, [])
-    me.hear(0.1, [Said("other", 0.0, tells())])
+    hear(me, 0.0, [])
+    hear(me, 0.1, [Said("other", 0.0, tells())])
     assert me.names(0.1) == {}
-    me.hear(0.5, [Said("other", 0.0, tells())])
+    hear(me, 0.5, [Said("other", 0.0, tells())])
     assert me.names(0.5) == {"other": "heard"}
+
+
+def test_a_crowd_is_read_one_by_one_and_nobody_is_passed_over() -> None:
+    me = neighbours()
+    crowd = [Said(f"r{n}", 0.5, tells()) for n in range(10)]
+    me.hear(0.0, crowd)
+    for n in range(4):
+        assert me.read(0.1 * n)
+    me.hear(1.0, crowd)
+    for _ in range(6):
+        me.read(1.0)
+    assert len(me.names(1.0)) == 10, "what came meanwhile did not begin anew"
+    assert all(one.at == -0.5 for one in me._heard.values()), "it is as old as it is, however long it waited"
 
 
 def test_no_more_robots_than_the_bound_are_kept_the_newest() -> None:
     me = neighbours()
     for n in range(40):
-        me.hear(float(n), [Said(f"r{n}", 0.0, tells())])
+        hear(me, float(n), [Said(f"r{n}", 0.0, tells())])
     assert len(me.names(39.0)) == 11, "those of the last ten seconds"
     assert len(me._heard) == 15
 
@@ -205,7 +224,7 @@ def test_no_more_robots_than_the_bound_are_kept_the_newest() -> None:
 @pytest.mark.parametrize("which", ["tell", "listen"])
 def test_each_way_can_be_switched_off(which: str) -> None:
     me = neighbours(**{which: False})
-    me.hear(0.0, [Said("other", 0.0, tells())])
+    hear(me, 0.0, [Said("other", 0.0, tells())])
     assert (me.word(0.1, ME, marks()) is None) == (which == "tell")
     assert (me.costs(0.1, ME) is None) == (which == "listen")
 
@@ -213,7 +232,7 @@ def test_each_way_can_be_switched_off(which: str) -> None:
 def test_an_outline_of_any_kind_is_told() -> None:
     square = replace(ROUND, corners=((0.3, 0.3), (-0.3, 0.3), (-0.3, -0.3), (0.3, -0.3)))
     me = Neighbours(SharingParams(), STATIC, square, ObstacleParams())
-    me.hear(0.0, [])
+    hear(me, 0.0, [])
     text = me.word(0.1, ME, marks())
     assert text is not None
     read = read_word(text, map_id(STATIC), STATIC.costs.shape)
