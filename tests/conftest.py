@@ -89,6 +89,7 @@ TOGETHER = (
     "ros/ros2/test_parameters.py",
     "ros/ros2/test_port.py",
     "ros/ros2/test_robot_run.py",
+    "service/test_actions_live.py",
     "service/test_calls.py",
     "services/",
     "wire/",

@@ -14,7 +14,7 @@ from .errors import CallError
 from .goals import ActionServer, F, G, Goal, R, State
 
 RESULT_KEEP = 900.0
-"""s that a result is kept, as rcl does by default (until Jazzy, which keeps it for 10 s)."""
+"""s that a result is kept: the default of rcl until Iron; the 10 s of later ones are few for a lost link."""
 MAX_ASKED = 4
 """Requests for one result that may wait; with more the oldest fails, so that none takes the place of other calls."""
 CODES = {
