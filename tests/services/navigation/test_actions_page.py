@@ -1,4 +1,4 @@
-"""The page's client for ROS 2, run with a played rclpy: its names and steps. That for ROS 1 is run in tests/ros/ros1."""
+"""The page's client for ROS 2, run with a played rclpy: its names and steps. That of ROS 1: tests/ros/ros1."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def closed(what: Any, like: Any) -> Any:
     if not isinstance(like, Message):
         return what
     assert set(vars(what)) == set(like.__slots__)
-    return dataclasses.replace(like, **{name: closed(getattr(what, name), getattr(like, name)) for name in vars(what)})  # type: ignore[type-var]
+    fields = {name: closed(getattr(what, name), getattr(like, name)) for name in like.__slots__}
+    return dataclasses.replace(like, **fields)  # type: ignore[type-var]
 
 
 class Played:
