@@ -52,6 +52,7 @@ class Drive:
         alter: Changes what the robot's sensors say.
         statuses: All that the service told of itself, as the pairs (state, code), each once when it changed.
         times: Of each step.
+        acted: When each command that arrived so far was sent, and when it arrived [s].
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class Drive:
         self.alter: Alter = lambda _, message: message
         self.statuses: list[tuple[str, str]] = []
         self.times: list[StepTime] = []
+        self.acted: list[tuple[float, float]] = []
         conditions = link or LinkConditions()
         self._up = _Way(conditions, "up")
         self._down = _Way(replace(conditions, seed=conditions.seed + 1), "down")
@@ -123,7 +125,8 @@ class Drive:
         harness = self.harness
         harness.now += TICK
         now = harness.now
-        for _, _, command in self._down.arrived(now):
+        for sent, _, command in self._down.arrived(now):
+            self.acted.append((sent, now))
             self.robot.write(command)
         for topic, message in self.world.tick(now)[0]:
             altered = self.alter(topic, message) if topic in _SENSORS else None

@@ -301,6 +301,11 @@ class Navigator:
         else:
             self._begin(following)
 
+    @property
+    def predicted(self) -> tuple[State, State]:
+        """The robot as it was seen last, and as it is to be when the newest command arrives."""
+        return self._state, self._arrival
+
     # What the leaves of the tree do (behaviours.Robot).
 
     @property

@@ -87,7 +87,7 @@ class Navigation(Service[Params]):
     def start(self) -> None:
         params = self.params
         try:
-            self._navigator = navigator = Navigator(params)
+            self.navigator = navigator = Navigator(params)
             is_mapping = params.mode is ModeName.MAP
             self._mapping = MappingMode(params, self.context.data_dir, self.executor()) if is_mapping else None
         except ValueError as error:
@@ -134,29 +134,29 @@ class Navigation(Service[Params]):
             self._mapping.step(now)
             self._tell_mapping(self._mapping, now)
             return
-        self._sense(self._navigator.whereabouts)
+        self._sense(self.navigator.whereabouts)
         self._listen()
         if heard := self.obstacles_shared.take():
             late = max(0.0, heard.age(now))
             said = [replace(one, age=one.age + late) for one in read_said(heard.message.data)]
-            self._navigator.hear(now, said)
-        self._clients.listen(self._navigator, now)
-        velocity = self._navigator.step(now, self._delay)
+            self.navigator.hear(now, said)
+        self._clients.listen(self.navigator, now)
+        velocity = self.navigator.step(now, self._delay)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
         self._tell(now)
-        self._clients.tell(self._navigator, now, self._stamp)
+        self._clients.tell(self.navigator, now, self._stamp)
 
     @answers(Trigger)
     def cancel(self, request: TriggerRequest) -> TriggerResponse:
         """Stand, and forget the goals."""
         del request
-        done = self._navigator.cancel()
+        done = self.navigator.cancel()
         return TriggerResponse(done, "The goals were called off." if done else "There are no goals to call off.")
 
     @answers(SetBool)
     def pause(self, request: SetBoolRequest) -> SetBoolResponse:
         """Stand until told to go on."""
-        if not self._navigator.pause(request.data):
+        if not self.navigator.pause(request.data):
             return SetBoolResponse(False, "There are no goals that the robot is on its way to.")
         return SetBoolResponse(True, "The robot waits." if request.data else "The robot goes on.")
 
@@ -164,7 +164,7 @@ class Navigation(Service[Params]):
     def clear_costmaps(self, request: TriggerRequest) -> TriggerResponse:
         """Forget what the laser saw."""
         del request
-        self._navigator.clear(whole=True, near=True)
+        self.navigator.clear(whole=True, near=True)
         return TriggerResponse(True, "What is still there is seen again.")
 
     @answers(Trigger)
@@ -204,7 +204,7 @@ class Navigation(Service[Params]):
 
     def _listen(self) -> None:
         """Hand what people ask for on to the navigator."""
-        navigator = self._navigator
+        navigator = self.navigator
         if map_ := self.map.take():
             self._use(convert.grid_of(map_.message), "the topic map")
         if first := self.initialpose.take():
@@ -247,7 +247,7 @@ class Navigation(Service[Params]):
     def _is_on_map(self, frame: str) -> bool:
         if convert.is_map(frame):
             return True
-        self._navigator.refuse(Trouble(Code.BAD_GOAL, convert.other_frame(frame)))
+        self.navigator.refuse(Trouble(Code.BAD_GOAL, convert.other_frame(frame)))
         return False
 
     def _load(self, name: str) -> None:
@@ -255,15 +255,15 @@ class Navigation(Service[Params]):
         try:
             self._use(load_map(self.context.data_dir / name), name)
         except MapError as error:
-            self._navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map cannot be used: {error}")
+            self.navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map cannot be used: {error}")
 
     def _use(self, grid: GridMap | None, source: str) -> None:
         try:
             if grid is None:
                 raise MapError("its size does not fit its cells")
-            self._navigator.use_map(grid, self._mask(self.params.keep_out), self._mask(self.params.speed_zones))
+            self.navigator.use_map(grid, self._mask(self.params.keep_out), self._mask(self.params.speed_zones))
         except ValueError as error:  # a MapError is one
-            self._navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map of {source} cannot be used: {error}")
+            self.navigator.no_map = Trouble(Code.MAP_BROKEN, f"The map of {source} cannot be used: {error}")
 
     def _mask(self, name: str) -> Mask | None:
         return mask_of(load_map(self.context.data_dir / name)) if name else None
@@ -280,7 +280,7 @@ class Navigation(Service[Params]):
 
     def _tell(self, now: float) -> None:
         """Publish what people and programs want to see."""
-        navigator = self._navigator
+        navigator = self.navigator
         report = navigator.report()
         self._report(now, report)
         told = (report.doing, report.code, report.task)

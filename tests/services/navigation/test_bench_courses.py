@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skytether_services.navigation.bench_courses import delay_verdict, distance_from, score
+from skytether.control.admittance import Velocity
+from skytether_services.navigation.bench_courses import Predictions, delay_verdict, distance_from, score
+from skytether_services.navigation.geometry import Pose
+from skytether_services.navigation.prediction import State
 
 
 def test_distance_from_a_path() -> None:
@@ -13,6 +16,20 @@ def test_distance_from_a_path() -> None:
     assert distance_from(path, (1.0, 0.3)) == pytest.approx(0.3)
     assert distance_from(path, (2.5, 1.0)) == pytest.approx(0.5)
     assert distance_from(path, (-3.0, -4.0)) == pytest.approx(5.0)
+
+
+def test_a_prediction_is_held_against_the_motion_and_not_the_place() -> None:
+    """It drives 0.02 m north in each tick of 10 ms. It is believed to be elsewhere, and to face east."""
+    predictions = Predictions(5.0)
+    for tick in range(1, 8):
+        predictions.saw(Pose(1.0, 0.02 * tick, np.pi / 2))
+    still = Velocity(0.0, 0.0)
+    # Seen at the end of tick 2; the command arrives in tick 6, so it acts from the end of tick 5 on.
+    predictions.sent(5.04, State(Pose(9.0, 9.0, 0.0), still, 5.02), State(Pose(9.05, 9.0, 0.0), still, 5.06))
+    predictions.arrived(5.04, 5.06)
+    assert predictions.errors == [pytest.approx(0.06 - 0.05)]
+    predictions.arrived(5.03, 5.06)  # it was sent while the robot stood
+    assert len(predictions.errors) == 1
 
 
 def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
@@ -25,7 +42,7 @@ def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
 def rows(off: float, fixed: float, measured: float, late: float, state: str = "succeeded") -> list[dict[str, Any]]:
     def row(trip: float, jitter: float, kind: str, error: float, seconds: float) -> dict[str, Any]:
         told = {"round_trip": trip, "jitter": jitter, "compensation": kind}
-        return {**told, "path_error": error, "seconds": seconds, "state": state}
+        return {**told, "path_error": error, "prediction_error": error, "seconds": seconds, "state": state}
 
     plain = [row(0.0, 0.0, "measured", 0.02, 100.0), row(0.2, 0.0, "measured", 0.02, late)]
     errors = {"off": off, "fixed": fixed, "measured": measured}

@@ -129,7 +129,7 @@ def test_the_other_robots_body_is_gone_round_and_is_no_wall(tmp_path: Path) -> N
     pair.world.place(SCOUT, Pose(9.0, 4.0, 0.0))
     pair.shares = False
     pair.run(6.0)
-    whole = pair.services[NEEDY].service._navigator.surroundings.whole
+    whole = pair.services[NEEDY].service.navigator.surroundings.whole
     assert whole.at(*scout) < LETHAL
 
 
@@ -143,7 +143,7 @@ def test_a_neighbour_that_lies_makes_no_goal_unreachable(tmp_path: Path) -> None
     corners = np.array([[0.3, 0.3], [-0.3, 0.3], [-0.3, -0.3], [0.3, -0.3]])
     pair.false_word = write_word(map_id(static), Word(MapPose(9.0, 4.0, 0.0), corners, wall, np.zeros(len(wall))))
     pair.run(3.0)
-    surroundings = pair.services[NEEDY].service._navigator.surroundings
+    surroundings = pair.services[NEEDY].service.navigator.surroundings
     assert surroundings.whole.at(6.0, 4.1) == LETHAL, "it is believed"
     assert surroundings.own.at(6.0, 4.1) < LETHAL
     pair.go()
