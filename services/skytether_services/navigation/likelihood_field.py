@@ -177,6 +177,20 @@ class Explained:
     share: float
     through: float
 
+    @property
+    def telling(self) -> float:
+        """Share of the beams that speak for the pose, or against it.
+
+        One that ends in the open met something that the map does not show. That says nothing of the pose.
+        """
+        return self.known * (self.share + self.through)
+
+    @property
+    def against(self) -> float:
+        """Share of the telling beams that speak against the pose: they passed through what the map shows."""
+        telling = self.share + self.through
+        return self.through / telling if telling > 0 else 0.0
+
 
 def compare_beams(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> NDArray[np.int8]:
     """What the map says of each beam from one pose: ``UNKNOWN``, ``EXPLAINED``, ``OPEN`` or ``THROUGH``.

@@ -5,6 +5,10 @@ the match of the scans had, the likelihood field of the beams that the map expla
 many particles as KLD sampling asks for. Where the map explains little, as in a room that it lacks, the particles are
 not weighed: then odometry alone carries the pose.
 
+A beam that ends where the map is free met something that the map does not show. That speaks neither for a pose nor
+against it, so a field of such things is driven through by the few walls seen between them. What speaks against a pose
+is a beam that passed through a wall.
+
 Where no pose is believed, hypotheses come from a search of the whole map with the scans of the last metres put
 together. They are searched for again while the robot drives, until one explains more than every other. Where the map
 contradicts the pose that is believed, it is searched beside the tracking: the robot may have been carried away, or be
@@ -23,6 +27,7 @@ from numpy.typing import NDArray
 from skytether_services.navigation.global_search import Hypothesis, SearchParams, distinct, search
 from skytether_services.navigation.likelihood_field import (
     EXPLAINED,
+    OPEN,
     Explained,
     LikelihoodField,
     compare_beams,
@@ -52,8 +57,8 @@ class LocalisationParams:
         beams: As many of a scan's beams are compared with the map.
         independent_beams: They count as much as so many independent ones: neighbours see the same wall, and err alike.
         max_beam: Longer beams are left out [m].
-        least_explained: The map is not asked where it explains no more of the beams than this share: there odometry
-            carries the pose, for what bits of map near by explain is explained wrongly.
+        least_explained: The map is not asked where it explains no more than this share of the beams that do not end in
+            the open: there odometry carries the pose, for what bits of map near by explain is explained wrongly.
         well_explained: It is asked without reserve from this share on.
         gathered: Up to this standard deviation the middle of the particles tells which beams the map explains [m].
         update_distance: The map is asked after so much motion [m].
@@ -69,9 +74,11 @@ class LocalisationParams:
         sure_lead: And every other place explains less, by so much of the score.
         least_share: A search makes it sure with as little as this, too, by a larger lead: see `lead_needed`.
         sure_distance: After so much motion within one place [m].
-        doubt_share: It doubts where the map explains less than this share.
-        doubt_known: While the map has something to say about at least this share of the beams.
-        doubt_distance: For so much motion on end [m].
+        doubt_share: It doubts where more than this share of the telling beams passed through an obstacle of the map.
+        doubt_known: While the map has something to say about at least this share of the beams: about fewer where the
+            robot is in a room that the map lacks.
+        doubt_telling: And while at least this share of all beams is telling.
+        doubt_distance: For so much motion [m]; motion with scans that agree is taken off.
         doubt_search: Then the map is searched after so much motion, and each time in vain after twice as much [m].
         doubt_search_most: But after so much at most [m].
         carried_from: Share of all beams that the map explained before scans broke off, for a robot to be carried away.
@@ -104,8 +111,9 @@ class LocalisationParams:
     sure_lead: float = 0.25
     least_share: float = 0.4
     sure_distance: float = 1.0
-    doubt_share: float = 0.45
-    doubt_known: float = 0.4
+    doubt_share: float = 0.5
+    doubt_known: float = 0.6
+    doubt_telling: float = 0.2
     doubt_distance: float = 0.5
     doubt_search: float = 1.0
     doubt_search_most: float = 4.0
@@ -205,7 +213,7 @@ class Localisation:
         points = points[np.isfinite(points).all(axis=1)]
         points = points[np.hypot(points[:, 0] - origin[0], points[:, 1] - origin[1]) <= params.max_beam]
         scan = self._odometry.update(step, with_normals(points, origin))
-        travelled = math.hypot(scan.motion[0], scan.motion[1]) + 0.3 * abs(float(scan.motion[2]))
+        travelled = _length(scan.motion)
         # A robot that stands is matched with the same scans again and again: those errors do not add up.
         covariance = scan.covariance * min(1.0, travelled / params.update_distance + 1e-6)
         self.particles = move_particles(self.particles, scan.motion, covariance, self._random)
@@ -220,7 +228,8 @@ class Localisation:
             return self._estimate
         self._since_asked = np.zeros(3)
         if self._believed:
-            self._estimate = self._track(points, origin, travelled, scan.broken)
+            # By where it is, not by its way: what trembles does not drive.
+            self._estimate = self._track(points, origin, _length(away), scan.broken)
         if not self._believed:
             self._estimate = self._find(points, origin)
         assert self._estimate is not None  # noqa: S101 - one of both was done
@@ -263,10 +272,13 @@ class Localisation:
             # The middle of a wide cloud may explain nothing, though some particle is right.
             at = self.particles[int(score_poses(self._field, self.particles, points).argmax())]
         beams = compare_beams(self._field, at, starts, points)
-        share = float(np.mean(beams == EXPLAINED)) if len(beams) else 0.0
+        fits = beams == EXPLAINED
+        # What stands in the open, on no map, says nothing of where the robot is.
+        share = float(fits.sum()) / max(int((beams != OPEN).sum()), 1)
         trust = (share - params.least_explained) / (params.well_explained - params.least_explained)
-        # What the map does not explain says nothing of where the robot is.
-        self._weigh(points[beams == EXPLAINED], min(max(trust, 0.0), 1.0))
+        # Neighbours err alike, and those that are left out leave as many neighbours to each of the others.
+        alike = min(1.0, params.independent_beams / max(len(points), 1))
+        self._weigh(points[fits], alike * min(max(trust, 0.0), 1.0))
         cluster = self._cluster()
         seen = explain(self._field, cluster.mean, starts, points)
         self._judge(cluster, seen, travelled, broken)
@@ -282,7 +294,7 @@ class Localisation:
         if trust == 0 or len(points) == 0:
             return
         total = score_poses(self._field, self.particles, points)
-        total *= trust * min(1.0, self.params.independent_beams / len(points))
+        total *= trust
         weights = self.weights * np.exp(total - total.max())
         self.weights = weights / weights.sum()
 
@@ -305,9 +317,11 @@ class Localisation:
             self._disbelieve()
             return
         self._before.append(explained)
-        contradicts = seen.known >= params.doubt_known and seen.share < params.doubt_share
+        tells = seen.known >= params.doubt_known and seen.telling >= params.doubt_telling
+        contradicts = tells and seen.against > params.doubt_share
         agrees = seen.known >= params.sure_known and seen.share >= params.sure_share and cluster.weight > 0.9
-        self._doubted = self._doubted + travelled if contradicts else 0.0
+        if tells:
+            self._doubted = max(self._doubted + (travelled if contradicts else -travelled), 0.0)
         self._regained = self._regained + travelled if agrees else 0.0
         wide = _deviation(cluster) > params.lost_deviation
         if self._sure and not contradicts:
@@ -410,6 +424,11 @@ def lead_needed(share: float, params: LocalisationParams) -> float:
     if share < params.least_share:
         return math.inf
     return params.sure_lead + max(0.0, params.sure_share - share)
+
+
+def _length(motion: Array) -> float:
+    """Of a motion, its turning included [m]."""
+    return math.hypot(motion[0], motion[1]) + 0.3 * abs(float(motion[2]))
 
 
 def _deviation(cluster: Cluster) -> float:

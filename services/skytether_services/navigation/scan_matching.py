@@ -9,6 +9,7 @@ lines (Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +36,21 @@ class Patch:
 
     Attributes:
         origin: Corner of cell (0, 0) [m].
-        score: Rows by columns, uint8: 255 on a surface, exp(-d² / 2 SIGMA²) of that at d.
+        squares: Rows by columns, float32: squared distance to the nearest surface [cells²], 1e9 where none is near.
         nearest: Rows by columns, int32: number of the nearest surface, -1 where none is near.
         surfaces: Number by (x, y, nx, ny): mean position and unit normal (0, 0 without one).
     """
 
     origin: tuple[float, float]
-    score: NDArray[np.uint8]
+    squares: NDArray[np.float32]
     nearest: NDArray[np.int32]
     surfaces: Floats
+
+    @cached_property
+    def score(self) -> NDArray[np.uint8]:
+        """Rows by columns: 255 on a surface, exp(-d² / 2 SIGMA²) of that at d. Made when it is asked for first."""
+        # Where a robot is followed scan by scan it is hardly ever asked for.
+        return _likelihood(self.squares, CELL, SIGMA)
 
 
 def make_patch(points: Floats, reach: int = REACH) -> Patch:
@@ -61,14 +68,14 @@ def make_patch(points: Floats, reach: int = REACH) -> Patch:
         middle = np.median(points[:, :2], axis=0)
         half = np.sqrt(_MAX_CELLS) * CELL / 2 - margin
         return make_patch(points[(np.abs(points[:, :2] - middle) < half).all(axis=1)], reach)
-    score, nearest, surfaces = _fill(points, low[0], low[1], rows, columns, CELL, reach, SIGMA, _MERGE)
-    return Patch((float(low[0]), float(low[1])), score, nearest, surfaces)
+    squares, nearest, surfaces = _fill(points, low[0], low[1], rows, columns, CELL, reach, _MERGE)
+    return Patch((float(low[0]), float(low[1])), squares, nearest, surfaces)
 
 
 @compiled
 def _fill(
-    points: Floats, x0: float, y0: float, rows: int, columns: int, cell: float, reach: int, sigma: float, merge: int
-) -> tuple[NDArray[np.uint8], NDArray[np.int32], Floats]:
+    points: Floats, x0: float, y0: float, rows: int, columns: int, cell: float, reach: int, merge: int
+) -> tuple[NDArray[np.float32], NDArray[np.int32], Floats]:
     wide, high = columns // merge + 1, rows // merge + 1
     number = np.full((high, wide), -1, np.int32)
     sums = np.zeros((points.shape[0], 5))
@@ -106,15 +113,23 @@ def _fill(
                 if square < squares[rr, cc] and square <= reach * reach:
                     squares[rr, cc] = square
                     nearest[rr, cc] = k
-    table = np.empty(reach * reach * 4 + 1, np.uint8)
+    return squares, nearest, surfaces
+
+
+@compiled
+def _likelihood(squares: NDArray[np.float32], cell: float, sigma: float) -> NDArray[np.uint8]:
+    # Farther than four standard deviations nothing is left of 255.
+    table = np.empty(int(4 * (4 * sigma / cell) ** 2) + 1, np.uint8)
     for i in range(table.size):
         table[i] = np.uint8(255 * np.exp(-(i / 4) * cell * cell / (2 * sigma * sigma)))
+    rows, columns = squares.shape
     score = np.zeros((rows, columns), np.uint8)
     for r in range(rows):
         for c in range(columns):
-            if nearest[r, c] >= 0:
-                score[r, c] = table[int(squares[r, c] * 4)]
-    return score, nearest, surfaces
+            quarter = squares[r, c] * 4
+            if quarter < table.size:
+                score[r, c] = table[int(quarter)]
+    return score
 
 
 @compiled

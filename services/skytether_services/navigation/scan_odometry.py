@@ -59,10 +59,12 @@ class KeyScan:
     Attributes:
         pose: Of the robot, in the frame of this odometry: x [m], y [m], heading [rad].
         points: n by (x, y, nx, ny), in the robot's frame then [m].
+        placed: The same in the frame of this odometry.
     """
 
     pose: Array
     points: Array
+    placed: Array
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,10 @@ class ScanOdometry:
             if math.hypot(away[0], away[1]) < params.key_distance and abs(away[2]) < params.key_turn:
                 return
         self._last = self.pose
-        self.keys.append(KeyScan(self.pose, thin(points, 0.05)))
+        thinned = thin(points, 0.05)
+        self.keys.append(KeyScan(self.pose, thinned, moved(thinned, self.pose)))
         self.kept += 1
         poses = np.array([key.pose for key in self.keys])
         far = np.hypot(poses[:, 0] - self.pose[0], poses[:, 1] - self.pose[1])
         near = np.argsort(far, kind="stable")[: params.near_scans]
-        seen = [moved(self.keys[index].points, self.keys[index].pose) for index in near]
-        self._patch = make_patch(np.vstack(seen))
+        self._patch = make_patch(np.vstack([self.keys[index].placed for index in near]))

@@ -95,6 +95,10 @@ def test_a_beam_is_explained_by_a_wall_that_was_seen_from_its_side() -> None:
     assert compare_beams(field, behind, starts[:1], np.array([[0.9, 0.0]])).tolist() == [UNKNOWN]
     both = explain(field, pose, starts, ends)
     np.testing.assert_allclose([both.known, both.share, both.through], [0.75, 1 / 3, 1 / 3])
+    # The one in the open and the unknown one tell nothing; of the two others, one speaks against the pose.
+    np.testing.assert_allclose([both.telling, both.against], [0.5, 0.5])
+    nothing = explain(field, pose, starts[:1], ends[1:2])
+    assert (nothing.known, nothing.telling, nothing.against) == (1.0, 0.0, 0.0)
 
 
 def test_beams_that_met_nothing_only_clear() -> None:

@@ -105,8 +105,8 @@ class LocalisationBench(Protocol):
             kidnaps: So many times it is carried away.
 
         Returns:
-            What is printed: ``position_mean_m, position_p95_m, heading_mean_deg, lost, seeds, update_p99_ms``, and more
-            with starts and kidnaps.
+            What is printed: ``position_mean_m, position_p95_m, heading_mean_deg, lost, seeds, update_p99_ms``, the same
+            of processor time, ``update_cpu_p99_ms``, and more with starts and kidnaps.
 
         Raises:
             ValueError: The log is not good for it; the text says why.
