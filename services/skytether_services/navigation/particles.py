@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
-from skytether_services.navigation.poses import wrap
 
 Array = NDArray[np.float64]
 
@@ -89,22 +88,49 @@ def heaviest_cluster(particles: Array, weights: Array, radius: float, turn: floa
     """
     _, index = np.unique(bin_keys(particles, radius, turn), return_inverse=True)
     sums = np.bincount(index, weights)
-    inside = index == int(sums.argmax())
-    mean, covariance = moments(particles[inside], weights[inside])
+    mean, covariance, weight = _moments(particles, weights, index == int(sums.argmax()))
     for _ in range(2):
         inside = _within(particles, mean, radius, turn)
         if not inside.any():
             break
-        mean, covariance = moments(particles[inside], weights[inside])
-    return Cluster(mean, covariance, float(weights[inside].sum()))
+        mean, covariance, weight = _moments(particles, weights, inside)
+    return Cluster(mean, covariance, weight)
 
 
 def moments(particles: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted mean and covariance of poses; headings as directions."""
-    total = weights.sum()
-    shares = weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
-    heading = math.atan2(float(shares @ np.sin(particles[:, 2])), float(shares @ np.cos(particles[:, 2])))
-    mean = np.array([float(shares @ particles[:, 0]), float(shares @ particles[:, 1]), heading])
-    away = particles - mean
-    away[:, 2] = wrap(away[:, 2])
-    return mean, (away * shares[:, None]).T @ away
+    mean, covariance, _ = _moments(particles, weights, np.ones(len(particles), np.bool_))
+    return mean, covariance
+
+
+@compiled
+def _moments(particles: Array, weights: Array, chosen: NDArray[np.bool_]) -> tuple[Array, Array, float]:
+    """Mean and covariance of the chosen, and their weight; where they weigh nothing, all weigh the same."""
+    total, count = 0.0, 0
+    for i in range(particles.shape[0]):
+        if chosen[i]:
+            total += weights[i]
+            count += 1
+    x, y, cos, sin = 0.0, 0.0, 0.0, 0.0
+    for i in range(particles.shape[0]):
+        if chosen[i]:
+            share = weights[i] / total if total > 0 else 1.0 / count
+            x += share * particles[i, 0]
+            y += share * particles[i, 1]
+            cos += share * math.cos(particles[i, 2])
+            sin += share * math.sin(particles[i, 2])
+    mean = np.array([x, y, math.atan2(sin, cos)])
+    covariance = np.zeros((3, 3))
+    for i in range(particles.shape[0]):
+        if chosen[i]:
+            share = weights[i] / total if total > 0 else 1.0 / count
+            dx, dy, turned = particles[i, 0] - mean[0], particles[i, 1] - mean[1], particles[i, 2] - mean[2]
+            turned -= 2 * math.pi * math.floor((turned + math.pi) / (2 * math.pi))
+            covariance[0, 0] += share * dx * dx
+            covariance[0, 1] += share * dx * dy
+            covariance[0, 2] += share * dx * turned
+            covariance[1, 1] += share * dy * dy
+            covariance[1, 2] += share * dy * turned
+            covariance[2, 2] += share * turned * turned
+    covariance[1, 0], covariance[2, 0], covariance[2, 1] = covariance[0, 1], covariance[0, 2], covariance[1, 2]
+    return mean, covariance, total
