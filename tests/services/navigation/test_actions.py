@@ -95,7 +95,7 @@ def test_lists_that_are_none_and_behaviour_trees_of_nav2_are_rejected(tmp_path: 
     harness = served(tmp_path, "cdr")
     through, to = ActionClient(harness, "navigate_through_poses"), ActionClient(harness, "navigate_to_pose")
     empty = through.send(NavigateThroughPosesGoal())
-    tree = to.send(NavigateToPoseGoal(at(1.0, 2.0), "/tmp/tree.xml"))
+    tree = to.send(NavigateToPoseGoal(at(1.0, 2.0), "my_tree.xml"))
     harness.step()
     assert (through.is_accepted(empty), to.is_accepted(tree)) == (False, False)
     assert [report.code for report in harness.service.reports.recent] == ["bad_goal", "no_goals"]
