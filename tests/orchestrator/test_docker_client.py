@@ -79,6 +79,35 @@ def test_an_answer_that_never_ends_costs_no_memory(engine: Callable[..., Client]
         engine(answer).info()
 
 
+def test_of_what_is_to_be_small_no_more_is_read(engine: Callable[..., Client]) -> None:
+    sent: list[bytes] = []
+
+    def answer(asked: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        if b"small" in asked:
+            yield b"5\r\nhello\r\n0\r\n\r\n"
+            return
+        for piece in chunks(b" " * 65_536):
+            sent.append(piece)
+            yield piece
+
+    client = engine(answer)
+    assert client.fetch(f"{client.base_url}/small", 5).content == b"hello"
+    with pytest.raises(requests.ConnectionError, match=r"an answer of more than 0\.0625 MiB"):
+        client.fetch(f"{client.base_url}/large", 65_536)
+    assert len(sent) < 50, "the rest was not taken"
+
+
+def test_what_is_to_be_small_takes_no_longer_than_its_call_may(engine: Callable[..., Client]) -> None:
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED
+        yield from chunks(b" ", 0.02)
+
+    client = engine(answer, 0.2)
+    with pytest.raises(requests.RequestException):
+        client.fetch(f"{client.base_url}/slow", 1000)
+
+
 def drops(drop: bytes, pause_s: float = 0.02) -> Iterator[bytes]:
     for _ in range(10_000):
         yield drop

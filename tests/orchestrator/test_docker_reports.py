@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from skytether.api.service_report import MOST_BYTES, ServiceReport
+from skytether.orchestrator.runtimes.base import RuntimeFailure
 from skytether.orchestrator.runtimes.docker.reports import ReportReader, unpacked
 
 ONE = {"reports": [{"number": 1, "code": "lost", "message": "here"}]}
@@ -36,6 +37,8 @@ class MadeUpEngine:
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
         self.mode = 0o600
+        self.shifting: set[str] = set()
+        """Containers whose files are others whenever they are fetched."""
         self.gets = 0
 
     def asked(self) -> Any:
@@ -52,8 +55,10 @@ class MadeUpEngine:
         header = base64.b64encode(json.dumps(stat).encode()).decode()
         return SimpleNamespace(status_code=200, headers={"X-Docker-Container-Path-Stat": header})
 
-    def get(self, url: str, **_: Any) -> Any:
+    def fetch(self, url: str, most: int, **_: Any) -> Any:
         self.gets += 1
+        if url.split("/")[-2] in self.shifting:
+            raise RuntimeFailure(f"more than {most} bytes")
         return SimpleNamespace(status_code=200, content=archive(self.files[url.split("/")[-2]]))
 
 
@@ -78,6 +83,17 @@ def test_a_file_is_read_when_it_changed_only(engine: MadeUpEngine) -> None:
     del engine.files["c1"]
     read.look()
     assert read.of("c1") == ()
+
+
+def test_a_file_that_changes_while_it_is_fetched_keeps_no_other_from_being_read(engine: MadeUpEngine) -> None:
+    engine.files["c1"] = engine.files["c2"] = json.dumps(ONE).encode()
+    read = reader(engine)
+    read.look()
+    engine.files = {"c1": b"{}", "c2": json.dumps(ONE).replace("here", "there").encode()}
+    engine.shifting = {"c1"}
+    read.look()
+    assert [report.message for report in read.of("c2")] == ["there"]
+    assert [report.message for report in read.of("c1")] == ["here"], "what was read of it before stays"
 
 
 @pytest.mark.parametrize("mode", [1 << 31 | 0o700, 1 << 27 | 0o777, 1 << 25 | 0o600])

@@ -13,6 +13,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from skytether.api.rest import SiteCreate, State
+from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.database import RobotRow, TokenRow
 from skytether.orchestrator.db import AddressError, make_engine, migrate
 from skytether.orchestrator.models import metadata
@@ -239,6 +240,38 @@ def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_
         live = store.change(live, NOW, reason=str(number)) or live
     store.prune(NOW, ended_age=100, ended_count=2, events_count=3)
     assert [e.reason for e in store.events("live", 0)] == ["7", "8", "9"]
+
+
+def tell(store: Store, record: Record, numbers: range) -> Record:
+    for number in numbers:
+        record = store.tell(record, NOW, [ServiceReport(number, "said", str(number))]) or record
+    return record
+
+
+def check_that_a_talker_pushes_out_nothing(store: Store, new_record: NewRecord) -> None:
+    for name in ("quiet", "talker"):
+        store.add(new_record(name), "operator", None, "")
+    talker = store.get("talker")
+    assert talker is not None
+    for start in range(1, 301, 150):
+        talker = tell(store, talker, range(start, start + 150))
+        store.prune(NOW, ended_age=100, ended_count=2, events_count=110)
+    talked = [event.reason for event in store.events("talker", 0)]
+    assert talked == ["", *(str(number) for number in range(201, 301))], "its newest, and how it began"
+    assert [event.code for event in store.events("quiet", 0)] == [""]
+
+
+def test_a_service_that_talks_all_day_pushes_out_nobody_elses_events(store: Store, new_record: NewRecord) -> None:
+    check_that_a_talker_pushes_out_nothing(store, new_record)
+
+
+@pytest.mark.postgres
+@pytest.mark.slow
+def test_nor_does_it_in_postgresql(postgres: str, new_record: NewRecord) -> None:
+    store = Store(postgres)
+    store.migrate()
+    check_that_a_talker_pushes_out_nothing(store, new_record)
+    store.close()
 
 
 def test_an_instance_is_replaced_by_one_at_a_time(store: Store, new_record: NewRecord) -> None:

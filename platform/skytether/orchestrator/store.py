@@ -52,6 +52,9 @@ _SEEN = 4096
 changed."""
 _FETCHED = 500
 """Rows that one query names at most."""
+_REPORTS = 100
+"""Events of what one instance's service reported that are kept, the newest: a service that talks all day must not push
+out what happened to others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,6 +480,8 @@ class Store(Database):
     def prune(self, now: float, ended_age: float, ended_count: int, events_count: int) -> list[tuple[str, str | None]]:
         """Forget ended instances that are too old or too many, their events, keys and sums, and the oldest events.
 
+        What services reported is bounded by instance first (`_REPORTS`), then all events together.
+
         Returns:
             Forgotten instances with their sites.
         """
@@ -487,8 +492,12 @@ class Store(Database):
             connection.execute(delete(instances).where(instances.c.id.in_([i for i, _ in gone])))
             same = (instances.c.robot == accounts.c.robot) & (instances.c.service == accounts.c.service)
             connection.execute(delete(accounts).where(~exists().where(same)))
-            newest = connection.scalar(select(func.max(events.c.id))) or 0
-            connection.execute(delete(events).where(events.c.id <= newest - events_count))
+            rank = func.row_number().over(partition_by=events.c.instance, order_by=events.c.id.desc())
+            told = select(events.c.id, rank.label("rank")).where(events.c.code != "").subquery()
+            connection.execute(delete(events).where(events.c.id.in_(select(told.c.id).where(told.c.rank > _REPORTS))))
+            # By their number, not by their ids: of those many are gone.
+            beyond = connection.scalar(select(events.c.id).order_by(events.c.id.desc()).offset(events_count).limit(1))
+            connection.execute(delete(events).where(events.c.id <= (beyond or 0)))
         return gone
 
     def _look(self, versions: Select[str, int], **named: str) -> list[Record]:

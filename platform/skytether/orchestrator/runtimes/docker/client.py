@@ -49,6 +49,18 @@ class Client(APIClient):
             _original(answer).until = inf
         return answer
 
+    def fetch(self, url: str, most: int, **options: Any) -> requests.Response:
+        """The answer to a GET, where no more than ``most`` bytes of it are wanted.
+
+        Raises:
+            requests.RequestException: It is larger, or not all of it is there within the call's time-out.
+        """
+        answer = self.get(url, stream=True, **options)
+        if answer.status_code < HTTPStatus.BAD_REQUEST:  # else `send` has read it
+            _original(answer).until = time.monotonic() + (options.get("timeout") or self.timeout)
+            _read(answer, most)
+        return answer
+
     @override
     def get_redirect_target(self, resp: requests.Response) -> str | None:
         """An engine is where the site says; whom it names may be anybody."""
@@ -132,19 +144,24 @@ def _original(answer: requests.Response) -> Any:
     return answer.raw._original_response  # noqa: SLF001
 
 
-def _read(answer: requests.Response) -> None:
+def _read(answer: requests.Response, most: int | None = None) -> None:
     """Take all of an answer, as the library does it.
+
+    Args:
+        answer: Of which nothing was read yet.
+        most: Bytes; None: `_MOST`.
 
     Raises:
         requests.RequestException: It has no end.
     """
+    most = _MOST if most is None else most
     pieces, size = [], 0
     for piece in answer.iter_content(_PIECE):
         pieces.append(piece)
         size += len(piece)
-        if size > _MOST:
+        if size > most:
             answer.close()
-            raise requests.ConnectionError(f"an answer of more than {_MOST >> 20} MiB")
+            raise requests.ConnectionError(f"an answer of more than {most / (1 << 20):g} MiB")
     answer._content = b"".join(pieces)  # noqa: SLF001 (it has no other way to be given it)
 
 

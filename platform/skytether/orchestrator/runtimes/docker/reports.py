@@ -28,6 +28,10 @@ _STAT = "X-Docker-Container-Path-Stat"
 _NO_FILE = 1 << 19
 """The lowest of Go's bits in a file's mode that say that it is none: a folder, a link, a device."""
 
+_MOST_ARCHIVE = MOST_BYTES + (8 << 10)
+"""Of the archive of one such file: the file, and some heads of 512 bytes. A service may have put a huge file in the
+place of the one that the engine told of."""
+
 Known = tuple[str, tuple[ServiceReport, ...]]
 """What the engine said of a file, and what was read of it then."""
 
@@ -80,18 +84,25 @@ class ReportReader:
 
     def _look_at(self, container: str) -> Known | None:
         """None: it has reported nothing, or is gone."""
+        api: Any = self._engine.api()  # a `Client`; told as the SDK's, which has no `fetch`
         with self._engine.asked():
-            api = self._engine.api()
             url = f"{api.base_url}/v{api.api_version}/containers/{container}/archive"
             asked: dict[str, Any] = {"params": {"path": REPORTS}, "timeout": api.timeout}
             head = api.head(url, **asked)
             stat = head.headers.get(_STAT, "")
             if head.status_code != HTTPStatus.OK or not _is_readable(stat):
                 return None
-            known = self._known.get(container)
-            if known is not None and known[0] == stat:
-                return known
-            answer = api.get(url, **asked)
+        known = self._known.get(container)
+        if known is not None and known[0] == stat:
+            return known
+        try:
+            with self._engine.asked():
+                answer = api.fetch(url, _MOST_ARCHIVE, **asked)
+        except RuntimeFailure as error:
+            # The engine has answered just before. A file that changes while it is packed is its service's doing, and
+            # must not keep those of others from being read.
+            log.debug("reports of container %.12s are not read: %s", container, error)
+            return known
         return (stat, pull_reports(unpacked(answer.content))) if answer.status_code == HTTPStatus.OK else None
 
 
