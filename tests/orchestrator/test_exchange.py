@@ -203,7 +203,8 @@ def test_over_rest(served: Any, manifest: Callable[..., dict[str, Any]]) -> None
     assert [robot.group for robot in served.operator.robots()] == ["hall", "hall"]
     with pytest.raises(ApiError, match="there is no instance"):
         other.share(ids["a"], Share(text="a lie"))
-    for wrong in ({"text": "x" * (MOST_SHARED + 1)}, {"age_s": -1.0}):
+    long = ({"text": "x" * (MOST_SHARED + 1)}, {"text": "\U0001f916" * (MOST_SHARED // 4 + 1)})
+    for wrong in (*long, {"text": "a\x01"}, {"text": "a\0"}, {"age_s": -1.0}):
         with pytest.raises(ApiError) as refused:
             one.share(ids["a"], Share.model_construct(**{"text": None, "age_s": 0.0, **wrong}))
         assert refused.value.problem.status == 422

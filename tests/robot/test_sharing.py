@@ -7,11 +7,12 @@ import pytest
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.manifest import TopicSpec
-from skytether.api.rest import MOST_SHARED, Neighbours, Problem, Share, Shared
+from skytether.api.rest import MOST_NEIGHBOURS, MOST_SHARED, Neighbours, Problem, Share, Shared
 from skytether.messages import String, decode, encode
 from skytether.robot.session import LiveSession
 from skytether.robot.sharing import Serving, SharedTopics, Sharing
 from skytether.wire.events import Connected, MessageReceived
+from skytether_services.navigation.shared_word import read_said
 
 TOPICS = SharedTopics("seen", "heard")
 OTHER = Shared(robot="other", age_s=0.5, text="a crate")
@@ -125,8 +126,23 @@ def test_what_is_no_text_or_too_long_is_left_out_and_named(scene, caplog):
     scene.after(1.0)
     scene.say("x" * (MOST_SHARED + 1))
     scene.after(1.0)
-    assert [share for _, share in scene.exchange.asked] == [Share(), Share()]
+    scene.say("a bell \a")
+    scene.after(1.0)
+    scene.say("two\tlines\n")
+    scene.after(1.0)
+    assert [share.text for _, share in scene.exchange.asked] == [None, None, None, "two\tlines\n"]
     assert f"{MOST_SHARED} at most are carried" in caplog.text
+
+
+@pytest.mark.parametrize("letter", ["\U0001f916", '"', "\n", "\a", "ü", "x"])
+def test_whatever_liars_say_there_is_room_for_what_the_others_say(scene, letter):
+    lie = letter * (MOST_SHARED // len(letter.encode()))
+    liars = tuple(Shared(robot="r" * 62 + str(i), age_s=1e-300, text=lie) for i in range(MOST_NEIGHBOURS - 1))
+    scene.exchange.answer = Neighbours(group="hall", others=(*liars, OTHER))
+    scene.after(1.0)
+    ((_, payload),) = scene.bridge.published
+    assert len(payload) < 2 * MOST_NEIGHBOURS * (MOST_SHARED + 100)
+    assert read_said(decode(String, payload, "cdr").data)[-1].text == OTHER.text
 
 
 def test_the_topics_of_a_manifest_that_are_shared():

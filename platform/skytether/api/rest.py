@@ -7,7 +7,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, FailFast, Field
+from pydantic import AfterValidator, BeforeValidator, FailFast, Field
 
 from .manifest import Name, Needs, Strict, Tier, Topics
 
@@ -280,15 +280,32 @@ class Renew(Strict):
 
 
 MOST_SHARED = 8192
-"""Characters that a service may share at a time; with them a robot's request counts as one or two."""
+"""Bytes of UTF-8 that a service may share at a time; with them a robot's request counts as one or two."""
+_UNSHARED = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]")
+"""Six times as long in JSON. Without them what 15 robots say is at most twice 15 times `MOST_SHARED` there."""
 MOST_NEIGHBOURS = 15
 """Robots of a group whose words one of them gets: those heard last."""
+
+
+def unshareable(text: str) -> str | None:
+    """Why a text cannot be shared between robots; None: it can."""
+    if (size := len(text.encode(errors="surrogatepass"))) > MOST_SHARED:
+        return f"it has {size} bytes, and {MOST_SHARED} at most are carried"
+    if _UNSHARED.search(text):
+        return "it has control characters, of which only tabs and ends of lines are carried"
+    return None
+
+
+def _shareable(text: str) -> str:
+    if why := unshareable(text):
+        raise ValueError(why)
+    return text
 
 
 class Share(Strict):
     """What an instance's service shares, and what it hears for it."""
 
-    text: Annotated[str, Field(max_length=MOST_SHARED)] | None = None
+    text: Annotated[str, Field(max_length=MOST_SHARED), AfterValidator(_shareable)] | None = None
     """Instead of what it said before; None: nothing new."""
     age_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
     """How long ago the robot got it of its service."""

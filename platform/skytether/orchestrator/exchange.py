@@ -1,7 +1,7 @@
 """What services of robots of one group share: each one's last word, for the same services of the others.
 
 The orchestrator reads none of it. Who is in a group is an operator's to say; a robot's word is known by the token that
-it came with; each has one word for each service, of `rest.MOST_SHARED` characters, for `KEPT_S`. Any orchestrator may
+it came with; each has one word for each service, of `rest.MOST_SHARED` bytes, for `KEPT_S`. Any orchestrator may
 be asked: words and groups go through the database once a second, and requests wait for none of that.
 """
 

@@ -16,7 +16,7 @@ from typing import Protocol
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.manifest import TopicSpec
-from skytether.api.rest import MOST_NEIGHBOURS, MOST_SHARED, Neighbours, Share
+from skytether.api.rest import MOST_NEIGHBOURS, Neighbours, Share, unshareable
 from skytether.messages import DecodeError, Message, String, decode
 
 from .notices import Notices
@@ -118,8 +118,9 @@ class Sharing:
             return
         self._due = now + PERIOD_S / 2  # a little early is better than a whole period late
         if serving.topics.heard is not None:
-            others = [one.model_dump() for one in found.others[:MOST_NEIGHBOURS] if len(one.text) <= MOST_SHARED]
-            serving.session.publish(serving.topics.heard, String(json.dumps(others)))
+            others = [one.model_dump() for one in found.others[:MOST_NEIGHBOURS] if unshareable(one.text) is None]
+            # As it is: escapes would make what one says twelve times as long, and the others' have no room.
+            serving.session.publish(serving.topics.heard, String(json.dumps(others, ensure_ascii=False)))
 
     def run(self, ended: threading.Event) -> None:
         """Exchange until told to end."""
@@ -139,8 +140,7 @@ class Sharing:
         except DecodeError as error:
             self._notices.say("decode", f"what the service shares is left out: {error}", now)
             return Share()
-        if len(text) > MOST_SHARED:
-            too_long = f"it has {len(text)} characters, and {MOST_SHARED} at most are carried"
-            self._notices.say("long", f"what the service shares is left out: {too_long}", now)
+        if why := unshareable(text):
+            self._notices.say("unshareable", f"what the service shares is left out: {why}", now)
             return Share()
         return Share(text=text, age_s=min(max(0.0, now - message.received_at), 3600.0))
