@@ -19,6 +19,7 @@ from skytether.cli.config_file import check_config
 from skytether.cli.gate_config import inherit
 from skytether.cli.relay_config import RelayConfig
 from skytether.cli.robot_config import RobotConfig
+from skytether_services.navigation.status import Code
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -33,7 +34,8 @@ def commands() -> list[tuple[str, str]]:
     found = []
     for page in [*PAGES, *FILES]:
         text = page.read_text()
-        lines = [line for block in re.findall(r"```\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+        fenced = re.findall(r"^( *)```(\w*)\n(.*?)^\1```$", text, re.DOTALL | re.MULTILINE)  # each with its own end
+        lines = [line for _, language, block in fenced if not language for line in block.splitlines()]
         lines += re.findall(r"`(skytether [^`]+)`", text) + re.findall(r"ExecStart=\S*/(skytether .*)", text)
         found += [(page.name, line.strip()) for line in lines if line.strip().startswith("skytether ")]
     return found
@@ -126,3 +128,9 @@ def test_each_promise_of_the_gate_names_tests_that_are_there() -> None:
         for file, name in named:
             found = list((ROOT / "tests").rglob(file))
             assert any(f"def {name}(" in path.read_text() for path in found), f"{file}::{name} of: {row}"
+
+
+def test_the_page_of_navigation_has_a_row_for_each_code() -> None:
+    table = (ROOT / "docs" / "navigation.md").read_text().partition("| `code` | |\n")[2].partition("\n\n")[0]
+    told = [code for row in table.splitlines() for code in re.findall(r"`(\w+)`", row.split("|")[1])]
+    assert sorted(told) == sorted(code.value for code in Code if code is not Code.OK)

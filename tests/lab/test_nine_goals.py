@@ -1,14 +1,20 @@
 """The navigation experiment: its numbers, and one short drive with all that is real."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from skytether.cli.app import app
-from skytether.lab.nine_goals import SCENARIOS, Scenario, Trial, TrialResult, TrialSettings
-from skytether.lab.nine_goals_report import compare_times, summary
+from skytether.lab.nine_goals import SCENARIOS, Scenario, Trial, TrialSettings
+from skytether.lab.nine_goals_figures import draw_figures
+from skytether.lab.nine_goals_report import compare_times, devices, summary, topics
+from skytether.lab.nine_goals_result import KeptTrials, TopicRow, Traces, TrialResult
+from skytether.lab.world.plan import building
 
 RESULT = TrialResult(
     scenario="edge", seed=1, completed=True, contacts=0, goals=9, start_s=1.0, time_s=100.0, distance_m=41.0,
@@ -36,6 +42,7 @@ def test_trials_are_summed_up_by_scenario_over_those_that_were_completed() -> No
     assert (private["time_s"], private["time_s_std"]) == (120.0, None)
 
 
+@pytest.mark.slow  # imports SciPy's statistics
 def test_completion_times_are_compared_as_in_the_thesis() -> None:
     base = [replace(RESULT, scenario="0 ms", time_s=time) for time in (100.0, 101.0, 102.0)]
     late = [replace(RESULT, scenario="200 ms", time_s=time) for time in (101.0, 102.0, 103.0)]
@@ -45,6 +52,105 @@ def test_completion_times_are_compared_as_in_the_thesis() -> None:
     assert row["p"] == pytest.approx(0.2879, abs=1e-4)
     assert row["slower"] == pytest.approx(1 / 101, abs=1e-4)
     assert compare_times([*base, late[0]], "0 ms") == []
+
+
+@pytest.mark.slow  # likewise
+def test_the_thesis_has_a_test_of_its_own_beside_ours() -> None:
+    near = [replace(RESULT, scenario="edge", time_s=time) for time in (100.0, 101.0)]
+    far = [replace(RESULT, scenario="embedded", time_s=time) for time in (120.0, 121.0)]
+    (row,) = compare_times([*near, *far], "edge")
+    # 128.7 with 13.1 against 100.6 with 3.6, five of each: t = 28.1 / sqrt((13.1^2 + 3.6^2) / 5).
+    assert row["thesis_t"] == pytest.approx(28.1 / math.sqrt((13.1**2 + 3.6**2) / 5), abs=1e-3)
+    assert row["thesis_p"] < 0.05
+
+
+def test_topics_are_summed_up_over_completed_trials_beside_the_period_that_they_are_sent_with() -> None:
+    trials = [
+        replace(RESULT, seed=seed, topics=(TopicRow("scan", 900, lost, 20.0, 5.0, period, 180.0),))
+        for seed, lost, period in ((1, 0.01, 119.0), (2, 0.03, 121.0))
+    ]
+    hit = replace(trials[0], completed=False, topics=(TopicRow("scan", 900, 0.5, 20.0, 5.0, 500.0, 900.0),))
+    (row,) = topics([*trials, hit])
+    assert (row["topic"], row["ideal_ms"], row["period_ms"], row["lost"]) == ("scan", 120.0, 120.0, 0.02)
+    assert row["period_ms_std"] == pytest.approx(math.sqrt(2), abs=1e-4)
+    (slow,) = topics([replace(RESULT, scenario="embedded", topics=(TopicRow("cmd_vel", 1, 0.0, 1.0, 1.0, 167.0),))])
+    assert slow["ideal_ms"] == pytest.approx(166.7, abs=0.1)
+    assert slow["period_p99_ms"] is None
+
+
+def test_robot_and_service_on_one_computer_are_one_device() -> None:
+    first = replace(RESULT, robot_memory_mb=400.0)
+    (row,) = summary([first, replace(first, seed=2, service_cpu=0.4)])
+    assert devices(row, on_robot=False) == [
+        ("robot", (pytest.approx(10.0), 0.0), (400.0, 0.0)),
+        ("service", (pytest.approx(30.0), pytest.approx(14.1)), (300.0, 0.0)),
+    ]
+    assert devices(row, on_robot=True) == [("robot", (pytest.approx(40.0), pytest.approx(14.1)), (700.0, 0.0))]
+
+
+TRACES = Traces(
+    way=((1.0, 1.0), (5.0, 1.0), (7.0, 1.4), (8.8, 1.2)), goals=(1, 3), person=((7.3, 3.4), (7.3, 1.1)),
+    plans=(((5.0, 1.0), (8.8, 1.2)),), sent_kbit_s=(700.0, 720.0), arrived_kbit_s=(690.0, 710.0),
+)  # fmt: skip
+ROWS = tuple(TopicRow(topic, 900, 0.01, 20.0, 5.0, 100.0, 180.0) for topic in ("tf", "odom", "scan", "cmd_vel"))
+
+
+def test_kept_trials_are_there_when_a_run_goes_on(tmp_path: Path) -> None:
+    file, asked = tmp_path / "trials.jsonl", TrialSettings(SCENARIOS["edge"]).document()
+    result = replace(RESULT, topics=ROWS, traces=TRACES, rtt_ms=math.nan)
+    kept = KeptTrials(file)
+    assert kept.get(asked) is None
+    kept.put(asked, result)
+    again = KeptTrials(file).get(asked)
+    assert again is not None
+    assert math.isnan(again.rtt_ms)
+    assert replace(again, rtt_ms=1.0) == replace(result, rtt_ms=1.0)
+    for other in (TrialSettings(SCENARIOS["edge"], seed=2), TrialSettings(SCENARIOS["edge"], goals=1)):
+        assert KeptTrials(file).get(other.document()) is None
+
+
+def test_a_line_that_a_crash_cut_off_is_done_again_and_any_other_refused(tmp_path: Path) -> None:
+    file = tmp_path / "trials.jsonl"
+    one, two = (TrialSettings(SCENARIOS["edge"], seed=seed).document() for seed in (1, 2))
+    KeptTrials(file).put(one, RESULT)
+    KeptTrials(file).put(two, RESULT)
+    file.write_text(file.read_text()[:-20])
+    kept = KeptTrials(file)
+    assert kept.get(one) is not None
+    assert kept.get(two) is None
+    kept.put(two, RESULT)
+    assert KeptTrials(file).get(two) is not None
+    assert len(file.read_text().splitlines()) == 2
+    file.write_text('{"a": 1}\n')
+    with pytest.raises(ValueError, match="line 1 of"):
+        KeptTrials(file)
+
+
+@pytest.mark.slow
+def test_figures_are_drawn_also_of_trials_that_lack_things(tmp_path: Path) -> None:
+    whole = replace(RESULT, topics=ROWS, traces=TRACES)
+    hit = replace(whole, scenario="embedded", completed=False, topics=(), traces=Traces())
+    files = draw_figures([whole, replace(whole, seed=2), hit], building(), tmp_path / "new")
+    assert [file.stem for file in files] == ["fig36-paths", "fig37-throughput", "fig38-loss", "fig39-periods", "times"]
+    for file in files:
+        with Image.open(file) as picture:
+            assert len(set(picture.convert("L").resize((200, 100)).tobytes())) > 20  # something is on it
+    with pytest.raises(ValueError, match="no trial"):
+        draw_figures([], building(), tmp_path)
+
+
+def test_a_run_of_kept_trials_only_prints_their_tables(tmp_path: Path) -> None:
+    file = tmp_path / "trials.jsonl"
+    settings = replace(SCENARIOS["edge"], params={"delay": {"compensation": "measured"}})
+    KeptTrials(file).put(TrialSettings(settings).document(), replace(RESULT, topics=ROWS))
+    line = ["lab", "run", "navigation", "--scenario", "edge", "--trials", "1", "--keep", str(file)]
+    done = CliRunner().invoke(app, line, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    assert "edge, seed 1: completed, 100.0 s (kept)" in done.output
+    for table in ("Table 6", "Table 7", "Figs. 38 and 39"):
+        assert table in done.output
+    said = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
+    assert said["topics"][0] == {**said["topics"][0], "scenario": "edge", "topic": "cmd_vel", "lost": 0.01}
 
 
 def test_an_unknown_scenario_is_refused() -> None:
@@ -67,3 +173,16 @@ def test_a_robot_is_driven_to_the_first_goal_by_a_service_of_its_own() -> None:
     rows = {row.topic: row for row in result.topics}
     assert {"tf", "odom", "scan", "cmd_vel", "status", "map"} <= rows.keys()
     assert result.document()["topics"][0]["topic"] in rows
+    assert len(result.traces.way) > 20
+    assert math.dist(result.traces.way[-1], (goal.x, goal.y)) < 0.6
+    assert sum(result.traces.sent_kbit_s) > sum(result.traces.arrived_kbit_s) > 0
+    assert TrialResult.of(result.document(traces=True)).traces.way == result.traces.way
+
+
+@pytest.mark.slow
+def test_on_the_robots_own_computer_the_service_gets_no_more_than_that_has() -> None:
+    scarce = replace(SCENARIOS["embedded"], cpu=0.03)  # far less than it needs
+    with Trial(TrialSettings(scarce, goals=1, drive_limit_s=6.0)) as trial:
+        result = trial.drive()
+    assert result.service_cpu < 0.06
+    assert not result.completed

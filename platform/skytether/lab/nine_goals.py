@@ -13,22 +13,24 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import psutil
 from prometheus_client.parser import text_string_to_metric_families
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
-from skytether.messages import Message, String, Twist, decode
+from skytether.messages import Message, Path, String, Twist, decode
 from skytether.robot.agent import Agent, AgentConfig
 from skytether.robot.supervisor import Limits
-from skytether.wire.stats import TopicStats
 
 from .embedded import EmbeddedOrchestrator
 from .link import LinkConditions, LinkEmulator
+from .nine_goals_result import Point, TopicRow, Traces, TrialResult
+from .throttle import Throttle, children_of
 from .world.agent import Clockwork, WorldBase, WorldGraph
 from .world.occupancy import Occupancy
 from .world.plan import Plan, building
@@ -36,9 +38,10 @@ from .world.simulation import Simulation
 
 ROBOT, SERVICE = "pioneer", "navigation"
 _LOOK_S = 0.05
+_TRACE_S = 0.1
 _BEAT_S = 2.0
 """The map is given again so long after a service said that it has none."""
-_LIMITS = Limits(linear_max=0.5, linear_min=-0.1, angular_max=1.0)
+LIMITS = Limits(linear_max=0.5, linear_min=-0.1, angular_max=1.0)
 """What the simulated robot can do."""
 
 
@@ -56,6 +59,7 @@ class Scenario:
         jitter_s: Standard deviation of the round trip [s].
         loss: Share of round trips that are lost.
         params: Of the service, where they differ.
+        cpu: Processors that the service gets at most; None: all. Then it runs on the robot itself.
     """
 
     name: str
@@ -63,6 +67,7 @@ class Scenario:
     jitter_s: float = 0.0
     loss: float = 0.0
     params: Mapping[str, Any] = field(default_factory=dict)
+    cpu: float | None = None
 
     def link(self, seed: int, direction: int) -> LinkConditions:
         """One direction of the network, 0 or 1: half of the delay, of its variance and of the loss."""
@@ -80,11 +85,14 @@ _EMBEDDED_RATES = {
     "publish_global_costmap": 0.4,
 }
 """Table 5 of the thesis, for processing on the robot."""
+ROBOT_CPU = 0.25
+"""Processors of the robot's computer, in those of this machine: the Pioneer LX has an Atom of two slow cores (thesis,
+section 5.2), here taken for an eighth of one of ours each. An assumption, not a measurement."""
 SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
     {
         scenario.name: scenario
         for scenario in (
-            Scenario("embedded", params={"rates": _EMBEDDED_RATES}),
+            Scenario("embedded", params={"rates": _EMBEDDED_RATES}, cpu=ROBOT_CPU),
             Scenario("edge", 0.0287, 0.0209, 0.005),
             Scenario("commercial", 0.1522, 0.0247, 0.001),
             Scenario("private", 0.1962, 0.0241, 0.027),
@@ -113,81 +121,15 @@ class TrialSettings:
     docker: Mapping[str, Any] | None = None
     image: str = ""
     goals: int = 9
-    start_limit_s: float = 60.0
+    start_limit_s: float = 120.0
     drive_limit_s: float = 400.0
 
-
-@dataclass(frozen=True, slots=True)
-class TrialResult:
-    """What came out.
-
-    Attributes:
-        scenario: Its name.
-        seed: Of the trial.
-        completed: All goals were reached, and nothing was touched.
-        contacts: What the robot touched: walls, things, people.
-        goals: Reached.
-        start_s: From the robot's request to the first command that it accepted [s].
-        time_s: From the first motion to the last goal [s].
-        distance_m: Way covered in that time.
-        first_leg_m: Of it, from the first goal to the second, where the person stands in the way.
-        mean_speed_m_s: That way per time.
-        rtt_ms: Median round trip, as the bridge measured it.
-        robot_cpu: Mean processors in use by agent and bridge, without the simulation.
-        service_cpu: And by the service.
-        service_memory_mb: Of the service, at the end.
-        message: What the service said last.
-        topics: Of each topic `TopicRow`.
-    """
-
-    scenario: str
-    seed: int
-    completed: bool
-    contacts: int
-    goals: int
-    start_s: float
-    time_s: float
-    distance_m: float
-    first_leg_m: float
-    mean_speed_m_s: float
-    rtt_ms: float
-    robot_cpu: float
-    service_cpu: float
-    service_memory_mb: float
-    message: str
-    topics: tuple[TopicRow, ...]
-
     def document(self) -> dict[str, Any]:
-        """For ``--json``, which has no NaN."""
-        return {key: _plain(value) for key, value in asdict(self).items()}
-
-
-@dataclass(frozen=True, slots=True)
-class TopicRow:
-    """Quality of service of one topic in one trial.
-
-    Attributes:
-        topic: Its name.
-        sent: Messages.
-        lost: Share of them that never arrived.
-        delay_ms: Median, one way.
-        jitter_ms: Mean difference between the delays of neighbours (RFC 3550).
-        period_ms: Median time between arrivals.
-    """
-
-    topic: str
-    sent: int
-    lost: float
-    delay_ms: float
-    jitter_ms: float
-    period_ms: float
-
-    @classmethod
-    def of(cls, stats: TopicStats) -> TopicRow:
-        """From the bridge's counters."""
-        lost = stats.lost / stats.sent if stats.sent else 0.0
-        times = (stats.delay_p50, stats.jitter, stats.period_p50)
-        return cls(stats.topic, stats.sent, round(lost, 5), *(round(1000 * value, 2) for value in times))
+        """All that a trial's result depends on, for `KeptTrials`."""
+        scenario = self.scenario
+        network = {"rtt_s": scenario.rtt_s, "jitter_s": scenario.jitter_s, "loss": scenario.loss}
+        asked: dict[str, Any] = {"scenario": scenario.name, "seed": self.seed, "goals": self.goals, **network}
+        return {**asked, "cpu": scenario.cpu, "params": dict(scenario.params), "image": self.image}
 
 
 class _Timed(WorldBase):
@@ -208,6 +150,57 @@ class _Timed(WorldBase):
         if twist.linear.x or twist.angular.z:
             self.commanded.set()
         super().write(twist)
+
+
+class _Tracker:
+    """Notes for figures what goes by. Its times are those of the caller."""
+
+    def __init__(self, world: Simulation, network: LinkEmulator) -> None:
+        self._world, self._network = world, network
+        self._way: list[Point] = []
+        self._person: list[Point] = []
+        self._plans: list[tuple[Point, ...]] = []
+        self._goals: list[int] = []
+        self._kbit: list[tuple[float, float]] = []
+        self._due = self._counted_at = -math.inf
+        self._bytes = (0, 0)
+
+    def look(self, now: float, reached: int) -> None:
+        """Take what is due.
+
+        Args:
+            now: [s], not less than before.
+            reached: Goals so far.
+        """
+        if now < self._due:
+            return
+        self._due = now + _TRACE_S
+        self._goals += [len(self._way)] * (reached - len(self._goals))
+        self._way.append(_rounded(self._world.robots[0].pose[:2]))
+        for stance in self._world.stances[:1]:
+            if self._person[-1:] != [place := _rounded(stance.trunk)]:
+                self._person.append(place)
+        if now - self._counted_at >= 1:
+            up = self._network.counters()["up"]
+            bytes_ = (up.bytes_received, up.bytes_forwarded)
+            if self._counted_at > -math.inf:
+                took = 125 * (now - self._counted_at)
+                sent, arrived = ((b - a) / took for a, b in zip(self._bytes, bytes_, strict=True))
+                self._kbit.append((round(sent, 1), round(arrived, 1)))
+            self._bytes, self._counted_at = bytes_, now
+
+    def plan(self, payload: bytes | memoryview) -> None:
+        """A path that the service plans: those around the person are kept, each fourth point and the last."""
+        if len(self._goals) == 1:
+            poses = decode(Path, payload, "cdr").poses
+            points = [_rounded((one.pose.position.x, one.pose.position.y)) for one in poses]
+            self._plans.append((*points[:-1:4], *points[-1:]))
+
+    def traces(self, reached: int) -> Traces:
+        """All of it."""
+        goals = (*self._goals, *[len(self._way) - 1] * (reached - len(self._goals)))
+        sent, arrived = zip(*self._kbit, strict=True) if self._kbit else ((), ())
+        return Traces(tuple(self._way), goals, tuple(self._person), tuple(self._plans), sent, arrived)
 
 
 class Trial:
@@ -233,7 +226,7 @@ class Trial:
             self.orchestrator = stack.enter_context(EmbeddedOrchestrator())
             self.operator = stack.enter_context(Client(self.orchestrator.url, self.orchestrator.operator_token))
             if settings.docker is not None:
-                stack.enter_context(_on_docker(self.operator, settings.docker, settings.image))
+                stack.enter_context(_on_docker(self.operator, settings))
             token = self.operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
             links = [settings.scenario.link(settings.seed, direction) for direction in (0, 1)]
             self.network = stack.enter_context(LinkEmulator(("127.0.0.1", 9), up=links[0], down=links[1]))
@@ -243,12 +236,14 @@ class Trial:
                 token=token,
                 service=SERVICE,
                 params=self._params(),
-                limits=_LIMITS,
+                limits=LIMITS,
                 bind=("127.0.0.1", 0),
                 route=self._through_network,
             )
             self.agent = Agent(config, self.base, graph=self.graph)
+            self._tracker = _Tracker(self.world, self.network)
             stack.callback(self.graph.subscribe("status", self._hear))
+            stack.callback(self.graph.subscribe("plan", self._tracker.plan))
             stack.enter_context(self.agent)
             self._stack = stack.pop_all()
         return self
@@ -270,14 +265,23 @@ class Trial:
             trouble = self.agent.status().trouble or self.status.get("message") or "no command came"
             raise TrialError(f"the service did not drive the robot within {limit:.0f} s: {trouble}")
         robot = self.world.robots[0]
-        begun, from_m, spent, used = time.monotonic(), robot.distance, self._spent(), self._used()
-        while self.status.get("state") not in ("succeeded", "failed"):
-            if time.monotonic() - begun > self.settings.drive_limit_s:
-                break
-            on_progress(self.status)
-            time.sleep(_LOOK_S)
-        took, way = time.monotonic() - begun, robot.distance - from_m
-        return self._result(took, way, (self._spent() - spent) / took, used)
+        with self._throttled():
+            begun, from_m, spent, used = time.monotonic(), robot.distance, self._spent(), self._used()
+            while self.status.get("state") not in ("succeeded", "failed"):
+                if time.monotonic() - begun > self.settings.drive_limit_s:
+                    break
+                self._tracker.look(time.monotonic() - begun, self._goals_reached())
+                on_progress(self.status)
+                time.sleep(_LOOK_S)
+            took, way = time.monotonic() - begun, robot.distance - from_m
+            return self._result(took, way, (self._spent() - spent) / took, used)
+
+    def _throttled(self) -> AbstractContextManager[object]:
+        """A process gets no more than the robot's computer has, from its first command on; a container always."""
+        cpu = self.settings.scenario.cpu
+        if cpu is None or self.settings.docker is not None:
+            return nullcontext()
+        return Throttle(cpu, lambda: children_of(self.orchestrator.pid))
 
     def _result(self, took: float, way: float, robot_cpu: float, used: float) -> TrialResult:
         status = self.agent.status()
@@ -302,6 +306,9 @@ class Trial:
             service_memory_mb=self._metric("skytether_instance_memory_bytes") / 1e6,
             message=self.status.get("message", ""),
             topics=tuple(TopicRow.of(topic) for topic in topics if topic.sent),
+            robot_memory_mb=psutil.Process().memory_info().rss / 1e6,
+            on_robot=self.settings.scenario.cpu is not None,
+            traces=self._tracker.traces(self._goals_reached()),
         )
 
     def _params(self) -> dict[str, Any]:
@@ -323,6 +330,9 @@ class Trial:
             self.graph.publish("map", Occupancy(self.plan).message())
         self.status = status
 
+    def _goals_reached(self) -> int:
+        return max(tuple(self._reached), default=0)  # a copy: another thread adds to it
+
     def _spent(self) -> float:
         """Processor time of this process without the simulation [s]."""
         return time.process_time() - self.base.simulating_s
@@ -341,23 +351,21 @@ class Trial:
 
 
 @contextmanager
-def _on_docker(operator: Client, options: Mapping[str, Any], image: str) -> Iterator[None]:
+def _on_docker(operator: Client, settings: TrialSettings) -> Iterator[None]:
     """Make an engine the only site."""
     manifest = operator.get_service(SERVICE)
-    if image:
-        spec = manifest.spec.model_copy(update={"image": image})
+    changes: dict[str, Any] = {"image": settings.image} if settings.image else {}
+    if cpu := settings.scenario.cpu:  # the engine's quota of processor time
+        changes["needs"] = manifest.spec.needs.model_copy(update={"cpu": min(manifest.spec.needs.cpu, cpu)})
+        changes["limits"] = manifest.spec.limits.model_copy(update={"cpu": cpu})
+    if changes:
+        spec = manifest.spec.model_copy(update=changes)
         operator.put_service(SERVICE, manifest.model_copy(update={"spec": spec}))
-    named = {"owner": f"trial-{secrets.token_hex(4)}", **options}
+    named = {"owner": f"trial-{secrets.token_hex(4)}", **(settings.docker or {})}
     operator.create_site(SiteCreate(name="docker", tier="edge", runtime="docker", options=named))
     operator.delete_site("local")
     yield
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return None if math.isnan(value) else round(value, 3)
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(one) for one in value]
-    return value
+def _rounded(place: Sequence[float]) -> Point:
+    return round(place[0], 3), round(place[1], 3)

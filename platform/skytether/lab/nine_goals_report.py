@@ -1,4 +1,4 @@
-"""Many trials of `nine_goals` in a few numbers, beside those of the thesis (Mello, section 5.6.3)."""
+"""Many trials of `nine_goals` in a few numbers, beside those of the thesis (Mello, sections 4.3.5 and 5.6.3)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from statistics import fmean, stdev
 from types import MappingProxyType
 from typing import Any
 
-from .nine_goals import TrialResult
+from .nine_goals_result import TrialResult
 
 FIGURES = (
     "start_s",
@@ -18,6 +18,7 @@ FIGURES = (
     "mean_speed_m_s",
     "rtt_ms",
     "robot_cpu",
+    "robot_memory_mb",
     "service_cpu",
     "service_memory_mb",
 )
@@ -56,6 +57,20 @@ THESIS: Mapping[str, Mapping[str, Pair]] = MappingProxyType(
     }
 )
 """By scenario, five trials each; the deviation of the speed is that within a trial."""
+THESIS_TRIALS = 5
+DEVICES: Mapping[str, Sequence[tuple[str, Pair, Pair]]] = MappingProxyType(
+    {
+        "embedded": [("robot", (76.9, 21.5), (866, 14))],
+        "edge": [("robot", (43.1, 5.7), (560, 14)), ("service", (18.2, 4.2), (4032, 176))],
+        "commercial": [("robot", (47.1, 5.2), (552, 14)), ("service", (26.7, 4.8), (1264, 112))],
+        "private": [("robot", (46.4, 5.4), (560, 14)), ("service", (22.9, 6.1), (1152, 153))],
+    }
+)
+"""Table 7: of each device the processors in use [% of the device's], the memory in use [MB], of all that ran on it."""
+DRAWN_TOPICS = ("cmd_vel", "odom", "scan", "tf")
+"""Those of Table 4 in ascending size of their messages, as in Fig. 38, but for /tf, which the thesis finds apart."""
+PERIODS_MS: Mapping[str, float] = MappingProxyType({"tf": 10.0, "odom": 100.0, "scan": 120.0, "cmd_vel": 33.0})
+"""Table 4: of the messages as they are sent."""
 
 
 def summary(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
@@ -79,14 +94,64 @@ def summary(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
     return rows
 
 
+def topics(results: Sequence[TrialResult], names: Sequence[str] = DRAWN_TOPICS) -> list[dict[str, Any]]:
+    """Each topic of each scenario in one row: mean and standard deviation over the completed trials.
+
+    Returns:
+        Of ``lost``, ``delay_ms``, ``jitter_ms``, ``period_ms`` and ``period_p99_ms``, as in `TopicRow`
+        and ``ideal_ms``.
+    """
+    rows = []
+    for name in dict.fromkeys(result.scenario for result in results):
+        good = [result for result in results if result.scenario == name and result.completed]
+        for topic in names:
+            mine = [row for result in good for row in result.topics if row.topic == topic]
+            if not mine:
+                continue
+            line: dict[str, Any] = {"scenario": name, "topic": topic, "ideal_ms": ideal_ms(name, topic)}
+            for figure in ("lost", "delay_ms", "jitter_ms", "period_ms", "period_p99_ms"):
+                values = [value for row in mine if not math.isnan(value := getattr(row, figure))]
+                line[figure] = round(fmean(values), 5) if values else None
+                line[f"{figure}_std"] = round(stdev(values), 5) if len(values) > 1 else None
+            rows.append(line)
+    return rows
+
+
+def ideal_ms(scenario: str, topic: str) -> float | None:
+    """The period with which messages are sent: Table 4's, but Table 5's of commands of the robot's own computer."""
+    return 1000 / 6 if (scenario, topic) == ("embedded", "cmd_vel") else PERIODS_MS.get(topic)
+
+
+def devices(row: Mapping[str, Any], *, on_robot: bool) -> list[tuple[str, Pair, Pair]]:
+    """Table 7 of one row of `summary`: of each device its processors in use [% of one], and memory [MB].
+
+    Where the service runs on the robot, both are one device. NaN where there are too few trials.
+    """
+    cpu = {side: _pair_of(row, f"{side}_cpu", 100) for side in ("robot", "service")}
+    memory = {side: _pair_of(row, f"{side}_memory_mb") for side in ("robot", "service")}
+    if not on_robot:
+        return [(side, cpu[side], memory[side]) for side in ("robot", "service")]
+    both = [
+        (parts["robot"][0] + parts["service"][0], math.hypot(parts["robot"][1], parts["service"][1]))
+        for parts in (cpu, memory)
+    ]
+    return [("robot", both[0], both[1])]
+
+
+def _pair_of(row: Mapping[str, Any], name: str, factor: float = 1.0) -> Pair:
+    mean, deviation = row[name], row[f"{name}_std"]
+    return tuple(math.nan if value is None else factor * value for value in (mean, deviation))  # type: ignore[return-value]
+
+
 def compare_times(results: Sequence[TrialResult], baseline: str) -> list[dict[str, Any]]:
     """Student's t-test of the completion times against those of one scenario (thesis, section 4.3.5).
 
     Returns:
         For each other scenario with two completed trials at least: ``t``, ``p`` of two sides, ``slower``: how much
-        longer its mean time is, as a share.
+        longer its mean time is, as a share; ``thesis_t`` and ``thesis_p``: the same of the thesis's means and
+        deviations, None of what it did not run.
     """
-    from scipy.stats import ttest_ind  # of the extra `navigation`, which the service itself needs
+    from scipy.stats import ttest_ind, ttest_ind_from_stats  # of the extra `navigation`, which the service itself needs
 
     times: dict[str, list[float]] = {}
     for result in results:
@@ -98,6 +163,11 @@ def compare_times(results: Sequence[TrialResult], baseline: str) -> list[dict[st
         if name != baseline and min(len(base), len(values)) > 1:
             found = ttest_ind(values, base)
             slower = fmean(values) / fmean(base) - 1
+            told = [THESIS[one]["time_s"] for one in (name, baseline) if one in THESIS]
+            theirs = None
+            if len(told) == 2:
+                (mean, std), (base_mean, base_std) = told
+                theirs = ttest_ind_from_stats(mean, std, THESIS_TRIALS, base_mean, base_std, THESIS_TRIALS)
             rows.append(
                 {
                     "scenario": name,
@@ -105,6 +175,8 @@ def compare_times(results: Sequence[TrialResult], baseline: str) -> list[dict[st
                     "t": round(float(found.statistic), 3),
                     "p": round(float(found.pvalue), 4),
                     "slower": round(slower, 4),
+                    "thesis_t": round(float(theirs.statistic), 3) if theirs is not None else None,
+                    "thesis_p": round(float(theirs.pvalue), 4) if theirs is not None else None,
                 }
             )
     return rows

@@ -82,7 +82,7 @@ def draw_run(
     """
     figure = _figure(plan, width=12.0, dpi=120, room=0.6)
     axes = figure.add_axes((0.05, 0.08, 0.93, 0.84))
-    _draw_plan(axes, plan)
+    draw_plan(axes, plan)
     if way:
         axes.plot(*np.array(way).T, color=_INK, linewidth=1, linestyle=(0, (4, 4)), zorder=3)
     for index, _ in enumerate(plan.starts[: len(frames[0].poses)]):
@@ -113,7 +113,7 @@ def draw_gif(plan: Plan, frames: Sequence[Frame], file: Path, *, speed: float = 
     """
     figure = _figure(plan, width=_GIF_WIDTH / 100, dpi=100, room=0.0)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    _draw_plan(axes, plan)
+    draw_plan(axes, plan)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
@@ -172,7 +172,8 @@ def _figure(plan: Plan, *, width: float, dpi: int, room: float) -> Figure:
     return figure
 
 
-def _draw_plan(axes: Axes, plan: Plan) -> None:
+def draw_plan(axes: Axes, plan: Plan) -> None:
+    """Walls, things and goals from above, on axes in metres."""
     x_min, y_min, x_max, y_max = _shown(plan)
     axes.set_xlim(x_min, x_max)
     axes.set_ylim(y_min, y_max)
