@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -275,6 +276,53 @@ def test_a_run_whose_pid_was_never_noted_is_found_by_its_grant(open_runtime: Ope
     second.stop("i1", force=False)
     until(second, Phase.EXITED)
     assert not alive(pid)
+
+
+def _broken(note: Path, content: str | None) -> None:
+    if content is None:
+        note.unlink(missing_ok=True)
+    else:
+        note.write_text(content)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "content",
+    [None, "", '{"attempt": 1, "bo', "[]", '{"attempt": "x", "process": ["a", "b"]}', '{"process": [1, 2, 3]}'],
+)
+def test_a_run_whose_note_was_broken_is_ended_before_the_next_begins(
+    open_runtime: Open, tmp_path: Path, content: str | None
+) -> None:
+    runtime = open_runtime()
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    pid = pid_of(tmp_path)
+    for second in (runtime, open_runtime()):  # the leader that began it, and the next one
+        _broken(tmp_path / "instances/i1/run.json", content)
+        assert second.look_at(["i1"])["i1"].phase is Phase.RUNNING
+    second.start(launch(attempt=2))
+    assert not alive(pid)
+    assert until(second, Phase.RUNNING).attempt == 2
+    second.remove("i1")
+    assert not (tmp_path / "instances/i1").exists()
+
+
+@pytest.mark.slow
+def test_a_run_whose_folder_was_deleted_is_ended_before_the_next_begins(open_runtime: Open, tmp_path: Path) -> None:
+    runtime = open_runtime()
+    runtime.start(launch())
+    until(runtime, Phase.RUNNING)
+    pid = pid_of(tmp_path)
+    shutil.rmtree(tmp_path / "instances/i1")
+    assert runtime.observe()["i1"].phase is not Phase.EXITED
+    runtime.start(launch(attempt=2))
+    assert not alive(pid)
+    until(runtime, Phase.RUNNING)
+    pid = pid_of(tmp_path)
+    shutil.rmtree(tmp_path / "instances/i1")
+    runtime.remove("i1")
+    assert not alive(pid)
+    assert runtime.observe() == {}
 
 
 @pytest.mark.slow

@@ -248,6 +248,20 @@ def test_a_transaction_that_stood_still_for_too_long_is_a_connection_that_is_gon
     engine.dispose()
 
 
+def test_a_server_that_takes_no_changes_is_asked_anew_by_another_connection(postgres: str) -> None:
+    engine = make_engine(postgres)
+    with engine.connect() as connection:
+        first = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
+        connection.exec_driver_sql("SET SESSION CHARACTERISTICS AS TRANSACTION READ ONLY")
+        connection.commit()
+        with pytest.raises(OperationalError, match="read-only transaction"):
+            connection.exec_driver_sql("CREATE TABLE never (id int)")
+    with engine.begin() as connection:
+        assert connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one() != first
+        connection.exec_driver_sql("CREATE TEMPORARY TABLE now (id int)")
+    engine.dispose()
+
+
 def test_a_database_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]

@@ -88,14 +88,14 @@ def make_engine(url: str, name: str = NAME, *, tried: bool = True, patience_s: f
         connect_args = {**_POSTGRES, "application_name": name}
         try:
             made = create_engine(address, pool_pre_ping=tried, connect_args=connect_args, **_JSON)
-            from .postgres import Server, stood_still  # its driver is an extra
+            from .postgres import Server, gone  # its driver is an extra
         except ImportError as error:
             raise AddressError(
                 f"PostgreSQL's driver cannot be loaded ({error}): pip install 'skytether[postgres]', or use SQLite"
             ) from error
 
         event.listen(made, "do_connect", Server(patience_s).connect)
-        event.listen(made, "handle_error", stood_still)
+        event.listen(made, "handle_error", gone)
         return made
     engine = create_engine(address, **_JSON)
     if engine.dialect.name == "sqlite":

@@ -7,7 +7,7 @@ from typing import Any
 
 import psycopg
 from psycopg.abc import RV, PQGen
-from psycopg.errors import ConnectionTimeout, IdleInTransactionSessionTimeout, _WaitTimeout
+from psycopg.errors import ConnectionTimeout, IdleInTransactionSessionTimeout, ReadOnlySqlTransaction, _WaitTimeout
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import OperationalError
 from typing_extensions import override
@@ -53,15 +53,18 @@ class Server:
         return made
 
 
-def stood_still(context: ExceptionContext) -> OperationalError | None:
-    """For SQLAlchemy's event ``handle_error``: the server ended a transaction of a program that was frozen meanwhile.
+def gone(context: ExceptionContext) -> OperationalError | None:
+    """For SQLAlchemy's event ``handle_error``: what the driver files under mistakes, and is a database that is away.
 
-    The driver files that under its own mistakes; it is a connection that is gone, as any other.
+    The server ended a transaction of a program that was frozen meanwhile; or it takes no changes, as one that another
+    was promoted over, or is to be soon: whoever connects anew may find that one.
     """
     error = context.original_exception
-    if isinstance(error, IdleInTransactionSessionTimeout):
-        return OperationalError(context.statement, context.parameters, error)
-    return None
+    if isinstance(error, ReadOnlySqlTransaction):
+        context.is_disconnect = True
+    elif not isinstance(error, IdleInTransactionSessionTimeout):
+        return None
+    return OperationalError(context.statement, context.parameters, error)
 
 
 class Connection(psycopg.Connection[Any]):

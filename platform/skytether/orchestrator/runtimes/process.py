@@ -207,7 +207,7 @@ class ProcessRuntime(Runtime):
             folder.mkdir(mode=0o700, exist_ok=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
             noted = read_json(folder / "run.json")
-            port = noted_port(Path(noted.get("ready", ""))) or noted_port(folder / "run.json")
+            port = noted_port(Path(str(noted.get("ready", "")))) or noted_port(folder / "run.json")
             user = self._user_for(folder, noted)
             ready = self._prepare(launch, folder, data, port, user)
             note = {"attempt": launch.attempt, "boot": BOOT_ID, "data": str(data), "port": port, "ready": ready}

@@ -92,6 +92,14 @@ def all_children_run() -> bool:
         return False  # it has none; those that an earlier program started are each looked at
 
 
+def user_of(process: ProcessId) -> int | None:
+    """The number of the user that it runs as; None: it is gone."""
+    with contextlib.suppress(OSError):
+        user = os.stat(f"{_PROC}/{process.pid}").st_uid
+        return user if stat_of(process) else None
+    return None
+
+
 def users_of_processes() -> set[int]:
     """The numbers of all users that anything runs as now."""
     found = set()

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from skytether.api.service_report import FILE_NAME, ServiceReport, pull_reports
 from .base import Observation, Phase, RuntimeFailure
 from .fence import Fence
 from .notes import noted_port, read_json, write_private
-from .procfs import BOOT_ID, ProcessId, find_by_environment, session_members, stat_of
+from .procfs import BOOT_ID, ProcessId, find_by_environment, session_members, stat_of, user_of
 from .users import end_all_of, give_user_back, keep_user, noted_user
 
 OWN = "own"
@@ -173,8 +173,7 @@ class Runs:
 
     def _find_all(self) -> dict[str, Run]:
         names = os.listdir(self._folder)
-        for gone in self._known.keys() - set(names):
-            self.find(gone)  # and forget it, if nobody has begun it anew
+        names += self._known.keys() - set(names)  # those are forgotten, if nobody has begun them anew
         return {name: run for name in names if (run := self.find(name))}
 
     def find(self, instance: str, *, acting: bool = False) -> Run | None:
@@ -191,6 +190,8 @@ class Runs:
             if known is not None and stamp is not None and known.note == stamp and not known.beginning:
                 return known
             if stamp is None and not os.path.isdir(folder):
+                if known is not None and known.lives:
+                    return known  # its folder was taken from under it: whoever removes a run ends it first
                 self._forget(instance)
                 return None
             run = self._read(Path(folder), instance, acting=acting)
@@ -240,25 +241,38 @@ class Runs:
         while True:
             stamp = _stamp(str(note))
             noted = read_json(note)
-            process = None
+            process = _noted_process(noted)
             beginning = not acting and "process" not in noted and self._fence.busy(instance)
-            if noted.get("boot") == BOOT_ID and not beginning:
-                if "process" in noted:
-                    process = ProcessId(*noted["process"])
-                else:
-                    # The orchestrator was killed between launch and note: the process is known by its grant.
-                    process = find_by_environment(GRANT_VARIABLE, str(folder / OWN / "grant.json"))
-                    if process is not None and acting:
-                        write_private(note, json.dumps({**noted, "process": [process.pid, process.start_time]}))
-                        stamp = _stamp(str(note))
+            if beginning or noted.get("boot", BOOT_ID) != BOOT_ID:
+                process = None
+            elif process is None:
+                # The orchestrator was killed between launch and note, or the note was broken or taken away since: the
+                # process is known by its grant.
+                process = find_by_environment(GRANT_VARIABLE, str(folder / OWN / "grant.json"))
+                if process is not None and acting:
+                    found = {"boot": BOOT_ID, **noted, "process": [process.pid, process.start_time]}
+                    write_private(note, json.dumps(found))
+                    stamp = _stamp(str(note))
             if _stamp(str(note)) == stamp:
                 break
-        user = keep_user(str(folder), noted_user(noted.get("user"))) if process is not None else None
-        ready = str(noted.get("ready", folder / "ready.json"))
+        user = None
+        if process is not None:
+            noted_or_seen = noted["user"] if "user" in noted else user_of(process)
+            user = keep_user(str(folder), noted_user(noted_or_seen))
+        ready = str(noted.get("ready", folder / OWN / "ready.json"))
         data = str(noted.get("data", ""))
-        return Run(
-            int(noted.get("attempt", 0)), process, str(folder), data, ready, user, note=stamp, beginning=beginning
-        )
+        attempt = noted.get("attempt")
+        # Without its note a run is of no attempt: it is no start that was asked for, and is ended before the next one.
+        attempt = attempt if type(attempt) is int else 0
+        return Run(attempt, process, str(folder), data, ready, user, note=stamp, beginning=beginning)
+
+
+def _noted_process(noted: Mapping[str, object]) -> ProcessId | None:
+    """None: the note names none, or was broken."""
+    match noted.get("process"):
+        case [int(pid), int(start_time)] if pid > 0:
+            return ProcessId(pid, start_time)
+    return None
 
 
 def _stamp(path: str) -> Stamp | None:
