@@ -151,16 +151,17 @@ def compare_times(results: Sequence[TrialResult], baseline: str) -> list[dict[st
         longer its mean time is, as a share; ``thesis_t`` and ``thesis_p``: the same of the thesis's means and
         deviations, None of what it did not run.
     """
-    from scipy.stats import ttest_ind, ttest_ind_from_stats  # of the extra `navigation`, which the service itself needs
-
     times: dict[str, list[float]] = {}
     for result in results:
         if result.completed:
             times.setdefault(result.scenario, []).append(result.time_s)
     base = times.get(baseline, [])
+    compared = {n: values for n, values in times.items() if n != baseline and min(len(base), len(values)) > 1}
     rows = []
-    for name, values in times.items():
-        if name != baseline and min(len(base), len(values)) > 1:
+    if compared:  # SciPy takes long to import; it is of the extra `navigation`, which the service itself needs
+        from scipy.stats import ttest_ind, ttest_ind_from_stats
+
+        for name, values in compared.items():
             found = ttest_ind(values, base)
             slower = fmean(values) / fmean(base) - 1
             told = [THESIS[one]["time_s"] for one in (name, baseline) if one in THESIS]
