@@ -13,7 +13,7 @@ END = {"host": "127.0.0.1", "port": 8700}
 TOPIC = {
     "name": "a", "kind": "topic", "type": "t/msg/T", "direction": "in", "type_hash": "", "encoding": "cdr",
     "priority": 1, "period_ms": 10, "lifespan_ms": 100, "depth": 1, "delivery": 0.9, "reliable": True, "latched": True,
-    "compression": "zstd", "paths": "redundant",
+    "compression": "zstd", "paths": "redundant", "shared": False,
 }  # fmt: skip
 LINK = {"delay_ms": 1, "jitter_ms": 1, "loss": 0.1, "burst": 2, "rate_mbps": 5, "seed": 1}
 ROBOT = {
