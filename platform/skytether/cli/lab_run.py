@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .lab_building import building
 from .output import console, fail, print_json
 
 if TYPE_CHECKING:
@@ -20,9 +21,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Experiments of the thesis that drive a service as a robot does.", no_args_is_help=True)
 
 
-@app.callback()
-def _run() -> None:
-    """Keeps the name of the one command."""
+app.command()(building)
 
 
 @app.command()
