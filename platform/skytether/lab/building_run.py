@@ -183,9 +183,7 @@ def drive(
 
     frames = [frame(world)]
     with ExitStack() as stack:
-        # Not from where it is started: services may read what Python imports from, and that folder, where it is closed
-        # to other users, would stand before the readable ones in it.
-        orchestrator = stack.enter_context(EmbeddedOrchestrator(environment={"PYTHONSAFEPATH": "1"}))
+        orchestrator = stack.enter_context(EmbeddedOrchestrator())
         operator = stack.enter_context(Client(orchestrator.url, orchestrator.operator_token))
         if readable:
             options = {"readable": [str(folder) for folder in readable]}
