@@ -54,6 +54,7 @@ TOGETHER = (
     "lab/world/",
     "orchestrator/test_backup.py",
     "orchestrator/test_docker.py",
+    "orchestrator/test_docker_fence.py",
     "orchestrator/test_disk_full.py",
     "orchestrator/test_docker_namespaces.py",
     "orchestrator/test_docker_orchestrated.py",
@@ -62,6 +63,7 @@ TOGETHER = (
     "orchestrator/test_images.py",
     "orchestrator/test_migrations.py",
     "orchestrator/test_moves.py",
+    "orchestrator/test_navigation_image.py",
     "orchestrator/test_openapi.py",
     "orchestrator/test_plan.py",
     "orchestrator/test_process.py",
@@ -125,7 +127,10 @@ be taken for longer by somebody else. What fails anywhere else is a finding: the
 
 QUICK_S = 0.5
 """Of processor time; a quick test that takes more belongs among the slow ones, or is made cheaper."""
+LEFT_OPEN = 50
+"""Descriptors that a test may leave; beyond 1,024 open ones `select` fails, in whatever test comes then."""
 _BEGAN = pytest.StashKey[float]()
+_OPEN = pytest.StashKey[int]()
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -150,6 +155,14 @@ def pytest_configure() -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     item.stash[_BEGAN] = time.process_time()
+    item.stash[_OPEN] = len(os.listdir("/proc/self/fd"))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    left = len(os.listdir("/proc/self/fd")) - item.stash[_OPEN]
+    if left > LEFT_OPEN:
+        pytest.fail(f"it leaves {left} descriptors open, {LEFT_OPEN} at most", pytrace=False)
 
 
 @pytest.hookimpl(wrapper=True)

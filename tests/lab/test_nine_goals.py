@@ -175,7 +175,9 @@ def test_a_robot_is_driven_to_the_first_goal_by_a_service_of_its_own() -> None:
     assert result.document()["topics"][0]["topic"] in rows
     assert len(result.traces.way) > 20
     assert math.dist(result.traces.way[-1], (goal.x, goal.y)) < 0.6
-    assert sum(result.traces.sent_kbit_s) > sum(result.traces.arrived_kbit_s) > 0
+    # what was under way when the counting began arrives in it: little less or more than what was sent
+    assert sum(result.traces.sent_kbit_s) > 0
+    assert sum(result.traces.arrived_kbit_s) == pytest.approx(sum(result.traces.sent_kbit_s), rel=0.1)
     assert TrialResult.of(result.document(traces=True)).traces.way == result.traces.way
 
 

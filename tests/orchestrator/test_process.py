@@ -504,7 +504,9 @@ def test_no_folder_that_a_service_made_keeps_it_from_being_weighed_started_and_r
     at = os.open(own, os.O_PATH)
     for _ in range(1_500):  # beyond what has a path, and beyond Python's recursion
         os.mkdir("deep", dir_fd=at)
-        at = os.open("deep", os.O_PATH, dir_fd=at)
+        above, at = at, os.open("deep", os.O_PATH, dir_fd=at)
+        os.close(above)
+    os.close(at)
     runtime.tidy()
     assert "too deep ones in its own folder" in runtime.observe()["i1"].exceeds
     runtime.start(launch(attempt=2))
