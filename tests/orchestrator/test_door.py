@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import math
 import socket
+import weakref
 from typing import Any
 
 import pytest
@@ -113,7 +115,7 @@ def test_one_customers_network_is_one_address() -> None:
     assert _place_of("unix") == "unix"
 
 
-async def answers_to(*asked: bytes) -> tuple[bytes, list[str]]:
+async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtocol) -> tuple[bytes, list[str]]:
     """All that a real connection is sent, until it is closed, and the paths that were served.
 
     Each part of what is asked is sent, and read, for itself, before there is an answer.
@@ -132,7 +134,7 @@ async def answers_to(*asked: bytes) -> tuple[bytes, list[str]]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         door = Door(
             listener,
-            lambda: GuardedProtocol(config, ServerState(), {}),
+            lambda: make(config, ServerState(), {}),
             None,
             Limits(idle_s=0.5),
             100,
@@ -153,6 +155,23 @@ async def answers_to(*asked: bytes) -> tuple[bytes, list[str]]:
             door.close()
             await door.wait_closed()
     return answers, served
+
+
+def test_a_connection_leaves_nothing_that_waits_for_the_collector() -> None:
+    made: list[weakref.ref[GuardedProtocol]] = []
+
+    class Watched(GuardedProtocol):
+        def connection_made(self, transport: Any) -> None:
+            made.append(weakref.ref(self))
+            super().connection_made(transport)
+
+    gc.disable()
+    try:
+        answer, served = asyncio.run(answers_to(get("/a"), make=Watched))
+        assert (answer[-2:], served) == (b"ok", ["/a"])
+        assert [protocol() for protocol in made] == [None]
+    finally:
+        gc.enable()
 
 
 def get(path: str) -> bytes:

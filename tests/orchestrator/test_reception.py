@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import threading
+import weakref
 from typing import Any
 
 import pytest
@@ -212,6 +214,34 @@ def test_tokens_that_nobody_knows_keep_no_renewal_waiting() -> None:
         assert len(at.renewed) == 1
 
     run(scene)
+
+
+def test_a_refusal_leaves_nothing_that_waits_for_the_collector() -> None:
+    class Unknown(UnauthenticatedError):
+        pass
+
+    left: list[weakref.ref[Unknown]] = []
+
+    def unknown(token: str | None, address: str) -> Principal:
+        error = Unknown("unknown")
+        left.append(weakref.ref(error))
+        try:
+            raise error
+        finally:
+            del error
+
+    async def scene() -> None:
+        at = Scene()
+        at.knows.authenticate = unknown  # type: ignore[method-assign]
+        assert (await at.ask(token="made-up"))[0] == 401
+        await settle()  # the thread forgets it at its next turn
+        assert [error() for error in left] == [None]
+
+    gc.disable()
+    try:
+        run(scene)
+    finally:
+        gc.enable()
 
 
 def test_a_body_is_bounded_whether_it_says_so_or_not_and_a_robots_is_smaller() -> None:

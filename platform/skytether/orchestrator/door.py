@@ -186,6 +186,8 @@ class GuardedProtocol(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self.book.leave(self.guest)
         super().connection_lost(exc)
+        # They hold this, and it holds them: hundreds would wait for the collector, which holds up everybody.
+        self.guest.protocol = self.cycle = None  # type: ignore[assignment]
 
     def data_received(self, data: bytes) -> None:
         self._around += len(data)

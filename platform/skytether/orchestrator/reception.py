@@ -267,7 +267,21 @@ class _Threads:
         """Run a function in one of them."""
         if self._limiter is None:
             self._limiter = CapacityLimiter(self._most)
-        return await to_thread.run_sync(function, *arguments, limiter=self._limiter)
+        value, error = await to_thread.run_sync(_tried, function, *arguments, limiter=self._limiter)
+        if error is None:
+            return value
+        try:
+            raise error
+        finally:
+            del error  # its traceback holds this frame: refusals would wait for the collector, which holds up everybody
+
+
+def _tried(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
+    """What it returns, or what it raises; raised through a thread's future, an error and that hold each other."""
+    try:
+        return function(*arguments), None
+    except Exception as error:
+        return None, error
 
 
 def _verified(doorman: Doorman, token: str | None, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -47,6 +47,10 @@ _SWITCH = 0.001
 """Seconds that one thread computes while others wait. An answer passes through several threads, each of which waits so
 long for a reconcile pass that is under way: at Python's own 5 ms that adds up."""
 
+_COLLECTED = (700, 10, 100)
+"""When garbage is looked for (`gc.set_threshold`): Python's own, but a tenth as often among what is old, which holds up
+everybody for 20 to 100 ms. What a connection or a refusal leaves is no such garbage, so little comes together."""
+
 
 class StartError(Exception):
     """It cannot start; one sentence saying what to do."""
@@ -114,6 +118,7 @@ def _serve(core: Orchestrator, listener: socket.socket) -> None:
         _start(core)
         try:
             gc.freeze()  # what is loaded by now stays: looking through it for garbage holds up every request
+            gc.set_threshold(*_COLLECTED)
             sys.setswitchinterval(_SWITCH)
             with _echo(core, listener):
                 server.run(sockets=[listener])
