@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from skytether.guard.enable import open_line
 from skytether.guard.folder import objection
 from skytether.guard.mailbox import bind
 from skytether.guard.protocol import STOP_SOCKET
@@ -299,6 +300,28 @@ def test_wheels_of_whoever_may_write_to_the_folder_that_hands_its_group_down_are
         wheels.write(Velocity(0.1, 0))
     wheels.close()
     root_has.close()
+
+
+@root
+def test_what_another_user_listens_at_gets_no_command_and_no_enable_signal(folder):
+    link, line = GateLink(folder), open_line(["unix", str(folder / "enable.sock")])
+    wanted = {
+        COMMAND_SOCKET: lambda: link.send(Velocity(0.1, 0)),
+        "enable.sock": lambda: line.write(True),
+    }
+    for name, tell in wanted.items():
+        theirs = bind(str(folder / name))
+        os.chown(folder / name, ANOTHER, ANOTHER)
+        with pytest.raises(PermissionError, match=f"{name} may not have the .*: it is the user {ANOTHER}"):
+            tell()
+        with pytest.raises(BlockingIOError):
+            theirs.recv(100)
+        os.chown(folder / name, 0, 0)
+        tell()
+        assert theirs.recv(100)
+        theirs.close()
+    link.close()
+    line.close()
 
 
 @root

@@ -24,7 +24,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import Limits, ServiceSpec
 from skytether.orchestrator.runtimes import confine, confinement, process, users
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
-from skytether.orchestrator.runtimes.confinement import Machine, covers, opened, readable, this_machine
+from skytether.orchestrator.runtimes.confinement import Machine, covers, opened, this_machine
 from skytether.orchestrator.runtimes.notes import noted_port
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 
@@ -203,6 +203,31 @@ def test_who_leaves_its_session_and_forks_all_the_time_ends(tmp_path: Path) -> N
     assert beat.read_bytes() == last
 
 
+LOOKER = """
+import json, os
+path = json.load(open(os.environ["SKYTETHER_GRANT"]))["params"]["say"] + "/notes"
+try:
+    print("ran; read", open(path).read())
+except OSError:
+    print("ran; refused", path)
+"""
+RUN_ONE = """
+import sys, time
+from pathlib import Path
+from skytether.api.grant import Grant
+from skytether.api.manifest import ServiceSpec
+from skytether.orchestrator.runtimes.base import Launch, Phase
+from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
+state, started = sys.argv[1:]
+runtime = ProcessRuntime("lab", Path(state), ProcessOptions(python_path=(started + "/code",)))
+session = {"session_id": "00112233445566aa", "session_key": "A" * 43 + "=", "topics": ()}
+grant = Grant(instance="i1", service="toy", robot="walker", params={"say": started}, **session)
+runtime.start(Launch(1, ServiceSpec(entrypoint="looker"), grant))
+while runtime.observe()["i1"].phase is not Phase.EXITED:
+    time.sleep(0.01)
+print(runtime.logs("i1", 9), end="")
+runtime.remove("i1")
+"""
 CROWD = """
 import os, time
 try:
@@ -296,12 +321,30 @@ def test_a_launch_file_opens_neither_folders_nor_secrets(tmp_path: Path) -> None
         runtime.remove("i1")
 
 
-def test_where_the_orchestrator_was_started_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert str(tmp_path) in readable([], Path("/var/lib/skytether"))
-    assert str(tmp_path) not in readable([], tmp_path / "state")
-    assert opened(tmp_path / "state", ["/usr", str(tmp_path)]) == str(tmp_path)
-    assert opened(tmp_path / "state", ["/usr"]) is None
+def test_what_holds_secrets_is_seen() -> None:
+    assert opened(Path("/srv/state"), ["/usr", "/srv"]) == "/srv"
+    assert opened(Path("/srv/state"), ["/usr"]) is None
+
+
+@pytest.mark.slow
+def test_services_read_nothing_of_where_the_orchestrator_was_started_but_what_is_theirs_in_it(tmp_path: Path) -> None:
+    """Started by ``python -m`` in a folder that is closed to other users, with code of a site in it."""
+    started = tmp_path / "started"
+    (started / "code").mkdir(parents=True)
+    (started / "code/looker.py").write_text(LOOKER)
+    (started / "notes").write_text("secret")
+    (started / "run.py").write_text(RUN_ONE)
+    started.chmod(0o700)
+    environment = {**os.environ, "PYTHONPATH": str(started)}
+    done = subprocess.run(
+        [sys.executable, "-m", "run", str(tmp_path / "state"), str(started)],
+        cwd=started,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.stdout == f"ran; refused {started}/notes\n", done
 
 
 def test_the_outermost_folder_that_others_may_not_pass_is_covered(monkeypatch: pytest.MonkeyPatch) -> None:

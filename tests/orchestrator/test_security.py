@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -54,6 +55,38 @@ def test_a_secret_file_that_cannot_be_used_is_told(tmp_path: Path) -> None:
         secret_file(tmp_path / "folder", lambda: b"new")
     with pytest.raises(SecretFileError, match="none/key: No such file"):
         secret_file(tmp_path / "none" / "key", lambda: b"new")
+
+
+def test_a_folder_for_secrets_is_made_and_is_nobody_elses(tmp_path: Path) -> None:
+    Secrets(tmp_path / "shared" / "secrets")
+    assert (tmp_path / "shared" / "secrets").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "file").touch()
+    with pytest.raises(SecretFileError, match=r"cannot make the folder .*file for secrets"):
+        Secrets(tmp_path / "file")
+
+
+def test_a_folder_into_which_anybody_may_put_another_token_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "secrets"
+    Secrets(folder)
+    folder.chmod(0o777)
+    with pytest.raises(SecretFileError, match=r"others may put secrets of their own into .*: chmod o-w"):
+        Secrets(folder)
+    folder.chmod(0o1777)  # where nobody can take away what is there, as Kubernetes mounts secrets
+    Secrets(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")
+@pytest.mark.parametrize("name", ["operator.token", "secret.key"])
+def test_a_secret_that_another_user_put_there_is_refused(tmp_path: Path, name: str) -> None:
+    """Who came first to a folder in which everybody may make files, and is read by root all the same."""
+    folder = tmp_path / "secrets"
+    Secrets(folder)
+    folder.chmod(0o1777)
+    os.chown(folder / name, 54_321, 54_321)
+    with pytest.raises(SecretFileError, match=f"{name} belongs to the user 54321"):
+        Secrets(folder)
+    os.chown(folder, 54_321, 54_321)  # all of it is theirs, and so is the orchestrator that root runs on it
+    Secrets(folder)
 
 
 @pytest.mark.parametrize("name", ["operator.token", "secret.key"])

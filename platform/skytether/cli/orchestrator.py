@@ -43,7 +43,10 @@ def run(
     ] = None,
     secrets_dir: Annotated[
         Path | None,
-        typer.Option(help="Folder of secret.key and operator.token, the same for all orchestrators over one database."),
+        typer.Option(
+            help="Folder of secret.key and operator.token, the same for all orchestrators over one database; made "
+            "where it is not there."
+        ),
     ] = None,
     stop_instances: Annotated[
         bool | None,

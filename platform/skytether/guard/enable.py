@@ -15,8 +15,9 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from .folder import check_listener
 from .protocol import pack_enable
-from .wheels import Address, WriterWheels
+from .wheels import Address, WriterWheels, family_of
 
 _GET_LINE = 0xC250B407
 """GPIO_V2_GET_LINE_IOCTL of linux/gpio.h, for a gpio_v2_line_request of 592 bytes."""
@@ -129,15 +130,14 @@ class DatagramLine:
     """
 
     def __init__(self, address: Address) -> None:
-        family = (
-            socket.AF_UNIX if isinstance(address, str) else socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        )
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket = socket.socket(family_of(address), socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._address = address
 
     def write(self, high: bool) -> None:
-        """Line: send it."""
+        """Line: send it, but to no other user's socket."""
+        if isinstance(self._address, str):
+            check_listener(self._address, "the enable signal")
         self._socket.sendto(_BOOL[high], self._address)
 
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import stat
@@ -112,6 +113,21 @@ class Known:
             if why := self.objection(found.st_uid, _NOBODY):
                 return why
         return ""
+
+
+def check_listener(path: str, thing: str) -> None:
+    """See whose socket a datagram would go to.
+
+    Args:
+        path: Of the socket.
+        thing: What it would have.
+
+    Raises:
+        PermissionError: It is of somebody who may not have that.
+        OSError: There is none.
+    """
+    if why := Known(path).objection_to_listener():
+        raise PermissionError(errno.EPERM, f"whoever listens at {path} may not have {thing}: {why}")
 
 
 def objection_to(link: socket.socket, path: str) -> str:

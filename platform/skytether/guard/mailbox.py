@@ -11,7 +11,7 @@ import socket
 from contextlib import suppress
 
 from .descriptors import refuse
-from .wheels import Address
+from .wheels import Address, family_of
 
 MODE = 0o660
 """Of a path: for the user and the group; who of the group is heard, `folder.Known` says."""
@@ -25,7 +25,7 @@ def bind(address: Address, mode: int = MODE) -> socket.socket:
     Raises:
         OSError: The address cannot be had.
     """
-    family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    family = family_of(address)
     made = socket.socket(family, socket.SOCK_DGRAM)
     made.setblocking(False)
     if family == socket.AF_UNIX:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import select
 import socket
 
 from .descriptors import receive
-from .folder import Known
+from .folder import check_listener
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
 from .velocity import Velocity
 
@@ -114,8 +113,8 @@ def _connected(address: Address) -> socket.socket:
     made = socket.socket(family_of(address), socket.SOCK_DGRAM)
     made.setblocking(False)
     try:
-        if isinstance(address, str) and (why := Known(address).objection_to_listener()):
-            raise PermissionError(errno.EPERM, f"whoever listens at {address} may not have the wheels: {why}")
+        if isinstance(address, str):
+            check_listener(address, "the wheels")
         made.connect(address)
     except OSError:
         made.close()

@@ -68,9 +68,7 @@ class EmbeddedOrchestrator:
         """
         address = self.state_dir / "address"
         address.unlink(missing_ok=True)
-        # Not from where it is started: services may read what Python imports from, and that folder, where it is closed
-        # to other users, would stand before those in it that they may read.
-        command = [sys.executable, "-P", "-m", "skytether.lab.tethered", "orchestrator", "run", "--stop-instances"]
+        command = [sys.executable, "-m", "skytether.lab.tethered", "orchestrator", "run", "--stop-instances"]
         command += ["--state-dir", str(self.state_dir), "--port", str(self._port)]
         self._let_go()
         with (self.state_dir / "orchestrator.log").open("ab") as log:

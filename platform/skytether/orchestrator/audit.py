@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from skytether.guard.folder import Known
+from skytether.guard.folder import check_listener
 
 log = logging.getLogger(__name__)
 
@@ -238,8 +238,8 @@ class Sink(logging.Handler):
         made = socket.socket(family, socket.SOCK_DGRAM)
         made.setblocking(False)
         try:
-            if isinstance(self._address, str) and (why := Known(self._address).objection_to_listener()):
-                raise PermissionError(errno.EPERM, f"whoever listens there may not have the audit: {why}")
+            if isinstance(self._address, str):
+                check_listener(self._address, "the audit")
             made.connect(self._address)
         except OSError:
             made.close()

@@ -127,8 +127,14 @@ def _secret_file(path: Path, make: Callable[[], bytes]) -> bytes:
             os.link(draft, path)
         draft.unlink()
         _keep_names(path.parent)
-    if path.is_file() and stat.S_IMODE(path.stat().st_mode) & 0o077:
+    found = path.stat()
+    if stat.S_ISREG(found.st_mode) and stat.S_IMODE(found.st_mode) & 0o077:
         raise SecretFileError(f"{path} can be read by others: chmod 600 {path}")
+    ours = {0, os.geteuid(), path.parent.stat().st_uid}
+    if found.st_uid not in ours:  # that user may have put it there, and knows it
+        raise SecretFileError(
+            f"{path} belongs to the user {found.st_uid}: chown it, or delete it if nobody put it there"
+        )
     content = path.read_bytes()
     if not content.strip():
         raise SecretFileError(f"{path} is empty: delete it, and a new one is made at the next start")
@@ -152,8 +158,9 @@ class Secrets:
         """Read or make ``operator.token`` and ``secret.key``.
 
         Raises:
-            SecretFileError: One of them cannot be used.
+            SecretFileError: One of them cannot be used, or anybody may put another one in its place.
         """
+        _make_folder(folder)
         self._folder = folder
         secret_file(folder / KEY, new_key)
         secret_file(folder / OPERATOR, new_operator)
@@ -228,6 +235,17 @@ class Secrets:
         held = self._held
         keys = [*held.old, held.current]
         return next((key for key in keys if fingerprint_of(key) == of), None) if of else keys[0]
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder for secrets that others cannot look into; one that is there others must not write to."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = folder.stat().st_mode
+    except OSError as error:
+        raise SecretFileError(f"cannot make the folder {folder} for secrets: {error.strerror}") from error
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        raise SecretFileError(f"others may put secrets of their own into {folder}: chmod o-w {folder}")
 
 
 def _kept_secret(path: Path) -> bytes:

@@ -241,8 +241,8 @@ class Settings(Group):
     database_url: str | None = Field(default=None, repr=False)
     """SQLAlchemy URL, `postgresql://user:password@host/name`; none: SQLite in the state folder."""
     secrets_dir: Path | None = None
-    """Folder of `secret.key` and `operator.token`, the same for all orchestrators over one database; none: the state
-    folder."""
+    """Folder of `secret.key` and `operator.token`, the same for all orchestrators over one database; made (0700) where
+    it is not there. None: the state folder."""
     catalogue_dir: Path | None = None
     """Folder of manifests (`*.yaml`, `*.yml`) beside the built-in ones."""
     stop_instances: bool = False

@@ -1,5 +1,6 @@
 """What is shown of the gate: the picture says what the rule says, and showing it costs the gate nothing."""
 
+import os
 import socket
 from contextlib import closing
 from math import inf
@@ -10,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.guard.mailbox import bind
 from skytether.messages import MarkerArray, decode, encode
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.dead_reckoning import Variation
@@ -194,6 +196,21 @@ def test_the_gate_sends_no_more_often_than_configured_and_waits_for_nobody(tmp_p
             for second in range(600):  # it takes none of them
                 feed.turn(make, 113.0 + second)
             assert "takes nothing: Resource temporarily unavailable" in feed.trouble
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")
+def test_what_the_gate_sees_is_shown_to_no_other_user(tmp_path):
+    path = str(tmp_path / "display.sock")
+    with closing(Feed(path, 5.0, 100.0)) as feed, closing(bind(path)) as theirs:
+        os.chown(path, 54_321, 54_321)
+        feed.turn(seen, 111.0)
+        assert "display.sock may not have what the gate sees: it is the user 54321" in feed.trouble
+        with pytest.raises(BlockingIOError):
+            theirs.recv(LARGEST)
+        os.chown(path, 0, 0)
+        feed.turn(seen, 112.0)
+        assert feed.trouble == ""
+        assert theirs.recv(LARGEST)
 
 
 def test_a_snapshot_that_cannot_be_made_costs_the_picture_only(tmp_path):

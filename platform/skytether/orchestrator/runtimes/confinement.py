@@ -83,15 +83,29 @@ def this_machine() -> Machine:
     return Machine(has["landlock"], has["seccomp"], has["user"], has.get("why", ""), has["hidden"])
 
 
-def readable(more: Collection[Path], secret: Path) -> list[str]:
+def readable(more: Collection[Path]) -> list[str]:
     """What every instance of a site may read: the system's, Python's, what Python imports, what the site adds.
 
-    A folder that Python imports from only because the orchestrator was started in it is left out where it holds
-    ``secret``.
+    Raises:
+        RuntimeFailure: Python does not say what it imports from.
     """
     python = [sys.prefix, sys.base_prefix, os.path.realpath(sys.executable)]
-    imported = [path for path in sys.path if os.path.isabs(path) and not opened(secret, [path])]
-    return sorted({*_READ, *python, *imported, *map(str, more)})
+    return sorted({*_READ, *python, *_imported(), *map(str, more)})
+
+
+@functools.cache
+def _imported() -> tuple[str, ...]:
+    """Where services import from, asked of a Python that is started as they are.
+
+    This process's own ``sys.path`` has more: the folder that the orchestrator was started in, which is nobody's code
+    and would stand, closed to the services, before what is in it; PYTHONPATH; a home's packages.
+    """
+    command = [sys.executable, "-I", "-c", "import json, sys; print(json.dumps(sys.path))"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_S, check=True)
+        return tuple(path for path in json.loads(done.stdout) if os.path.isabs(path))
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        raise RuntimeFailure(f"{sys.executable} does not say where it imports from: {error}") from error
 
 
 def opened(secret: Path, read: Sequence[str]) -> str | None:

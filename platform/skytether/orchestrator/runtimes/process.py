@@ -132,7 +132,7 @@ class ProcessRuntime(Runtime):
             raise RuntimeFailure("the process runtime needs Linux: use a container site")
         self._options = options
         self._machine = this_machine() if self._options.confined else None
-        self._readable = readable((*self._options.readable, *map(Path, self._options.python_path)), folder)
+        self._readable = readable((*self._options.readable, *map(Path, self._options.python_path)))
         self._closed = [path for path in (folder, self._options.folder) if path]
         for path in self._closed if self._machine else ():
             if by := opened(path, (*self._readable, *map(str, self._options.writable))):

@@ -13,7 +13,7 @@ from typing import Any
 
 from skytether.guard.clock import now as boottime
 from skytether.guard.descriptors import receive, refuse
-from skytether.guard.folder import ROOM, objection, peer, sender, trusted
+from skytether.guard.folder import ROOM, check_listener, objection, peer, sender, trusted
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.requests import readable
 from skytether.guard.velocity import Velocity
@@ -71,6 +71,7 @@ class GateLink:
             if why := objection(self._folder):
                 raise PermissionError(errno.EPERM, why)
             self._trusted = trusted(self._folder)
+        check_listener(self._address, "the wheels")
         self.state()  # what is not taken in time would leave no room for newer ones
         self._sequence += 1
         self._socket.sendto(pack_command(self._epoch, self._sequence, self._clock(), velocity, decided), self._address)

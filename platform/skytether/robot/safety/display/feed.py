@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 
+from skytether.guard.folder import check_listener
+
 from .snapshot import Snapshot, pack
 
 _MISSED_S = 10.0
@@ -35,7 +37,9 @@ class Feed:
             return
         self._due = now + self._period
         try:
-            self._socket.sendto(pack(make()), self._path)
+            shown = pack(make())
+            check_listener(self._path, "what the gate sees")
+            self._socket.sendto(shown, self._path)
             self._taken_at, self.trouble = now, ""
         except Exception as error:  # whatever it is, the robot goes on
             if now - self._taken_at > _MISSED_S:
