@@ -217,13 +217,13 @@ def test_tokens_that_nobody_knows_keep_no_renewal_waiting() -> None:
 
 
 def test_a_refusal_leaves_nothing_that_waits_for_the_collector() -> None:
-    class Unknown(UnauthenticatedError):
+    class UnknownError(UnauthenticatedError):
         pass
 
-    left: list[weakref.ref[Unknown]] = []
+    left: list[weakref.ref[UnknownError]] = []
 
     def unknown(token: str | None, address: str) -> Principal:
-        error = Unknown("unknown")
+        error = UnknownError("unknown")
         left.append(weakref.ref(error))
         try:
             raise error
