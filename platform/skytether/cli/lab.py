@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .lab_authentication import authentication
 from .lab_failover import alarms, failover
 from .lab_hostile import hostile
 from .lab_navigation import localisation, mapping, navigation
@@ -22,6 +23,7 @@ app.add_typer(run_app, name="run")
 app.command("world")(world)
 bench.command("safety")(safety)
 bench.command("hostile")(hostile)
+bench.command("authentication")(authentication)
 bench.command("mapping")(mapping)
 bench.command("localisation")(localisation)
 bench.command("navigation")(navigation)
