@@ -77,10 +77,16 @@ def start(
     runtime: Annotated[
         list[str] | None, typer.Option(help="process or docker; may be repeated. Default: process.")
     ] = None,
+    service: Annotated[str, typer.Option(help="virtual-trail, or navigation (extra `lab`).")] = "virtual-trail",
     prefix: Annotated[str, typer.Option(help="Of the images' names.")] = "skytether/",
-    json: Annotated[bool, typer.Option("--json", help="Print rows `runtime, standby, p50_s, p99_s, n`.")] = False,
+    json: Annotated[
+        bool,
+        typer.Option("--json", help="Print rows `runtime, standby, p50_s, p99_s, n, moving_p50_s, moving_p99_s`."),
+    ] = False,
 ) -> None:
     """Time from a robot's request over REST to the first velocity command that it accepts.
+
+    With navigation also to the first that moves the robot: on its way to a goal, on a map that it gives the service.
 
     With docker, the images must be there (`make images`), and `docker run` of the same image is timed in turn, until
     its service listens; each after three seconds of rest.
@@ -93,15 +99,22 @@ def start(
 
     try:
         with console.status("starting ...") as line:
-            rows = bench_start(n, runtime or ["process"], prefix, lambda row, s: line.update(f"{row}: {s:.3f} s"))
+            rows = bench_start(
+                n, runtime or ["process"], prefix, lambda row, s: line.update(f"{row}: {s:.3f} s"), service
+            )
     except (BenchError, EmbeddedError) as error:
         fail(str(error))
     if json:
         print_json([row.document() for row in rows])
         return
-    table = Table("runtime", "standby", "p50 [s]", "p99 [s]", "starts", title="Request to first velocity command")
+    moves = any(row.moving_p50_s is not None for row in rows)
+    more = ("moving p50 [s]", "moving p99 [s]") if moves else ()
+    title = "Request to first velocity command"
+    table = Table("runtime", "standby", "p50 [s]", "p99 [s]", *more, "starts", title=title)
     for row in rows:
-        table.add_row(row.runtime, str(row.standby), f"{row.p50_s:.3f}", f"{row.p99_s:.3f}", str(row.n))
+        times = (row.p50_s, row.p99_s, *((row.moving_p50_s, row.moving_p99_s) if moves else ()))
+        shown = ("" if time is None else f"{time:.3f}" for time in times)
+        table.add_row(row.runtime, str(row.standby), *shown, str(row.n))
     console.print(table)
 
 

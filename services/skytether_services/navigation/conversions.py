@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,11 @@ from skytether.messages import Pose as PoseMessage
 from .costmap import INSCRIBED, Costmap
 from .geometry import Pose
 from .grid_map import MAX_CELLS, GridMap
-from .mapping_mode import MappingMode
 from .navigator import Report
 from .whereabouts import Whereabouts
+
+if TYPE_CHECKING:
+    from .mapping_mode import MappingMode
 
 MAP_FRAME = "map"
 SHOWN_PATH = 500

@@ -18,7 +18,6 @@ from skytether.api.grant import GRANT_VARIABLE, Grant
 from skytether.api.manifest import TopicSpec
 from skytether.api.rest import SiteCreate
 from skytether.lab.bench.pair import BenchError
-from skytether.lab.demo import SERVICE
 from skytether.lab.embedded import EmbeddedOrchestrator
 
 _LIMIT_S = 60.0
@@ -31,12 +30,13 @@ _PORT = 7600
 class ServiceImage:
     """What a site of the benchmark runs."""
 
+    service: str
     image: str
     topics: tuple[TopicSpec, ...]
 
 
 @contextmanager
-def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str) -> Iterator[ServiceImage]:
+def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str, service: str) -> Iterator[ServiceImage]:
     """Make this machine's engine the only site, and remove what is left there in the end; gives what it runs.
 
     Raises:
@@ -46,19 +46,19 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str) -> Iterator[Ser
     options = {"owner": owner, "network": f"skytether-{owner}", "guard_image": f"{prefix}guard:1", "pull": "never"}
     if "DOCKER_HOST" in os.environ:  # as the command line has it
         options["engine"] = os.environ["DOCKER_HOST"]
-    image = f"{prefix}{SERVICE}:1"
+    image = f"{prefix}{service}:1"
     docker("image", "inspect", image, options["guard_image"])
     try:
         with Client(orchestrator.url, orchestrator.operator_token) as operator:
-            manifest = operator.get_service(SERVICE)
+            manifest = operator.get_service(service)
             spec = manifest.spec.model_copy(update={"image": image})
-            operator.put_service(SERVICE, manifest.model_copy(update={"spec": spec}))
+            operator.put_service(service, manifest.model_copy(update={"spec": spec}))
             operator.create_site(SiteCreate(name="docker", tier="edge", runtime="docker", options=options))
             operator.delete_site("local")
     except ApiError as error:
         raise BenchError(str(error)) from error
     try:
-        yield ServiceImage(image, manifest.spec.topics)
+        yield ServiceImage(service, image, manifest.spec.topics)
     finally:
         orchestrator.stop()
         _clean(owner, options["network"])
@@ -102,7 +102,7 @@ def docker_run(service: ServiceImage) -> float:
 def _grant(service: ServiceImage) -> Grant:
     return Grant(
         instance="bench",
-        service=SERVICE,
+        service=service.service,
         robot="bench",
         session_id=secrets.token_hex(8),
         session_key=base64.b64encode(secrets.token_bytes(32)).decode(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -12,12 +13,11 @@ from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, State
 from skytether.lab.bench.containers import docker_run, docker_site
 from skytether.lab.bench.pair import BenchError
-from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.bench.start_robots import ROBOTS, Asking, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.lab.trail import Trail
-from skytether.lab.walk import World
 from skytether.robot.agent import Agent, AgentConfig
 
+ROBOT = "robot"
 _LIMIT_S = 60.0
 _LOOK_S = 0.005
 _REST_S = 3.0
@@ -34,6 +34,8 @@ class StartRow:
         p50_s: Median time from request to first command [s].
         p99_s: 99th percentile (the largest, when there are fewer than 100) [s].
         n: Starts measured.
+        moving_p50_s: Median time until the first command that moves the robot; None: it has no reason to move.
+        moving_p99_s: Its 99th percentile.
     """
 
     runtime: str
@@ -41,6 +43,8 @@ class StartRow:
     p50_s: float
     p99_s: float
     n: int
+    moving_p50_s: float | None = None
+    moving_p99_s: float | None = None
 
     def document(self) -> dict[str, object]:
         """For ``--json``."""
@@ -52,8 +56,9 @@ def bench_start(
     runtimes: Sequence[str] = ("process",),
     prefix: str = "skytether/",
     on_start: Callable[[str, float], None] = lambda *_: None,
+    service: str = "virtual-trail",
 ) -> list[StartRow]:
-    """Start ``n`` instances of virtual-trail one after the other, on orchestrators of our own.
+    """Start ``n`` instances of a service one after the other, on orchestrators of our own.
 
     Args:
         n: Starts of each kind.
@@ -61,65 +66,74 @@ def bench_start(
             until its service listens: no robot, no orchestrator, no limits.
         prefix: Of the images' names.
         on_start: Called with the row and the time of each start [s].
+        service: One of `ROBOTS`.
 
     Raises:
-        BenchError: An instance did not drive in time, or there is no such runtime.
+        BenchError: An instance did not drive in time, or there is no such runtime or service.
     """
-    rows = []
+    if service not in ROBOTS:
+        raise BenchError(f"no robot of the benchmark asks for '{service}'; there are some for {', '.join(ROBOTS)}")
+    asking, rows = ROBOTS[service](), []
     for runtime in runtimes:
         if runtime not in _STARTS:
             raise BenchError(f"there is no runtime '{runtime}' to measure; there are {', '.join(_STARTS)}")
-        seconds: dict[tuple[str, int], list[float]] = {}
-        for row, standby, took in _STARTS[runtime](n, prefix):
-            seconds.setdefault((row, standby), []).append(took)
+        starts: dict[tuple[str, int], list[tuple[float, float]]] = {}
+        for row, standby, took, moving in _STARTS[runtime](service, asking, n, prefix):
+            starts.setdefault((row, standby), []).append((took, moving))
             on_start(row, took)
-        for (row, standby), all_of_it in seconds.items():
-            p50, p99 = np.percentile(all_of_it, [50, 99], method="inverted_cdf")
-            rows.append(StartRow(row, standby, round(float(p50), 4), round(float(p99), 4), n))
+        for (row, standby), all_of_it in starts.items():
+            (p50, moving_p50), (p99, moving_p99) = np.percentile(all_of_it, [50, 99], axis=0, method="inverted_cdf")
+            moving = (_seconds(moving_p50), _seconds(moving_p99)) if math.isfinite(moving_p99) else (None, None)
+            rows.append(StartRow(row, standby, _seconds(p50), _seconds(p99), n, *moving))
     return rows
 
 
-def _process(n: int, prefix: str) -> Iterator[_Start]:  # noqa: ARG001 (processes have no image)
+_Start = tuple[str, int, float, float]
+"""Row, instances kept warm, seconds to the first command, and to the first that moves: NaN where there is none."""
+
+
+def _process(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Start]:  # noqa: ARG001 (without image)
     with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
-        for standby, took in _starts(operator, orchestrator.url, n):
-            yield "process", standby, took
+        for standby, *took in _starts(operator, orchestrator.url, service, asking, n):
+            yield "process", standby, *took
 
 
-def _docker(n: int, prefix: str) -> Iterator[_Start]:
+def _docker(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Start]:
     with (
         EmbeddedOrchestrator() as orchestrator,
-        docker_site(orchestrator, prefix) as service,
+        docker_site(orchestrator, prefix, service) as image,
         Client(orchestrator.url, orchestrator.operator_token) as operator,
     ):
-        for standby, took in _starts(operator, orchestrator.url, n, _REST_S):
-            yield "docker", standby, took
+        for standby, *took in _starts(operator, orchestrator.url, service, asking, n, _REST_S):
+            yield "docker", standby, *took
             if not standby:
                 time.sleep(_REST_S)
-                yield "docker run", 0, docker_run(service)
+                yield "docker run", 0, docker_run(image), math.nan
 
 
-_Start = tuple[str, int, float]
-"""Row, instances kept warm, seconds."""
 _STARTS = {"process": _process, "docker": _docker}
 
 
-def _starts(operator: Client, url: str, n: int, rest_s: float = 0.0) -> Iterator[tuple[int, float]]:
+def _starts(
+    operator: Client, url: str, service: str, asking: Asking, n: int, rest_s: float = 0.0
+) -> Iterator[tuple[int, float, float]]:
     """Cold starts, each after a rest, then as many with an instance kept warm."""
-    token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
-    config = AgentConfig(robot=ROBOT, url=url, token=token, service=SERVICE, bind=("127.0.0.1", 0))
+    token = operator.create_robot(RobotCreate(name=ROBOT, services=(service,))).token
+    config = AgentConfig(ROBOT, url, service, token, params=asking.params, bind=("127.0.0.1", 0))
     for standby in (0, 1):
-        manifest = operator.get_service(SERVICE)
+        manifest = operator.get_service(service)
         needs = manifest.spec.needs.model_copy(update={"standby": standby})
         spec = manifest.spec.model_copy(update={"needs": needs})
-        operator.put_service(SERVICE, manifest.model_copy(update={"spec": spec}))
+        operator.put_service(service, manifest.model_copy(update={"spec": spec}))
         for _ in range(n):
             if standby:
                 _until_warm(operator)
             else:
                 time.sleep(rest_s)
-            with Agent(config, WalkerBase(World(Trail(), seed=1))) as agent:
-                took = _first_command(agent)
-            yield standby, took
+            watch = Watch()
+            with asking.agent(config, watch) as agent:
+                took = _first_command(agent, watch if asking.moves else None)
+            yield standby, *took
 
 
 def _until_warm(operator: Client) -> None:
@@ -134,11 +148,18 @@ def _until_warm(operator: Client) -> None:
         time.sleep(_LOOK_S)
 
 
-def _first_command(agent: Agent) -> float:
+def _first_command(agent: Agent, watch: Watch | None) -> tuple[float, float]:
+    """Seconds until the first command, and until the first that moves the robot, where that is watched for."""
     deadline = time.monotonic() + _LIMIT_S
     while time.monotonic() < deadline:
         status = agent.status()
-        if status.driver.first_command_at is not None and status.asked_at is not None:
-            return status.driver.first_command_at - status.asked_at
+        asked, first = status.asked_at, status.driver.first_command_at
+        moved = watch.moved_at if watch is not None else math.nan
+        if asked is not None and first is not None and moved is not None:
+            return first - asked, moved - asked
         time.sleep(_LOOK_S)
     raise BenchError(f"no command within {_LIMIT_S:.0f} s: {agent.status().trouble or 'the service is silent'}")
+
+
+def _seconds(value: float) -> float:
+    return round(float(value), 4)
