@@ -83,8 +83,8 @@ def bench_start(
             on_start(row, took)
         for (row, standby), all_of_it in starts.items():
             (p50, moving_p50), (p99, moving_p99) = np.percentile(all_of_it, [50, 99], axis=0, method="inverted_cdf")
-            moving = (_seconds(moving_p50), _seconds(moving_p99)) if math.isfinite(moving_p99) else (None, None)
-            rows.append(StartRow(row, standby, _seconds(p50), _seconds(p99), n, *moving))
+            times = (_seconds(moving_p50), _seconds(moving_p99)) if math.isfinite(moving_p99) else (None, None)
+            rows.append(StartRow(row, standby, _seconds(p50), _seconds(p99), n, *times))
     return rows
 
 
@@ -94,8 +94,8 @@ _Start = tuple[str, int, float, float]
 
 def _process(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Start]:  # noqa: ARG001 (without image)
     with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
-        for standby, *took in _starts(operator, orchestrator.url, service, asking, n):
-            yield "process", standby, *took
+        for standby, took, moving in _starts(operator, orchestrator.url, service, asking, n):
+            yield "process", standby, took, moving
 
 
 def _docker(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Start]:
@@ -104,8 +104,8 @@ def _docker(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Star
         docker_site(orchestrator, prefix, service) as image,
         Client(orchestrator.url, orchestrator.operator_token) as operator,
     ):
-        for standby, *took in _starts(operator, orchestrator.url, service, asking, n, _REST_S):
-            yield "docker", standby, *took
+        for standby, took, moving in _starts(operator, orchestrator.url, service, asking, n, _REST_S):
+            yield "docker", standby, took, moving
             if not standby:
                 time.sleep(_REST_S)
                 yield "docker run", 0, docker_run(image), math.nan
@@ -132,8 +132,8 @@ def _starts(
                 time.sleep(rest_s)
             watch = Watch()
             with asking.agent(config, watch) as agent:
-                took = _first_command(agent, watch if asking.moves else None)
-            yield standby, *took
+                took, moving = _first_command(agent, watch if asking.moves else None)
+            yield standby, took, moving
 
 
 def _until_warm(operator: Client) -> None:
