@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .patch import REACH, Patch, make_patch
 from .pose_graph import Edges, optimise
 from .poses import between, compose, wrap
 from .scan_following import match_next, odometry_information, turned
-from .scan_matching import REACH, Fit, Patch, make_patch, moved, rate, refine, scan_points, search, thin
+from .scan_matching import Fit, moved, rate, refine, scan_points, search, thin
 
 Floats = NDArray[np.float64]
 

@@ -42,13 +42,17 @@ def kld_count(bins: int, error: float, quantile: float) -> int:
     return math.ceil((bins - 1) / (2 * error) * (1 - part + math.sqrt(part) * quantile) ** 3)
 
 
+@compiled
 def bin_keys(particles: Array, cell: float, turn: float) -> NDArray[np.int64]:
     """A number for the bin of each particle: ``cell`` by ``cell`` [m] by ``turn`` [rad]."""
     turns = max(1, round(2 * math.pi / turn))
-    x = np.floor(particles[:, 0] / cell).astype(np.int64) + 2**20
-    y = np.floor(particles[:, 1] / cell).astype(np.int64) + 2**20
-    heading = np.floor((particles[:, 2] + math.pi) / (2 * math.pi) * turns).astype(np.int64) % turns
-    return (x * 2**21 + y) * turns + heading
+    keys = np.empty(particles.shape[0], np.int64)
+    for index in range(particles.shape[0]):
+        x = math.floor(particles[index, 0] / cell) + 2**20
+        y = math.floor(particles[index, 1] / cell) + 2**20
+        heading = math.floor((particles[index, 2] + math.pi) / (2 * math.pi) * turns) % turns
+        keys[index] = (x * 2**21 + y) * turns + heading
+    return keys
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,21 @@ class Cluster:
     mean: Array
     covariance: Array
     weight: float
+
+
+@compiled
+def _heaviest(keys: NDArray[np.int64], weights: Array) -> int:
+    """The key whose entries weigh most; of equals the least."""
+    order = np.argsort(keys, kind="mergesort")
+    best, most, total = keys[order[0]], -1.0, 0.0
+    for place in range(keys.shape[0]):
+        key = keys[order[place]]
+        total += weights[order[place]]
+        if place + 1 == keys.shape[0] or keys[order[place + 1]] != key:
+            if total > most:
+                best, most = key, total
+            total = 0.0
+    return int(best)
 
 
 @compiled
@@ -86,9 +105,8 @@ def heaviest_cluster(particles: Array, weights: Array, radius: float, turn: floa
         radius: How far from its middle a cluster reaches [m].
         turn: And in heading [rad].
     """
-    _, index = np.unique(bin_keys(particles, radius, turn), return_inverse=True)
-    sums = np.bincount(index, weights)
-    mean, covariance, weight = _moments(particles, weights, index == int(sums.argmax()))
+    keys = bin_keys(particles, radius, turn)
+    mean, covariance, weight = _moments(particles, weights, keys == _heaviest(keys, weights))
     for _ in range(2):
         inside = _within(particles, mean, radius, turn)
         if not inside.any():

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from .patch import Patch
 from .poses import compose
-from .scan_matching import Fit, Floats, Patch, rate, refine, search, thin
+from .scan_matching import Fit, Floats, rate, refine, search, thin
 
 FEWEST = 10
 """Points that a scan must have to be matched."""

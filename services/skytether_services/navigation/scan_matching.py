@@ -1,135 +1,22 @@
 """Finding where a laser scan was taken: against a patch of map that other scans made.
 
-A `Patch` is a grid that knows, around each surface, how near and which the nearest piece of surface is. `search` looks
-through a window of poses by the likelihood field of it, from coarse to fine (Olson, Real-time correlative scan
-matching, 2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine` moves points onto
-lines (Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [m], y [m], theta [rad]).
+`search` looks through a window of poses by the patch's likelihood field, from coarse to fine (Olson, Real-time
+correlative scan matching, 2009; bounds as in Hess et al., Real-time loop closure in 2D lidar SLAM, 2016); `refine`
+moves points onto lines (Censi, An ICP variant using a point-to-line metric, 2008). Poses are (x [m], y [m], theta
+[rad]).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .compiled import compiled
+from .patch import CELL, Patch
 
 Floats = NDArray[np.float64]
-
-CELL = 0.05
-"""Side of a cell [m]."""
-REACH = 8
-"""Cells around a surface that know it: 0.4 m."""
-SIGMA = 0.1
-"""Of the likelihood field [m]: what a pose a step of the search away still scores."""
-_MERGE = 2
-"""Cells that make one piece of surface, along each axis."""
-_MAX_CELLS = 4_000_000
-"""Of a patch: 100 m by 100 m."""
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A piece of map for matching.
-
-    Attributes:
-        origin: Corner of cell (0, 0) [m].
-        squares: Rows by columns, float32: squared distance to the nearest surface [cells²], 1e9 where none is near.
-        nearest: Rows by columns, int32: number of the nearest surface, -1 where none is near.
-        surfaces: Number by (x, y, nx, ny): mean position and unit normal (0, 0 without one).
-    """
-
-    origin: tuple[float, float]
-    squares: NDArray[np.float32]
-    nearest: NDArray[np.int32]
-    surfaces: Floats
-
-    @cached_property
-    def score(self) -> NDArray[np.uint8]:
-        """Rows by columns: 255 on a surface, exp(-d² / 2 SIGMA²) of that at d. Made when it is asked for first."""
-        # Where a robot is followed scan by scan it is hardly ever asked for.
-        return _likelihood(self.squares, CELL, SIGMA)
-
-
-def make_patch(points: Floats, reach: int = REACH) -> Patch:
-    """A patch of points with normals.
-
-    Args:
-        points: n by (x, y, nx, ny) in the map frame; a normal of (0, 0) is not known.
-        reach: Cells around a surface that know it.
-    """
-    margin = (reach + 1) * CELL
-    low = points[:, :2].min(axis=0) - margin
-    high = points[:, :2].max(axis=0) + margin
-    columns, rows = (np.ceil((high - low) / CELL).astype(int) + 1).tolist()
-    if rows * columns > _MAX_CELLS:
-        middle = np.median(points[:, :2], axis=0)
-        half = np.sqrt(_MAX_CELLS) * CELL / 2 - margin
-        return make_patch(points[(np.abs(points[:, :2] - middle) < half).all(axis=1)], reach)
-    squares, nearest, surfaces = _fill(points, low[0], low[1], rows, columns, CELL, reach, _MERGE)
-    return Patch((float(low[0]), float(low[1])), squares, nearest, surfaces)
-
-
-@compiled
-def _fill(
-    points: Floats, x0: float, y0: float, rows: int, columns: int, cell: float, reach: int, merge: int
-) -> tuple[NDArray[np.float32], NDArray[np.int32], Floats]:
-    wide, high = columns // merge + 1, rows // merge + 1
-    number = np.full((high, wide), -1, np.int32)
-    sums = np.zeros((points.shape[0], 5))
-    count = 0
-    for i in range(points.shape[0]):
-        c = int((points[i, 0] - x0) / (cell * merge))
-        r = int((points[i, 1] - y0) / (cell * merge))
-        k = number[r, c]
-        if k < 0:
-            k = count
-            number[r, c] = k
-            count += 1
-        # Both sides of a thin wall are in a cell: keep the side seen first.
-        elif sums[k, 2] * points[i, 2] + sums[k, 3] * points[i, 3] < 0:
-            continue
-        sums[k, 0] += points[i, 0]
-        sums[k, 1] += points[i, 1]
-        sums[k, 2] += points[i, 2]
-        sums[k, 3] += points[i, 3]
-        sums[k, 4] += 1
-    surfaces = np.zeros((count, 4))
-    squares = np.full((rows, columns), np.float32(1e9), np.float32)
-    nearest = np.full((rows, columns), np.int32(-1), np.int32)
-    for k in range(count):
-        x, y = sums[k, 0] / sums[k, 4], sums[k, 1] / sums[k, 4]
-        surfaces[k, 0], surfaces[k, 1] = x, y
-        norm = np.sqrt(sums[k, 2] ** 2 + sums[k, 3] ** 2)
-        if norm > 0.5 * sums[k, 4]:
-            surfaces[k, 2], surfaces[k, 3] = sums[k, 2] / norm, sums[k, 3] / norm
-        u, v = (x - x0) / cell - 0.5, (y - y0) / cell - 0.5
-        c, r = int(u + 0.5), int(v + 0.5)
-        for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
-            for cc in range(max(c - reach, 0), min(c + reach + 1, columns)):
-                square = (cc - u) ** 2 + (rr - v) ** 2
-                if square < squares[rr, cc] and square <= reach * reach:
-                    squares[rr, cc] = square
-                    nearest[rr, cc] = k
-    return squares, nearest, surfaces
-
-
-@compiled
-def _likelihood(squares: NDArray[np.float32], cell: float, sigma: float) -> NDArray[np.uint8]:
-    # Farther than four standard deviations nothing is left of 255.
-    table = np.empty(int(4 * (4 * sigma / cell) ** 2) + 1, np.uint8)
-    for i in range(table.size):
-        table[i] = np.uint8(255 * np.exp(-(i / 4) * cell * cell / (2 * sigma * sigma)))
-    rows, columns = squares.shape
-    score = np.zeros((rows, columns), np.uint8)
-    for r in range(rows):
-        for c in range(columns):
-            quarter = squares[r, c] * 4
-            if quarter < table.size:
-                score[r, c] = table[int(quarter)]
-    return score
 
 
 @compiled
@@ -457,7 +344,8 @@ def _points(ranges: Floats, xs: Floats, ys: Floats, max_range: float, min_range:
             j = i + side
             lost = 0
             while 0 <= j < n and lost < 2 and abs(j - i) <= 12:
-                if min_range < ranges[j] < max_range and np.hypot(xs[j] - xs[i], ys[j] - ys[i]) < reach:
+                square = (xs[j] - xs[i]) ** 2 + (ys[j] - ys[i]) ** 2
+                if min_range < ranges[j] < max_range and square < reach * reach:
                     sx += xs[j]
                     sy += ys[j]
                     sxx += xs[j] ** 2
@@ -483,10 +371,22 @@ def _points(ranges: Floats, xs: Floats, ys: Floats, max_range: float, min_range:
 
 def thin(points: Floats, cell: float) -> Floats:
     """At most one point for each cell of that size [m]: near surfaces have no more say than far ones."""
-    keys = np.floor(points[:, :2] / cell).astype(np.int64)
-    _, first = np.unique(keys[:, 0] * 2_000_003 + keys[:, 1], return_index=True)
-    kept: Floats = points[np.sort(first)]
+    kept: Floats = points[_firsts(points, cell)]
     return kept
+
+
+@compiled
+def _firsts(points: Floats, cell: float) -> NDArray[np.bool_]:
+    """Which points are the first ones of their cells."""
+    n = points.shape[0]
+    keys = np.empty(n, np.int64)
+    for i in range(n):
+        keys[i] = int(np.floor(points[i, 0] / cell)) * 2_000_003 + int(np.floor(points[i, 1] / cell))
+    order = np.argsort(keys, kind="mergesort")
+    first = np.zeros(n, np.bool_)
+    for i in range(n):
+        first[order[i]] = i == 0 or keys[order[i]] != keys[order[i - 1]]
+    return first
 
 
 def moved(points: Floats, pose: Floats) -> Floats:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether_services.navigation.patch import Patch, PatchMemory, make_patch
 from skytether_services.navigation.poses import between, compose
 from skytether_services.navigation.scan_following import FEWEST, match_next, odometry_information, turned
-from skytether_services.navigation.scan_matching import Patch, make_patch, moved, thin
+from skytether_services.navigation.scan_matching import moved, thin
 
 Array = NDArray[np.float64]
 
@@ -100,12 +101,15 @@ class ScanOdometry:
         self.keys: deque[KeyScan] = deque(maxlen=self.params.key_scans)
         self.kept = 0
         self._patch: Patch | None = None
+        self._memory = PatchMemory()
+        self._poses: Array = np.zeros((0, 3))
         self._last: Array = np.zeros(3)
         self._strange = 0
 
     def forget(self) -> None:
         """Begin anew: the next scan continues nothing."""
         self.keys.clear()
+        self._poses = np.zeros((0, 3))
         self._patch = None
         self._strange = 0
 
@@ -153,7 +157,8 @@ class ScanOdometry:
         thinned = thin(points, 0.05)
         self.keys.append(KeyScan(self.pose, thinned, moved(thinned, self.pose)))
         self.kept += 1
-        poses = np.array([key.pose for key in self.keys])
-        far = np.hypot(poses[:, 0] - self.pose[0], poses[:, 1] - self.pose[1])
+        # Of the keys, in their order.
+        self._poses = np.vstack((self._poses[max(len(self._poses) + 1 - params.key_scans, 0) :], self.pose))
+        far = np.hypot(self._poses[:, 0] - self.pose[0], self._poses[:, 1] - self.pose[1])
         near = np.argsort(far, kind="stable")[: params.near_scans]
-        self._patch = make_patch(np.vstack([self.keys[index].placed for index in near]))
+        self._patch = make_patch(np.vstack([self.keys[index].placed for index in near]), memory=self._memory)

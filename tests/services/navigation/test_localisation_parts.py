@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from skytether_services.navigation.bench_localisation import noisy_steps, scan_points
 from skytether_services.navigation.global_search import distinct
@@ -22,7 +23,7 @@ from skytether_services.navigation.likelihood_field import (
 from skytether_services.navigation.localisation import LocalisationParams, lead_needed
 from skytether_services.navigation.motion_model import move_particles
 from skytether_services.navigation.occupancy import Beams, beam_ends
-from skytether_services.navigation.particles import bin_keys, kld_count, low_variance_sample, moments
+from skytether_services.navigation.particles import bin_keys, heaviest_cluster, kld_count, low_variance_sample, moments
 from skytether_services.navigation.poses import between, compose, wrap
 
 
@@ -60,6 +61,14 @@ def test_bins_tell_places_and_headings_apart() -> None:
     keys = bin_keys(particles, 0.25, math.pi / 18)
     assert keys[0] == keys[1]
     assert len(set(keys.tolist())) == 4
+
+
+def test_the_heaviest_place_counts_not_the_one_with_most_particles() -> None:
+    many, few = np.tile([0.1, 0.1, 0.0], (30, 1)), np.array([[5.1, 5.1, 1.0], [5.2, 5.2, 1.1], [5.3, 5.1, 0.9]])
+    weights = np.concatenate((np.full(30, 0.4 / 30), [0.2, 0.2, 0.2]))
+    cluster = heaviest_cluster(np.concatenate((many, few)), weights, 0.6, math.radians(30))
+    np.testing.assert_allclose(cluster.mean, [5.2, 15.4 / 3, 1.0], atol=1e-9)
+    assert cluster.weight == pytest.approx(0.6)
 
 
 def test_the_mean_of_headings_goes_through_the_back() -> None:

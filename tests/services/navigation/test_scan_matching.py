@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.mapping import find_trajectory
+from skytether_services.navigation.patch import CELL, PatchMemory, make_patch
 from skytether_services.navigation.poses import between
-from skytether_services.navigation.scan_matching import make_patch, moved, rate, refine, scan_points, search, thin
+from skytether_services.navigation.scan_matching import moved, rate, refine, scan_points, search, thin
 
 pytestmark = pytest.mark.slow
 
@@ -40,6 +41,42 @@ def test_normals_look_at_the_laser() -> None:
     known = np.hypot(points[:, 2], points[:, 3]) > 0
     assert known.mean() > 0.9
     assert len(scan_points(np.array([1, np.nan, 30, 0], np.float32), ANGLES[:4], 30.0)) == 1
+
+
+def test_a_patch_knows_the_nearest_surface_and_how_far_it_is() -> None:
+    reach = 5
+    patch = make_patch(moved(scan_points(room(np.zeros(3)), ANGLES, 30.0), np.zeros(3)), reach)
+    rows, columns = patch.squares.shape
+    middles = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1) * CELL + patch.origin
+    # The slow way: each cell's middle against each surface.
+    squares = ((middles[:, :, None] - patch.surfaces[:, :2]) ** 2).sum(axis=3) / CELL**2
+    near = squares.min(axis=2) <= reach**2
+    np.testing.assert_allclose(patch.squares[near], squares.min(axis=2)[near], atol=1e-3)
+    assert (patch.squares[~near] > reach**2).all()
+    assert (patch.nearest[~near] == -1).all()
+    found = np.take_along_axis(squares, np.maximum(patch.nearest, 0)[:, :, None].astype(int), axis=2)[:, :, 0]
+    np.testing.assert_allclose(found[near], squares.min(axis=2)[near], atol=1e-3)
+
+
+def test_a_patch_in_used_memory_has_nothing_of_the_one_before_it() -> None:
+    points = moved(scan_points(room(np.zeros(3)), ANGLES, 30.0), np.zeros(3))
+    memory, part = PatchMemory(), points[:120]
+    before = make_patch(points, memory=memory)
+    again, alone = make_patch(part, memory=memory), make_patch(part)
+    assert np.shares_memory(again.squares, before.squares)
+    assert np.shares_memory(again.nearest, before.nearest)
+    np.testing.assert_array_equal(again.squares, alone.squares)
+    np.testing.assert_array_equal(again.nearest, alone.nearest)
+    np.testing.assert_array_equal(again.surfaces, alone.surfaces)
+    assert not np.shares_memory(alone.squares, make_patch(part).squares)
+
+
+def test_of_the_points_in_a_cell_the_first_one_stays() -> None:
+    points = np.array(
+        [[0.01, 0.01, 1, 0], [-0.01, 0.01, 0, 1], [0.09, 0.02, 0, 1], [0.1, 0.01, 1, 0], [-0.02, 0, 1, 0]]
+    )
+    np.testing.assert_array_equal(thin(points, 0.1), points[[0, 1, 3]])
+    assert len(thin(points[:0], 0.1)) == 0
 
 
 def test_refined_to_a_millimetre_and_the_search_finds_what_is_far() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.poses import between, compose
 from skytether_services.navigation.scan_matching import scan_points, with_normals
-from skytether_services.navigation.scan_odometry import ScanOdometry
+from skytether_services.navigation.scan_odometry import ScanOdometry, ScanOdometryParams
 
 from .test_scan_matching import ANGLES, room
 
@@ -48,6 +48,18 @@ def test_scans_that_continue_nothing_break_it_and_then_it_goes_on() -> None:
     assert broken == [False] * (odometry.params.strange - 1) + [True, False]
     # The room was forgotten, and is still counted.
     assert (len(odometry.keys), odometry.kept) == (1, 2)
+
+
+def test_scans_that_were_dropped_are_not_matched_with() -> None:
+    truth = drive(60)
+    odometry = ScanOdometry(ScanOdometryParams(key_scans=4, near_scans=2))
+    odometry.update(np.zeros(3), scan_points(room(truth[0]), ANGLES, 30.0))
+    for before, after in pairwise(truth):
+        moved = odometry.update(between(before, after), scan_points(room(after), ANGLES, 30.0))
+        assert moved.overlap > 0.6
+    assert len(odometry.keys) == 4
+    assert odometry.kept > 12
+    np.testing.assert_allclose(odometry.pose, between(truth[0], truth[-1]), atol=0.05)
 
 
 def test_normals_do_not_depend_on_where_the_robot_has_its_laser() -> None:
