@@ -102,7 +102,7 @@ def _bounds(points: Floats) -> Floats:
 def _stamp(
     squares: NDArray[np.float32],
     nearest: NDArray[np.int32],
-    number: int,
+    number: np.int32,
     u: float,
     v: float,
     reach: int,
