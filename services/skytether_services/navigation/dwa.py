@@ -23,6 +23,14 @@ from .footprint import Footprint, FootprintChecks, footprint_cost
 from .geometry import Pose, advance, wrap
 
 _INSCRIBED, _LETHAL, _UNKNOWN = INSCRIBED, LETHAL, UNKNOWN
+_TURN_STEP = 0.05
+"""Between headings that are checked of a turn on the spot [rad]."""
+_STANDS = 0.05
+"""A robot that is slower stands [m/s]."""
+_SETTLED = 0.3
+"""A turn on the spot ends slower than this: of the scores for an arc none would end it [rad/s]."""
+_SLOW = 0.2
+"""As fast the robot drives away from what keeps it from turning [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -216,12 +224,18 @@ class Dwa(PathController):
         error = wrap(math.atan2(ahead[1] - pose.y, ahead[0] - pose.x) - pose.yaw) if away > 0.1 else 0.0
         # The last piece is too short for an arc: face the goal, then go straight.
         ease = self._params.turn_until / self._params.turn_from if near < self._params.front else 1.0
-        limit = self._params.turn_until if self._turning else self._params.turn_from
-        self._turning = abs(error) > limit * ease
+        # One that stands turns first: what it can reach at once ends in so few cells that to stand may seem the best.
+        limit = self._params.turn_until if self._turning or abs(velocity.linear) < _STANDS else self._params.turn_from
+        still_turning = self._turning and abs(velocity.angular) > _SETTLED
+        self._turning = abs(error) > limit * ease or still_turning
         if self._turning:
-            control = self._turn(pose, velocity, costmap, error)
+            # So far it has to turn; the rest is for an arc.
+            control = self._turn(pose, velocity, costmap, error, self._params.turn_until * ease)
             if control.status is ControlStatus.DRIVING:
                 return control
+            away_from_it = self._make_room(pose, velocity, costmap, speed_limit)
+            if away_from_it is not None:
+                return away_from_it
         return self._choose(pose, velocity, costmap, poses, path.left(), speed_limit)
 
     def _choose(
@@ -277,24 +291,86 @@ class Dwa(PathController):
         self._rate = w
         return Control(Velocity(v, w), ControlStatus.DRIVING, self._trajectory(pose, Velocity(v, w)))
 
-    def _turn(self, pose: Pose, velocity: Velocity, costmap: Costmap, error: float) -> Control:
-        """On the spot, after braking, where there is room for it."""
+    def _turn(self, pose: Pose, velocity: Velocity, costmap: Costmap, error: float, enough: float = 0.0) -> Control:
+        """On the spot, after braking, where there is room for it; the long way round where only that is free.
+
+        Args:
+            pose: Of the robot.
+            velocity: Likewise.
+            costmap: Around it.
+            error: Desired minus actual yaw [rad].
+            enough: It need not come nearer to it than this [rad].
+        """
         limits, dt = self._limits, self._params.period
+        error = wrap(error)
+        rest = max(abs(error) - enough, 0.0)
+        if not self._is_turn_free(pose, costmap, math.copysign(rest, error)):
+            round_it = error - math.copysign(math.tau, error)
+            if not self._is_turn_free(pose, costmap, round_it + math.copysign(enough, error)):
+                self._rate = 0.0
+                return Control(STANDSTILL, ControlStatus.BLOCKED)
+            # Less than half a turn of it, so that it is that way which is taken; for more it is still the fastest.
+            error = math.copysign(min(abs(round_it), 0.9 * math.pi), round_it)
         linear = velocity.linear - math.copysign(
             min(limits.linear_acceleration * dt, abs(velocity.linear)), velocity.linear
         )
         rate = turn_towards(error, velocity.angular, limits, dt)
-        frame, samples, check_from = self._checks.on(costmap)
         trajectory = self._trajectory(pose, Velocity(linear, rate))[: math.ceil(0.5 / self._params.step)]
-        for x, y, yaw in trajectory:
-            cost = footprint_cost(
-                costmap.costs, frame[0], frame[1], frame[2], x, y, math.cos(yaw), math.sin(yaw), samples, check_from
-            )
-            if cost == LETHAL:
-                self._rate = 0.0
-                return Control(STANDSTILL, ControlStatus.BLOCKED)
+        if self._collides(trajectory, costmap):
+            self._rate = 0.0
+            return Control(STANDSTILL, ControlStatus.BLOCKED)
         self._rate = rate
         return Control(Velocity(linear, rate), ControlStatus.DRIVING, trajectory)
+
+    def _is_turn_free(self, pose: Pose, costmap: Costmap, turn: float) -> bool:
+        steps = math.ceil(abs(turn) / _TURN_STEP)
+        yaws = pose.yaw + turn * np.arange(1, steps + 1) / max(steps, 1)
+        return not self._collides(np.column_stack((np.full((steps, 2), pose[:2]), yaws)), costmap)
+
+    def _collides(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
+        frame, samples, check_from = self._checks.on(costmap)
+        return any(
+            footprint_cost(
+                costmap.costs, frame[0], frame[1], frame[2], x, y, math.cos(yaw), math.sin(yaw), samples, check_from
+            )
+            == LETHAL
+            for x, y, yaw in poses.tolist()
+        )
+
+    def _make_room(self, pose: Pose, velocity: Velocity, costmap: Costmap, speed_limit: float) -> Control | None:
+        """Away from what keeps the robot from turning on the spot; None: there is no such way.
+
+        A window of velocities that can be had at once tells nothing here: a robot that stands beside a wall gets
+        nowhere in it. So slow arcs of all radii are looked at, to where obstacles are farther off than here.
+        """
+        limits, params = self._limits, self._params
+        here = costmap.cell(pose.x, pose.y)
+        if here is None:
+            return None
+        costs = costmap.costs
+        room = np.where((costs < INSCRIBED) | (costs == UNKNOWN), costs, np.inf).astype(np.float32)
+        room[costs == UNKNOWN] = 0.0
+        ahead = max(min(_SLOW, limits.max_linear, speed_limit), 0.0)
+        linear = np.array([ahead, -min(limits.max_backward, ahead), ahead / 2])
+        angular = np.linspace(-limits.max_angular, limits.max_angular, params.angular_samples)
+        frame, samples, check_from = self._checks.on(costmap)
+        weights = np.array([0.5, 0.0, params.front, 0.0, params.change])
+        v, w, best = best_velocity(
+            np.array(pose), linear, angular, self._rate, np.array([params.horizon, params.step]),
+            costs, frame, samples, check_from, room, np.zeros_like(room), weights, np.array(pose[:2]), False,
+        )  # fmt: skip
+        if not best < room[here]:
+            return None
+        dv, dw = limits.linear_acceleration * params.period, limits.angular_acceleration * params.period
+        command = Velocity(
+            min(max(v, velocity.linear - dv), velocity.linear + dv),
+            min(max(w, velocity.angular - dw), velocity.angular + dw),
+        )
+        trajectory = self._trajectory(pose, command)
+        if self._collides(trajectory[: math.ceil(0.5 / params.step)], costmap):
+            return None
+        self._rate = w
+        return Control(command, ControlStatus.DRIVING, trajectory)
 
     def _trajectory(self, pose: Pose, velocity: Velocity) -> NDArray[np.float64]:
         times = np.arange(1, math.ceil(self._params.horizon / self._params.step) + 1) * self._params.step

@@ -214,6 +214,40 @@ def test_a_speed_zone_is_kept(name: str) -> None:
     assert velocity.linear > 0.15
 
 
+@pytest.mark.parametrize("round_trip", [0.0, 0.2])
+@pytest.mark.parametrize("heading", [math.pi, 0.97 * math.pi])
+def test_dwa_gets_away_from_a_wall_that_leaves_no_room_for_half_a_turn(heading: float, round_trip: float) -> None:
+    # The wall is 0.37 m from the robot's middle: its corners, 0.43 m away, do not get past it.
+    result = drive(
+        controller_of("dwa", BOX),
+        BOX,
+        start=Pose(3.0, 0.87, heading),
+        goal=Pose(4.0, 1.8, 0.0),
+        round_trip=round_trip,
+        delay=DelayParams(
+            linear_acceleration=LIMITS.linear_acceleration, angular_acceleration=LIMITS.angular_acceleration
+        ),
+    )
+    assert result.reached
+    assert result.touched == 0
+    assert result.seconds < 20
+    assert min(pose.x for pose in result.way) > 2.0, "it does not drive far off to turn"
+
+
+def test_dwa_that_stands_askew_turns_along_its_path_and_drives() -> None:
+    # Where a half turn had left it: the path leads off by 0.9 rad, less than what is turned on the spot at speed.
+    result = drive(
+        controller_of("dwa", BOX),
+        BOX,
+        start=Pose(2.744, 1.01, -0.339),
+        goal=Pose(4.0, 1.8, 0.0),
+        round_trip=0.0,
+        delay=DelayParams(),
+        limit=15.0,
+    )
+    assert result.reached
+
+
 def test_mppi_repeats_itself_with_the_same_seed() -> None:
     results = []
     for _ in range(2):
