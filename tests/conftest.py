@@ -142,6 +142,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             name = f"{item.path.relative_to(here).as_posix()}::{item.name}"
             if name.startswith(TOGETHER) and not name.startswith(ALONE):
                 item.add_marker(pytest.mark.together)
+            if item.get_closest_marker("flaky"):
+                raise pytest.UsageError(f"{name}: what may be run again stands in RERUN in tests/conftest.py, with why")
             if item.get_closest_marker("slow") and name.startswith(tuple(RERUN)):
                 item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=3))
 

@@ -73,6 +73,18 @@ def test_a_gate_that_is_started_anew_or_ended_later_is_left_alone(robot):
     assert not robot.made
 
 
+@pytest.mark.slow
+def test_who_may_write_where_the_robot_was_started_is_not_its_gate(tmp_path, monkeypatch):
+    for name in ("ctypes", "typer"):  # what the two programs on the way import
+        (tmp_path / f"{name}.py").write_text("open('came', 'w')\nraise SystemExit(77)\n")
+    monkeypatch.chdir(tmp_path)
+    safety = SimpleNamespace(place=lambda: tmp_path / "run", record_file=lambda: "record")
+    gate = OwnGate(tmp_path / "robot.yaml", safety, assumed=True)
+    with pytest.raises(GateError, match="the gate ended with status"):  # there is no robot.yaml
+        gate.wait()
+    assert not (tmp_path / "came").exists()
+
+
 class Started:
     """An own gate whose processes are played, in a folder that another guard may have."""
 

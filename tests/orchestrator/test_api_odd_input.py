@@ -11,7 +11,17 @@ import pytest
 from pydantic import ValidationError
 
 from skytether.api.client import ApiError
-from skytether.api.rest import MOST_COUNTED, MOST_TOPICS, Measurement, Renew, Report, RobotCreate, TopicReport
+from skytether.api.rest import (
+    MOST_COUNTED,
+    MOST_TOPICS,
+    GateReport,
+    Measurement,
+    Renew,
+    Report,
+    RobotCreate,
+    Share,
+    TopicReport,
+)
 from skytether.orchestrator.settings import Limits
 
 ASK = '{"robot": "walker", "service": "toy", "params": {"mass": %s}}'
@@ -84,6 +94,13 @@ def test_a_name_that_is_a_path_leads_nowhere_else(served: Any) -> None:
             operator.delete_site,
             operator.probe,
             operator.delete_robot,
+            lambda name: operator.stop_robot(name, "why"),
+            operator.stop_order,
+            lambda name: operator.acknowledge_stop(name, "order"),
+            lambda name: operator.acknowledge_stop("walker", name),
+            lambda name: operator.report_gate(name, GateReport()),
+            lambda name: operator.set_group(name, "hall"),
+            lambda name: operator.share(name, Share()),
             operator.rotate_token,
             operator.delete_token,
         ):

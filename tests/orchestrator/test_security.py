@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.orchestrator.security import SecretFileError, Secrets, TokenHash, new_token, secret_file
+from skytether.orchestrator.security import SecretFileError, Secrets, TokenHash, close_folder, new_token, secret_file
 
 
 def test_a_token_has_256_random_bits() -> None:
@@ -73,6 +73,21 @@ def test_a_folder_into_which_anybody_may_put_another_token_is_refused(tmp_path: 
         Secrets(folder)
     folder.chmod(0o1777)  # where nobody can take away what is there, as Kubernetes mounts secrets
     Secrets(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")
+def test_a_folder_that_another_user_made_where_all_may_is_not_taken(tmp_path: Path) -> None:
+    """Whose it is may replace the operator's token at any time."""
+    tmp_path.chmod(0o1777)
+    theirs = tmp_path / "skytether"
+    theirs.mkdir(mode=0o700)
+    os.chown(theirs, 54_321, 54_321)
+    for take in (Secrets, lambda folder: close_folder(folder, with_database=True)):
+        with pytest.raises(SecretFileError, match="skytether belongs to the user 54321, who may have made it"):
+            take(theirs)
+    assert list(theirs.iterdir()) == []
+    tmp_path.chmod(0o755)
+    Secrets(theirs)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")

@@ -319,8 +319,6 @@ class Client(Connection):
         """Tell what an instance's service shares, and hear what others of the group do; with the robot's token only."""
         return self._one(Neighbours, "POST", _at("instances", instance_id, "share"), share)
 
-    # Everything
-
     # Tokens
 
     def tokens(self) -> list[Token]:

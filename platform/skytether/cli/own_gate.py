@@ -19,7 +19,7 @@ def main(agent: int, config: str) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() == agent:
-        command = [sys.executable, "-m", "skytether.cli", "robot", "gate", config]
+        command = [sys.executable, "-P", "-m", "skytether.cli", "robot", "gate", config]
         os.execv(sys.executable, command)  # noqa: S606 - a list of arguments
 
 

@@ -135,7 +135,8 @@ class OwnGate:
             console.print(f"the gate (process {self._process.pid}) does not end; it is left as it is", markup=False)
 
     def _start(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "skytether.cli.own_gate", str(os.getpid()), str(self._config)]
+        # -P: whoever may write where the robot was started is not its gate.
+        command = [sys.executable, "-P", "-m", "skytether.cli.own_gate", str(os.getpid()), str(self._config)]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
 
     def _let_go(self, *, start: bool) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
-_START_TIMEOUT = 20.0
+_START_TIMEOUT = 60.0
 _STOP_TIMEOUT = 10.0
 
 
@@ -68,7 +68,7 @@ class EmbeddedOrchestrator:
         """
         address = self.state_dir / "address"
         address.unlink(missing_ok=True)
-        command = [sys.executable, "-m", "skytether.lab.tethered", "orchestrator", "run", "--stop-instances"]
+        command = [sys.executable, "-P", "-m", "skytether.lab.tethered", "orchestrator", "run", "--stop-instances"]
         command += ["--state-dir", str(self.state_dir), "--port", str(self._port)]
         self._let_go()
         with (self.state_dir / "orchestrator.log").open("ab") as log:

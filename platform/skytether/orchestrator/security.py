@@ -66,10 +66,11 @@ def close_folder(folder: Path, *, with_database: bool) -> None:
     """Make a folder that others cannot look into, or close one that is there, with the database in it.
 
     Raises:
-        SecretFileError: It cannot be closed; the text says what to do.
+        SecretFileError: It cannot be closed, or is another user's; the text says what to do.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_anothers(folder)
         for path, mode in ((folder, 0o700), *((folder / name, 0o600) for name in _DATABASE)):
             if path.exists() and stat.S_IMODE(path.stat().st_mode) & 0o077:
                 path.chmod(mode)
@@ -81,6 +82,16 @@ def close_folder(folder: Path, *, with_database: bool) -> None:
             f"the state folder {folder} cannot be closed to others ({error.strerror}): chmod 700 it, with an owner "
             f"who is to run the orchestrator, or give a folder within it: --state-dir {folder / 'state'}"
         ) from error
+
+
+def _refuse_anothers(folder: Path) -> None:
+    """Where everybody may make folders, somebody may have made this one to have what is put into it."""
+    owner, above = folder.stat().st_uid, folder.resolve().parent.stat().st_mode
+    if owner not in (0, os.geteuid()) and above & stat.S_IWOTH:
+        raise SecretFileError(
+            f"{folder} belongs to the user {owner}, who may have made it to be taken for another: name a folder where "
+            "not everybody may make some"
+        )
 
 
 def replace_secret(path: Path, content: bytes) -> None:
@@ -241,6 +252,7 @@ def _make_folder(folder: Path) -> None:
     """Make a folder for secrets that others cannot look into; one that is there others must not write to."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_anothers(folder)
         mode = folder.stat().st_mode
     except OSError as error:
         raise SecretFileError(f"cannot make the folder {folder} for secrets: {error.strerror}") from error

@@ -303,7 +303,7 @@ class PlayedRobot:
         with self.log.open("ab") as log:
             output = log.fileno() if self._output is None else self._output
             return subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                [sys.executable, "-P", "-m", module, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
