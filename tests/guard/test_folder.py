@@ -336,6 +336,47 @@ def test_wheels_of_another_user_have_a_folder_that_is_theirs(folder):
     theirs.close()
 
 
+@pytest.fixture
+def came_first(folder):
+    """A folder of another user, where everybody may make some; called, it is in one where only root may, as /run."""
+    theirs = folder / "driver"
+    theirs.mkdir()
+    os.chown(theirs, ANOTHER, ANOTHER)
+    folder.chmod(0o1777)
+    return theirs, lambda: folder.chmod(0o755)
+
+
+@root
+def test_whoever_made_the_folder_first_where_all_may_is_told_nothing(came_first):
+    theirs, make_it_theirs = came_first
+    path = str(theirs / "driver.sock")
+    wheels, line = SocketWheels(path), open_line(["unix", path])
+    with bind(path) as listens:
+        os.chown(path, ANOTHER, ANOTHER)
+        with pytest.raises(PermissionError, match="may not have the wheels"):
+            wheels.write(Velocity(0.1, 0))
+        with pytest.raises(PermissionError, match="may not have the enable signal"):
+            line.write(True)
+        make_it_theirs()
+        wheels.write(Velocity(0.1, 0))
+        line.write(True)
+        assert len([listens.recv(100), listens.recv(100)]) == 2
+    wheels.close()
+    line.close()
+
+
+@root
+def test_whoever_made_the_folder_first_where_all_may_is_not_heard(came_first):
+    theirs, make_it_theirs = came_first
+    for heard in ([], [("lock", Bool(True))]):
+        topics = Topics({"lock": Bool}, {})
+        at = SocketSensors(str(theirs / "sensors.sock"), bind(str(theirs / "estop.sock")), topics, lambda *_: None)
+        send_as(ANOTHER, ANOTHER, theirs / "sensors.sock", reading("lock"))
+        assert list(at.read()) == heard
+        at.close()
+        make_it_theirs()
+
+
 @root
 def test_what_another_user_tells_the_agent_is_not_the_gates_word(folder):
     link = GateLink(folder)

@@ -45,8 +45,15 @@ def objection(folder: str) -> str:
 
 
 def trusted(folder: str) -> tuple[int, ...]:
-    """The users who may be at the other end of a socket in a folder to which there is no objection."""
-    return (0, os.geteuid(), os.stat(folder).st_uid)
+    """The users who may be at the other end of a socket in a folder: root, the own one and the folder's owner.
+
+    The owner not where everybody may make folders: there it may be somebody who came first.
+    """
+    place, ours = os.path.realpath(folder), (0, os.geteuid())
+    owner = os.stat(place).st_uid
+    if owner in ours or _writable(os.lstat(os.path.dirname(place))):
+        return ours
+    return (*ours, owner)
 
 
 def peer(link: socket.socket) -> int:
