@@ -15,7 +15,7 @@ def conftest(request: pytest.FixtureRequest) -> Any:
 
 def test_a_test_that_asks_to_be_run_again_by_itself_is_refused(conftest: Any, request: pytest.FixtureRequest) -> None:
     request.node.add_marker(pytest.mark.flaky(reruns=1))
-    with pytest.raises(pytest.UsageError, match="test_reruns.py::.* stands in RERUN"):
+    with pytest.raises(pytest.UsageError, match=r"test_reruns.py::.* stands in RERUN"):
         conftest.pytest_collection_modifyitems([request.node])
 
 
