@@ -36,7 +36,7 @@ class Knows:
             raise UnauthenticatedError("a token is needed")
         return Principal(None, scopes=frozenset()) if token == "operator" else Principal(token)
 
-    def recent(self, token: str | None) -> Principal | None:
+    def recent(self, token: str | None, address: str) -> Principal | None:
         return self.lately.get(token or "")
 
     def spend(self, caller: Principal) -> None:

@@ -12,7 +12,7 @@ import pytest
 from skytether.api.client import ApiError, Client
 from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, SiteCreate, TokenCreate, TokenRotate
 from skytether.orchestrator.access import Access
-from skytether.orchestrator.errors import UnauthenticatedError
+from skytether.orchestrator.errors import TooManyError, UnauthenticatedError
 from skytether.orchestrator.security import Secrets
 from skytether.orchestrator.store import Store
 from skytether.orchestrator.throttle import Throttle
@@ -146,6 +146,25 @@ def test_a_token_ends_at_its_time_and_use_is_noted(store: Store, tmp_path: Any) 
     with pytest.raises(UnauthenticatedError, match="expired at 1970-01-01T00:17:40"):
         access.authenticate(token)
     assert store.tokens()[0].last_used_at == 1000.0
+
+
+def test_what_was_refused_a_moment_ago_is_refused_again_at_once_and_counted(store: Store, tmp_path: Any) -> None:
+    throttle = Throttle(0.001, 3, lambda: 0.0)
+    access = Access(store, Secrets(tmp_path), lambda: 1000.0, throttle)
+    assert access.recent("made-up", "10.0.0.1") is None
+    with pytest.raises(UnauthenticatedError, match="not known here"):
+        access.authenticate("made-up", "10.0.0.1")
+    with pytest.raises(UnauthenticatedError, match="not known here"):
+        access.recent("made-up", "10.0.0.1")
+    with pytest.raises(UnauthenticatedError, match="a token is needed"):
+        access.recent(None, "10.0.0.1")
+    with pytest.raises(TooManyError):
+        access.recent("made-up", "10.0.0.1")
+    with pytest.raises(UnauthenticatedError):
+        access.recent("made-up", "10.0.0.2")
+    _, token = access.register("walker", ("*",), ttl_s=None)
+    assert access.authenticate(token, "10.0.0.1").robot == "walker"
+    assert access.recent(token, "10.0.0.1").robot == "walker"
 
 
 def refused(call: Callable[[], Any]) -> int:

@@ -15,6 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 from skytether.api.rest import SCOPES, Scope
 
@@ -40,7 +41,10 @@ _SEEN_EVERY = 10.0
 
 _RECENT = 10.0
 """Seconds for which a token that was good is good enough to measure a round trip, and to read a renewal."""
+_UNKNOWN = 2.0
+"""Seconds for which a token that nobody knew is refused without another look into the database."""
 _MOST_RECENT = 4096
+_NO_TOKEN = "a token is needed: send `Authorization: Bearer TOKEN`"  # noqa: S105 - none
 _PER_REQUEST = 8192
 """Bytes of a body that count as another request: a renewal with a report on twenty topics."""
 
@@ -110,6 +114,8 @@ class Access:
         self._noted: dict[str, float] = {}
         self._recent: OrderedDict[str, tuple[Principal, float]] = OrderedDict()
         """Who showed a token, by its SHA-256, and the monotonic time when the database knew it last."""
+        self._unknown: OrderedDict[str, tuple[str, float]] = OrderedDict()
+        """Why a token was refused, likewise."""
 
     def authenticate(self, token: str | None, address: str = "") -> Principal:
         """Find out who asks.
@@ -125,8 +131,7 @@ class Access:
         try:
             principal = self.verify(token)
         except UnauthenticatedError:
-            if wait := self._throttle.wait(f"address {address}"):
-                raise TooManyError(wait) from None
+            self._spend_of(address)
             raise
         self.spend(principal)
         return principal
@@ -140,13 +145,12 @@ class Access:
         digest = _digest(token or "")
         try:
             principal = self._find(token)
-        except UnauthenticatedError:
+        except UnauthenticatedError as error:
             self._recent.pop(digest, None)
+            _keep(self._unknown, digest, str(error))
             raise
-        self._recent[digest] = principal, time.monotonic()
-        while len(self._recent) > _MOST_RECENT:
-            with contextlib.suppress(KeyError):  # another thread did
-                self._recent.popitem(last=False)
+        self._unknown.pop(digest, None)
+        _keep(self._recent, digest, principal)
         return principal
 
     def spend(self, principal: Principal) -> None:
@@ -158,14 +162,25 @@ class Access:
         if principal.robot is not None and (wait := self._throttle.wait(principal.owner)):
             raise TooManyError(wait, who=principal.owner)
 
-    def recent(self, token: str | None) -> Principal | None:
+    def _spend_of(self, address: str) -> None:
+        """Take a request of all who come from an address without a good token."""
+        if wait := self._throttle.wait(f"address {address}"):
+            raise TooManyError(wait) from None
+
+    def recent(self, token: str | None, address: str = "") -> Principal | None:
         """Who showed this token in the last seconds, at once: for what tells nothing that matters, takes no request.
 
         Raises:
+            UnauthenticatedError: It was refused a moment ago, or there is none: likewise without a wait.
             TooManyError: They asked too often; those who do are to cost as little as can be.
         """
-        principal, at = self._recent.get(_digest(token or ""), (None, 0.0))
-        if principal is None or time.monotonic() - at > _RECENT:
+        digest, now = _digest(token or ""), time.monotonic()
+        why, at = self._unknown.get(digest, ("", 0.0)) if token else (_NO_TOKEN, now)
+        if why and now - at <= _UNKNOWN:
+            self._spend_of(address)
+            raise UnauthenticatedError(why)
+        principal, at = self._recent.get(digest, (None, 0.0))
+        if principal is None or now - at > _RECENT:
             return None
         if principal.robot is not None and (wait := self._throttle.empty(principal.owner)):
             raise TooManyError(wait, who=principal.owner)
@@ -178,7 +193,7 @@ class Access:
 
     def _find(self, token: str | None) -> Principal:
         if not token:
-            raise UnauthenticatedError("a token is needed: send `Authorization: Bearer TOKEN`")
+            raise UnauthenticatedError(_NO_TOKEN)
         if self._secrets.is_operator(token):
             return Principal(None, scopes=frozenset(SCOPES))
         for row, robot in self._store.holders(token[:PREFIX_LENGTH]):
@@ -317,6 +332,15 @@ class Access:
         ends = now + ttl_s if ttl_s is not None else renews.ends_at if renews is not None else None
         family = renews.family if renews is not None else id_
         return TokenRow(id_, name, robot, scopes, TokenHash.of(token), now, ends, family=family, ends_at=ends), token
+
+
+def _keep(cache: OrderedDict[str, tuple[Any, float]], digest: str, what: Any) -> None:
+    """As the newest; the oldest goes."""
+    cache.pop(digest, None)
+    cache[digest] = what, time.monotonic()
+    while len(cache) > _MOST_RECENT:
+        with contextlib.suppress(KeyError):  # another thread did
+            cache.popitem(last=False)
 
 
 def _digest(token: str) -> str:

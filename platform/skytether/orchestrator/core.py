@@ -169,9 +169,9 @@ class Orchestrator:
             raise OutdatedError
         return self.access.authenticate(token, address)
 
-    def recent(self, token: str | None) -> Principal | None:
+    def recent(self, token: str | None, address: str) -> Principal | None:
         """Who showed this token in the last seconds: see ``Access.recent``. Does not wait."""
-        return None if self.refuses else self.access.recent(token)
+        return None if self.refuses else self.access.recent(token, address)
 
     def spend(self, caller: Principal) -> None:
         """Take a request of who was known a moment ago: see ``Access.spend``."""

@@ -60,8 +60,8 @@ class Doorman(Protocol):
             DomainError: Nobody, or too often.
         """
 
-    def recent(self, token: str | None) -> Principal | None:
-        """The same at once, if it was known a moment ago; takes no request, but raises as ``authenticate``."""
+    def recent(self, token: str | None, address: str) -> Principal | None:
+        """The same at once, if it was known a moment ago, or refused; takes no request of who was known."""
 
     def spend(self, caller: Principal) -> None:
         """Take a request of who was known a moment ago, at once.
@@ -166,7 +166,7 @@ class Reception:
         given = token.strip() if kind.lower() == "bearer" else None
         address = scope["client"][0] if scope.get("client") else ""
         run: Callable[..., Awaitable[Any]] = self._for_renewals.run if renewal else to_thread.run_sync
-        recent = self._doorman.recent(given)
+        recent = self._doorman.recent(given, address)
         caller: Principal
         if recent is None:
             caller = await self._for_strangers.run(self._doorman.authenticate, given, address)
