@@ -10,6 +10,7 @@ import typer
 from .lab_authentication import authentication
 from .lab_failover import alarms, failover
 from .lab_hostile import hostile
+from .lab_legs import legs
 from .lab_navigation import localisation, mapping, navigation
 from .lab_run import app as run_app
 from .lab_safety import safety
@@ -27,6 +28,7 @@ bench.command("authentication")(authentication)
 bench.command("mapping")(mapping)
 bench.command("localisation")(localisation)
 bench.command("navigation")(navigation)
+bench.command("legs")(legs)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 

@@ -182,8 +182,12 @@ class NavigationBenchError(Exception):
     """The benchmark's algorithm cannot be had; the text says why and what to do."""
 
 
-def load(name: str) -> Any:
+def load(name: str, extra: str = "navigation") -> Any:
     """Find an algorithm by the name of its entry point.
+
+    Args:
+        name: Of the entry point.
+        extra: What brings the libraries that it needs.
 
     Raises:
         NavigationBenchError: There is none of that name, or it cannot be imported.
@@ -197,7 +201,7 @@ def load(name: str) -> Any:
     except ImportError as error:
         raise NavigationBenchError(
             f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}; "
-            "install the extra: pip install 'skytether[navigation]'"
+            f"install the extra: pip install 'skytether[{extra}]'"
         ) from error
     except Exception as error:  # whatever a broken plug-in raises at import
         raise NavigationBenchError(f"benchmark '{name}' cannot be loaded from {found[name].value}: {error}") from error

@@ -1,0 +1,166 @@
+"""One person, or what may be one: where they are and how they walk, and what speaks for their being a person."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_ACCELERATION = 1.5
+"""How hard people change their walk, m/s^1.5 (square root of the power density of white acceleration)."""
+_TWO_LEGS = 0.06
+"""Standard deviation of the middle of two legs about the person's, m."""
+_ONE_LEG = 0.25
+"""Of one leg that is seen alone, m: a foot rests for half a second while the person goes on, and is no white noise."""
+_BORN = (0.15, 0.8)
+"""Standard deviations of place [m] and of each velocity [m/s] of one who was just found."""
+_WEIGHT = 0.12
+"""Of the newest scan in the share of legs seen."""
+_ONE = 0.5
+"""What one leg counts in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """What makes a person of a track.
+
+    Attributes:
+        scans: Since the track began, at the least.
+        way: Who has gone so far from where the track began walks [m].
+        speed: At no less than this on the whole [m/s]: what odometry or a wandering edge makes is slower.
+        seen: Share of the scans in which a walker was seen.
+        walker_legs: Share of legs seen of one who walks, 0 to 1 (both in all scans).
+        pair_scans: One who stands: so many scans, of which 60 % with both legs.
+        pair_legs: The same share, of one who stands.
+        pair_seen: Share of the scans in which one who stands was seen.
+        pair_trust: One who has stood for longer than this, and never walked, is furniture [s].
+    """
+
+    scans: int = 4
+    way: float = 0.6
+    speed: float = 0.6
+    seen: float = 0.7
+    walker_legs: float = 0.35
+    pair_scans: int = 5
+    pair_legs: float = 0.62
+    pair_seen: float = 0.8
+    pair_trust: float = 6.0
+
+
+@dataclass(slots=True)
+class Person:
+    """A track: constant velocity, disturbed by white acceleration (Bar-Shalom et al. 2001, section 6.2.2).
+
+    Attributes:
+        id: Never used twice.
+        state: x, y [m], vx, vy [m/s] in a frame that does not move.
+        covariance: Of it.
+        born_at: When the track began [s].
+        seen_at: When a leg of it was last seen [s].
+        walks: It has walked: a thing does not.
+        stands: Both legs were seen for a while, and it has not walked yet.
+        legs: Seen in the last scan: 0, 1 or 2.
+    """
+
+    id: int
+    state: Floats
+    covariance: Floats
+    born_at: float
+    seen_at: float
+    walks: bool = False
+    stands: bool = False
+    legs: int = 0
+    _born: Floats = field(default_factory=lambda: np.zeros(2))
+    _scans: int = 0
+    _seen: int = 0
+    _full: int = 0
+    _share: float = 0.5
+    _furthest: float = 0.0
+
+    @classmethod
+    def at(cls, number: int, place: Floats, now: float) -> Person:
+        """One who was just found at a place [m]."""
+        covariance = np.diag([_BORN[0] ** 2] * 2 + [_BORN[1] ** 2] * 2)
+        return cls(number, np.array([*place, 0.0, 0.0]), covariance, now, now, _born=np.array(place, np.float64))
+
+    @property
+    def place(self) -> Floats:
+        """(x, y) [m]."""
+        return self.state[:2]
+
+    @property
+    def velocity(self) -> Floats:
+        """(vx, vy) [m/s]."""
+        return self.state[2:]
+
+    @property
+    def known(self) -> bool:
+        """Whether it is taken for a person."""
+        return self.walks or self.stands
+
+    @property
+    def share(self) -> float:
+        """Of legs seen lately, 0 to 1."""
+        return self._share
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the place [m]."""
+        return math.sqrt((self.covariance[0, 0] + self.covariance[1, 1]) / 2)
+
+    def predict(self, dt: float) -> None:
+        """Walk on for dt seconds."""
+        q = _ACCELERATION**2
+        move = np.eye(4)
+        move[0, 2] = move[1, 3] = dt
+        noise = np.zeros((4, 4))
+        for axis in (0, 1):
+            noise[axis, axis] = q * dt**3 / 3
+            noise[axis, axis + 2] = noise[axis + 2, axis] = q * dt**2 / 2
+            noise[axis + 2, axis + 2] = q * dt
+        self.state = move @ self.state
+        self.covariance = move @ self.covariance @ move.T + noise
+
+    def look(self, legs: Floats, full: bool, now: float, proof: Proof) -> None:
+        """Take what a scan showed of it.
+
+        Args:
+            legs: n by (x, y) [m]; n is 0, 1 or 2.
+            full: Both legs are in it, be it in one cluster.
+            now: When [s].
+            proof: What makes it a person.
+        """
+        self._scans += 1
+        self.legs = 2 if full else len(legs)
+        self._share += _WEIGHT * ((1.0 if full else _ONE if len(legs) else 0.0) - self._share)
+        if len(legs):
+            self._correct(legs.mean(axis=0), _TWO_LEGS if full else _ONE_LEG)
+            self.seen_at = now
+            self._seen += 1
+            self._full += full
+        self._furthest = max(self._furthest, math.dist(self.place, self._born))
+        self._judge(now, proof)
+
+    def _correct(self, place: Floats, deviation: float) -> None:
+        innovation = self.covariance[:2, :2] + np.eye(2) * deviation**2
+        gain = self.covariance[:, :2] @ np.linalg.inv(innovation)
+        self.state = self.state + gain @ (place - self.state[:2])
+        self.covariance = self.covariance - gain @ self.covariance[:2, :]
+
+    def _judge(self, now: float, proof: Proof) -> None:
+        if self.walks:
+            return
+        age, seen = now - self.born_at, self._seen / self._scans
+        if self._scans >= proof.scans and self.legs:
+            self.walks = (
+                self._furthest >= max(proof.way, proof.speed * age)
+                and seen >= proof.seen
+                and self._share >= proof.walker_legs
+            )
+            pair = self._scans >= proof.pair_scans and self._full >= 0.6 * proof.pair_scans
+            self.stands = self.stands or (pair and self._share >= proof.pair_legs and seen >= proof.pair_seen)
+        self.stands = self.stands and not self.walks and age <= proof.pair_trust

@@ -1,0 +1,173 @@
+"""People tracked by their legs, in scans that were drawn: who is found, who is kept apart, and what is no person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from leg_scans import FIRST, LIMITS, STEP, feet, scan
+from skytether_services.follow_in_front.person import Person
+from skytether_services.follow_in_front.tracker import PeopleTracker
+
+PERIOD = 0.1
+WALL = [((4.0, -4.0), (4.0, 4.0))]
+
+
+def run(
+    tracker: PeopleTracker,
+    legs: Callable[[float], list[tuple[float, float]]],
+    seconds: float,
+    *,
+    walls: list[tuple[tuple[float, float], tuple[float, float]]] = WALL,
+    laser: Callable[[float], tuple[float, float, float]] = lambda _: (0.0, 0.0, 0.0),
+    begin: float = 100.0,
+    seed: int = 1,
+) -> Iterator[tuple[float, tuple[Person, ...]]]:
+    """Time since the beginning and the people, after each scan."""
+    random = np.random.default_rng(seed)
+    for number in range(round(seconds / PERIOD)):
+        at = number * PERIOD
+        ranges = scan(legs(at), walls, laser(at), random)
+        yield at, tracker.step(ranges, FIRST, STEP, LIMITS, laser(at), begin + at)
+
+
+def walker(
+    start: tuple[float, float], heading: float, speed: float
+) -> Callable[[float], tuple[tuple[float, float], list[tuple[float, float]]]]:
+    """Place and feet of one who walks straight on, by time [s]."""
+
+    def at(time: float) -> tuple[tuple[float, float], list[tuple[float, float]]]:
+        way = speed * time
+        place = (start[0] + math.cos(heading) * way, start[1] + math.sin(heading) * way)
+        return place, feet(place, heading, way)
+
+    return at
+
+
+def test_one_who_walks_is_one_person_at_the_right_place_and_speed() -> None:
+    tracker, one = PeopleTracker(), walker((1.5, -3.0), math.pi / 2, 1.0)
+    numbers, errors, speeds = set(), [], []
+    for at, people in run(tracker, lambda t: one(t)[1], 6.0):
+        if at < 1.0:
+            continue
+        assert len(people) == 1
+        numbers.add(people[0].id)
+        errors.append(math.dist(people[0].place, one(at)[0]))
+        speeds.append(math.hypot(*people[0].velocity))
+    assert len(numbers) == 1
+    assert people[0].walks
+    assert np.mean(errors) < 0.08
+    assert max(errors) < 0.2
+    assert abs(np.mean(speeds) - 1.0) < 0.1
+
+
+def test_one_leg_hides_the_other_and_the_person_stays_the_same() -> None:
+    # Walks across the laser's view, near: each step hides the far leg.
+    tracker, one = PeopleTracker(), walker((1.0, -2.5), math.pi / 2, 0.6)
+    alone, numbers = 0, set()
+    for at, people in run(tracker, lambda t: one(t)[1], 8.0):
+        if at >= 1.5:
+            numbers.update(person.id for person in people)
+            assert len(people) == 1
+            alone += people[0].legs == 1
+            assert math.dist(people[0].place, one(at)[0]) < 0.25
+    assert len(numbers) == 1
+    assert alone > 5
+
+
+def test_two_who_pass_each_other_keep_their_numbers() -> None:
+    # One in front of the other, so that the nearer hides the farther for some scans.
+    tracker = PeopleTracker()
+    near, far = walker((1.5, -2.5), math.pi / 2, 0.9), walker((2.3, 2.5), -math.pi / 2, 0.9)
+    by_place: dict[str, set[int]] = {"near": set(), "far": set()}
+    for at, people in run(tracker, lambda t: near(t)[1] + far(t)[1], 5.0):
+        if at < 1.2:
+            continue
+        for name, one in (("near", near), ("far", far)):
+            mine = [person for person in people if math.dist(person.place, one(at)[0]) < 0.35]
+            by_place[name].update(person.id for person in mine)
+    assert len(by_place["near"]) == 1
+    assert len(by_place["far"]) == 1
+    assert by_place["near"] != by_place["far"]
+
+
+def test_a_person_behind_a_pillar_walks_on_in_mind() -> None:
+    tracker, one = PeopleTracker(), walker((2.0, -2.0), math.pi / 2, 1.0)
+    pillar = [((1.0, -0.15), (1.0, 0.15)), *WALL]
+    unseen, numbers = 0, set()
+    for at, people in run(tracker, lambda t: one(t)[1], 4.0, walls=pillar):
+        if at >= 1.0:
+            assert len(people) == 1, at
+            numbers.add(people[0].id)
+            unseen += people[0].legs == 0
+    assert len(numbers) == 1
+    assert unseen >= 2
+
+
+def test_one_who_stands_is_found_by_both_legs() -> None:
+    tracker = PeopleTracker()
+    *_, (_, people) = run(tracker, lambda _: feet((1.2, 0.0), math.pi, 0.0), 2.0)
+    assert len(people) == 1
+    assert people[0].stands
+    assert not people[0].walks
+
+
+def test_a_mannequin_or_a_chair_is_no_person_for_long_and_never_one_who_walks() -> None:
+    tracker = PeopleTracker()
+    chair = [(1.2, 0.2), (1.2, -0.2), (1.6, 0.2), (1.6, -0.2)]
+    for at, people in run(tracker, lambda _: chair, 10.0):
+        assert not any(person.walks for person in people)
+        if at > 6.5:
+            assert not people
+
+
+def test_what_stands_is_no_walker_when_the_robot_drives_and_turns() -> None:
+    tracker = PeopleTracker()
+    posts = [(2.0, 1.0), (2.6, -1.2), (3.4, 0.4)]
+
+    def laser(time: float) -> tuple[float, float, float]:
+        return 0.3 * time, 0.0, 0.3 * math.sin(time)
+
+    for _, people in run(tracker, lambda _: posts, 5.0, laser=laser):
+        assert not any(person.walks for person in people)
+
+
+def test_a_walker_is_tracked_from_a_robot_that_drives_and_turns() -> None:
+    tracker, one = PeopleTracker(), walker((2.5, -2.0), math.pi / 2, 0.8)
+
+    def laser(time: float) -> tuple[float, float, float]:
+        return 0.2 * time, 0.0, 0.4 * math.sin(time)
+
+    numbers = set()
+    for at, people in run(tracker, lambda t: one(t)[1], 5.0, laser=laser):
+        if at >= 1.5:
+            assert len(people) == 1
+            numbers.add(people[0].id)
+            assert math.dist(people[0].place, one(at)[0]) < 0.25
+    assert len(numbers) == 1
+
+
+def test_scans_that_say_nothing_or_come_twice_change_nothing_for_the_worse() -> None:
+    tracker, one = PeopleTracker(), walker((1.5, -3.0), math.pi / 2, 1.0)
+    *_, (_, before) = run(tracker, lambda t: one(t)[1], 2.0)
+    state = before[0].state.copy()
+    # The same moment again, and one just before it.
+    for now in (101.9, 101.5):
+        again = tracker.step(np.full(772, np.nan, np.float32), FIRST, STEP, LIMITS, (0.0, 0.0, 0.0), now)
+        assert np.array_equal(again[0].state, state)
+    # Silence: forgotten after a second, and nobody is invented.
+    for step in range(1, 14):
+        people = tracker.step(np.zeros(0, np.float32), FIRST, STEP, LIMITS, (0.0, 0.0, 0.0), 101.9 + step * PERIOD)
+    assert people == ()
+    # A clock that was set back: all anew.
+    *_, (_, people) = run(tracker, lambda t: one(t)[1], 2.0, begin=5.0)
+    assert len(people) == 1
+
+
+def test_a_scan_full_of_posts_costs_a_bounded_number_of_tracks() -> None:
+    tracker = PeopleTracker()
+    posts = [(2 + 0.5 * row, 0.4 * column) for row in range(8) for column in range(-12, 13)]
+    for _, people in run(tracker, lambda _: posts, 1.0, walls=[]):
+        assert len(tracker.tracks) <= 60
+        assert len(people) <= 60
