@@ -33,12 +33,13 @@ def scan(
     laser: tuple[float, float, float] = (0.0, 0.0, 0.0),
     random: np.random.Generator | None = None,
     radius: float = LEG,
+    step: float = STEP,
 ) -> np.ndarray:
     """Ranges of one scan [m], infinite where a ray meets nothing; noise of 5 mm if there is a generator."""
     x, y, heading = laser
-    angles = heading + FIRST + STEP * np.arange(RAYS)
+    angles = heading + FIRST + step * np.arange(round(RAYS * STEP / step))
     cos, sin = np.cos(angles), np.sin(angles)
-    ranges = np.full(RAYS, np.inf)
+    ranges = np.full(len(angles), np.inf)
     for leg_x, leg_y in legs:
         along = (leg_x - x) * cos + (leg_y - y) * sin
         across = (leg_x - x) * sin - (leg_y - y) * cos
@@ -54,5 +55,5 @@ def scan(
         hits = (t > 0) & (u >= 0) & (u <= 1)
         ranges[hits] = np.minimum(ranges[hits], t[hits])
     if random is not None:
-        ranges = ranges + 0.005 * random.standard_normal(RAYS)
+        ranges = ranges + 0.005 * random.standard_normal(len(angles))
     return np.where(ranges <= LIMITS[1], ranges, np.inf).astype(np.float32)

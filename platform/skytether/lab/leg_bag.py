@@ -12,17 +12,17 @@ import struct
 import tempfile
 import zipfile
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skytether.messages import DecodeError, LaserScan, Odometry, Quaternion, TFMessage, decode
-from skytether.robot.bag import Bag, BagError
+from skytether.robot.bag import Bag, BagError, BagTopic
 
 Floats = NDArray[np.float64]
 
@@ -45,8 +45,8 @@ class LegBag:
         first: Angle of the first ray [rad].
         step: Between neighbouring rays [rad].
         limits: Smallest and largest range that means something [m].
-        lasers: Pose of the laser at each scan by odometry, n by (x [m], y [m], heading [rad]); zeros without odometry.
-        moved: Whether odometry was found.
+        lasers: Pose of the laser at each scan by ``/tf`` or odometry, n by (x [m], y [m], heading [rad]).
+        moved: Whether these poses differ; they do not where nothing tells of a motion.
         truth: People of each scan by number, (x, y) [m] in the laser's frame; None: the recording does not say.
     """
 
@@ -106,45 +106,75 @@ def _scan_topic(bag: Bag, path: Path, topic: str | None) -> str:
     return topic
 
 
+class _Found:
+    """What was read so far."""
+
+    def __init__(self) -> None:
+        self.scans: list[LaserScan] = []
+        self.begun: list[float] = []
+        self.truth: list[tuple[float, int, float, float]] = []
+        self.links: dict[str, _Link] = {}
+        """From each frame to the one that it is told in; what ``/tf`` says goes before odometry."""
+        self.odometry: dict[str, _Link] = {}
+
+    def take(self, at: float, topic: BagTopic, data: bytes) -> None:
+        """One message that is no truth.
+
+        Raises:
+            DecodeError: It is damaged.
+        """
+        encoding: Literal["cdr", "ros1"] = "ros1" if topic.offer.encoding == "ros1" else "cdr"
+        if topic.offer.type == _SCAN:
+            self.scans.append(decode(LaserScan, data, encoding))
+            self.begun.append(at)
+        elif topic.offer.type == _ODOMETRY:
+            odometry = decode(Odometry, data, encoding)
+            place = odometry.pose.pose
+            link = self.odometry.setdefault(_name(odometry.child_frame_id), _Link(_name(odometry.header.frame_id), []))
+            link.add(odometry.header.stamp.seconds(), place.position.x, place.position.y, place.orientation)
+        else:
+            for told in decode(TFMessage, data, encoding).transforms:
+                shift = told.transform.translation
+                parent = _name(told.header.frame_id)
+                link = self.links.setdefault(_name(told.child_frame_id), _Link(parent, []))
+                if link.parent == parent:
+                    link.add(told.header.stamp.seconds(), shift.x, shift.y, told.transform.rotation)
+
+
+class _Link(NamedTuple):
+    """A frame's pose in its parent, by time: [s], [m], [m], [rad]."""
+
+    parent: str
+    samples: list[tuple[float, float, float, float]]
+
+    def add(self, stamp: float, x: float, y: float, rotation: Quaternion) -> None:
+        sample = (stamp, x, y, _yaw(rotation))
+        if all(map(math.isfinite, sample)):
+            self.samples.append(sample)
+
+
+def _name(frame: str) -> str:
+    return frame.lstrip("/")
+
+
 def _read(bag: Bag, path: Path, topic: str) -> LegBag:
-    odometry_topic = next((name for name, found in bag.topics.items() if found.offer.type == _ODOMETRY), None)
-    wanted = {topic, TRUTH, "/tf", "/tf_static"} | ({odometry_topic} if odometry_topic else set())
-    scans: list[LaserScan] = []
-    begun: list[float] = []
-    truth: list[tuple[float, int, float, float]] = []
-    odometry: list[tuple[float, float, float, float]] = []
-    fixed: dict[tuple[str, str], tuple[float, float, float]] = {}
-    base = ""
-    for at, name, data in bag.messages({name for name in wanted if name in bag.topics}):
-        kind = bag.topics[name].offer
-        encoding: Literal["cdr", "ros1"] = "ros1" if kind.encoding == "ros1" else "cdr"
+    wanted = {name for name, found in bag.topics.items() if found.offer.type in (_ODOMETRY, _TF)} | {topic}
+    wanted |= {TRUTH} & bag.topics.keys()
+    found = _Found()
+    for at, name, data in bag.messages(wanted):
         try:
             if name == TRUTH:
                 x, y, *_, number = _PERSON.unpack(data[: _PERSON.size])
-                truth.append((at, number, x, y))
-            elif name == topic:
-                scans.append(decode(LaserScan, data, encoding))
-                begun.append(at)
-            elif name == odometry_topic:
-                message = decode(Odometry, data, encoding)
-                base = message.child_frame_id.lstrip("/")
-                place = message.pose.pose
-                odometry.append(
-                    (message.header.stamp.seconds(), place.position.x, place.position.y, _yaw(place.orientation))
-                )
-            elif kind.type == _TF:
-                for link in decode(TFMessage, data, encoding).transforms:
-                    key = (link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/"))
-                    shift = link.transform.translation
-                    fixed[key] = (shift.x, shift.y, _yaw(link.transform.rotation))
+                found.truth.append((at, number, x, y))
+            else:
+                found.take(at, bag.topics[name], data)
         except (DecodeError, struct.error) as error:
             raise BagError(f"{path}: a message of {name} is damaged: {error}") from error
+    scans = found.scans
     if not scans:
         raise BagError(f"{path}: no scan on {topic}")
-    stamps = _rising([scan.header.stamp.seconds() for scan in scans], begun)
-    mount = fixed.get((base, scans[0].header.frame_id.lstrip("/")))
-    moved = len(odometry) > 1 and mount is not None
-    lasers = _lasers(stamps, odometry, mount) if moved and mount is not None else np.zeros((len(scans), 3))
+    stamps = _rising([scan.header.stamp.seconds() for scan in scans], found.begun)
+    lasers = _climb(_name(scans[0].header.frame_id), stamps, found.odometry | found.links)
     return LegBag(
         topic,
         stamps,
@@ -153,8 +183,8 @@ def _read(bag: Bag, path: Path, topic: str) -> LegBag:
         scans[0].angle_increment,
         (scans[0].range_min, scans[0].range_max),
         lasers,
-        moved,
-        _by_scan(truth, begun) if TRUTH in bag.topics else None,
+        bool(np.ptp(lasers, axis=0).max() > 0),
+        _by_scan(found.truth, found.begun) if TRUTH in bag.topics else None,
     )
 
 
@@ -170,15 +200,25 @@ def _rising(stamps: list[float], begun: list[float]) -> Floats:
     return np.maximum.accumulate(np.array(begun) + np.arange(len(begun)) * 1e-6)
 
 
-def _lasers(
-    stamps: Floats, odometry: list[tuple[float, float, float, float]], mount: tuple[float, float, float]
-) -> Floats:
-    """Poses of a laser that is mounted so (x [m], y [m], heading [rad]) on the robot."""
-    ordered = np.array(sorted(odometry))
-    heading = np.interp(stamps, ordered[:, 0], np.unwrap(ordered[:, 3]))
-    x = np.interp(stamps, ordered[:, 0], ordered[:, 1]) + np.cos(heading) * mount[0] - np.sin(heading) * mount[1]
-    y = np.interp(stamps, ordered[:, 0], ordered[:, 2]) + np.sin(heading) * mount[0] + np.cos(heading) * mount[1]
-    return np.column_stack([x, y, heading + mount[2]])
+def _climb(frame: str, stamps: Floats, links: Mapping[str, _Link]) -> Floats:
+    """Poses of a frame at these times in ``odom``, or in the topmost frame that is known: n by (x, y, heading).
+
+    Planar: the rotation of a laser that hangs upside down is not understood.
+    """
+    x, y, heading = np.zeros((3, len(stamps)))
+    climbed: set[str] = set()
+    while frame in links and links[frame].samples and frame != "odom" and frame not in climbed:
+        climbed.add(frame)
+        frame, samples = links[frame]
+        known = np.array(sorted(samples))
+        turn = np.interp(stamps, known[:, 0], np.unwrap(known[:, 3]))
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = (
+            np.interp(stamps, known[:, 0], known[:, 1]) + cos * x - sin * y,
+            np.interp(stamps, known[:, 0], known[:, 2]) + sin * x + cos * y,
+        )
+        heading = heading + turn
+    return np.column_stack([x, y, heading])
 
 
 def _by_scan(truth: list[tuple[float, int, float, float]], begun: list[float]) -> list[dict[int, tuple[float, float]]]:

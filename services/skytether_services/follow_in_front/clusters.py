@@ -18,6 +18,8 @@ GAP = 0.13
 """Points of neighbouring rays further apart than this belong to two clusters, m (Leigh et al. 2015)."""
 _LEAST = 3
 """Points of a cluster at the least: fewer have no shape."""
+_COARSE = (0.1, 2.2)
+"""Where rays are so far apart that fewer than so many meet a leg of such a width [m], two points are a cluster, too."""
 _FREE = 0.10
 """What lies before a cluster's end by more than this hides the end, m."""
 
@@ -30,11 +32,13 @@ class Rays:
         points: n by (x, y), laser frame [m].
         ranges: [m].
         index: Of each ray in the scan.
+        step: Between neighbouring rays of the scan [rad].
     """
 
     points: Floats
     ranges: Floats
     index: NDArray[np.int64]
+    step: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,7 @@ def rays_of(ranges: NDArray[np.floating], first: float, step: float, least: floa
         index = np.flatnonzero((values >= max(least, 1e-3)) & (values <= most))
     values = values[index]
     angles = first + step * index
-    return Rays(np.column_stack([values * np.cos(angles), values * np.sin(angles)]), values, index)
+    return Rays(np.column_stack([values * np.cos(angles), values * np.sin(angles)]), values, index, step)
 
 
 def clusters_of(rays: Rays, *, gap: float = GAP, furthest: float = np.inf) -> Clusters:
@@ -104,7 +108,9 @@ def clusters_of(rays: Rays, *, gap: float = GAP, furthest: float = np.inf) -> Cl
     begins = np.concatenate([[0], cuts])
     ends = np.concatenate([cuts, [n]])
     counts = ends - begins
-    keep = counts >= _LEAST
+    # Of a leg of this width at the range of the first point, so many rays.
+    met = _COARSE[0] / np.maximum(ranges[begins] * abs(rays.step), 1e-6)
+    keep = counts >= np.where(met < _COARSE[1], 2, _LEAST)
     begins, ends, counts = begins[keep], ends[keep], counts[keep]
     if len(begins) == 0:
         return _none()

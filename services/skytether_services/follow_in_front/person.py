@@ -30,8 +30,10 @@ class Proof:
 
     Attributes:
         scans: Since the track began, at the least.
-        way: Who has gone so far from where the track began walks [m].
+        way: Who has gone so far from where they last rested walks [m].
         speed: At no less than this on the whole [m/s]: what odometry or a wandering edge makes is slower.
+        slow_speed: The same of one whose two legs are seen apart in most scans [m/s]: no edge has two that go together.
+        apart: So many of the scans are most.
         seen: Share of the scans in which a walker was seen.
         walker_legs: Share of legs seen of one who walks, 0 to 1 (both in all scans).
         pair_scans: One who stands: so many scans, of which 60 % with both legs.
@@ -43,6 +45,8 @@ class Proof:
     scans: int = 4
     way: float = 0.6
     speed: float = 0.6
+    slow_speed: float = 0.15
+    apart: float = 0.6
     seen: float = 0.7
     walker_legs: float = 0.35
     pair_scans: int = 5
@@ -51,7 +55,12 @@ class Proof:
     pair_trust: float = 6.0
 
 
-@dataclass(slots=True)
+_PROOF = Proof()
+_REST = (0.25, 2.0)
+"""Who has not left a place by so much [m] for so long [s] rests there: a walk begins anew."""
+
+
+@dataclass(slots=True, eq=False)
 class Person:
     """A track: constant velocity, disturbed by white acceleration (Bar-Shalom et al. 2001, section 6.2.2).
 
@@ -74,18 +83,23 @@ class Person:
     walks: bool = False
     stands: bool = False
     legs: int = 0
-    _born: Floats = field(default_factory=lambda: np.zeros(2))
+    _rested: Floats = field(default_factory=lambda: np.zeros(2))
+    _rested_at: float = 0.0
     _scans: int = 0
     _seen: int = 0
     _full: int = 0
+    _apart: int = 0
     _share: float = 0.5
     _furthest: float = 0.0
+    _proof: Proof = field(default_factory=Proof)
 
     @classmethod
-    def at(cls, number: int, place: Floats, now: float) -> Person:
-        """One who was just found at a place [m]."""
+    def at(cls, number: int, place: Floats, now: float, proof: Proof = _PROOF) -> Person:
+        """One who was just found at a place [m], and is a person by this proof."""
         covariance = np.diag([_BORN[0] ** 2] * 2 + [_BORN[1] ** 2] * 2)
-        return cls(number, np.array([*place, 0.0, 0.0]), covariance, now, now, _born=np.array(place, np.float64))
+        rested = np.array(place, np.float64)
+        state = np.array([*place, 0.0, 0.0])
+        return cls(number, state, covariance, now, now, _rested=rested, _rested_at=now, _proof=proof)
 
     @property
     def place(self) -> Floats:
@@ -101,6 +115,13 @@ class Person:
     def known(self) -> bool:
         """Whether it is taken for a person."""
         return self.walks or self.stands
+
+    @property
+    def paired(self) -> bool:
+        """Whether both legs are seen, and have been for a while: so a person stands, and a chair."""
+        p = self._proof
+        enough = self._scans >= p.pair_scans and self._full >= 0.6 * p.pair_scans
+        return enough and self._share >= p.pair_legs and self._seen / self._scans >= p.pair_seen
 
     @property
     def share(self) -> float:
@@ -125,14 +146,13 @@ class Person:
         self.state = move @ self.state
         self.covariance = move @ self.covariance @ move.T + noise
 
-    def look(self, legs: Floats, full: bool, now: float, proof: Proof) -> None:
+    def look(self, legs: Floats, full: bool, now: float) -> None:
         """Take what a scan showed of it.
 
         Args:
             legs: n by (x, y) [m]; n is 0, 1 or 2.
             full: Both legs are in it, be it in one cluster.
             now: When [s].
-            proof: What makes it a person.
         """
         self._scans += 1
         self.legs = 2 if full else len(legs)
@@ -142,8 +162,14 @@ class Person:
             self.seen_at = now
             self._seen += 1
             self._full += full
-        self._furthest = max(self._furthest, math.dist(self.place, self._born))
-        self._judge(now, proof)
+            self._apart += len(legs) == 2
+        self._furthest = max(self._furthest, math.dist(self.place, self._rested))
+        if self._furthest < _REST[0] and now - self._rested_at > _REST[1]:
+            self._rested, self._rested_at, self._furthest = self.place.copy(), now, 0.0
+        if self.legs:
+            self.walks = self.walks or (self._scans >= self._proof.scans and self._has_walked(now))
+            self.stands = self.stands or self.paired
+        self.stands = self.stands and not self.walks and now - self.born_at <= self._proof.pair_trust
 
     def _correct(self, place: Floats, deviation: float) -> None:
         innovation = self.covariance[:2, :2] + np.eye(2) * deviation**2
@@ -151,16 +177,8 @@ class Person:
         self.state = self.state + gain @ (place - self.state[:2])
         self.covariance = self.covariance - gain @ self.covariance[:2, :]
 
-    def _judge(self, now: float, proof: Proof) -> None:
-        if self.walks:
-            return
-        age, seen = now - self.born_at, self._seen / self._scans
-        if self._scans >= proof.scans and self.legs:
-            self.walks = (
-                self._furthest >= max(proof.way, proof.speed * age)
-                and seen >= proof.seen
-                and self._share >= proof.walker_legs
-            )
-            pair = self._scans >= proof.pair_scans and self._full >= 0.6 * proof.pair_scans
-            self.stands = self.stands or (pair and self._share >= proof.pair_legs and seen >= proof.pair_seen)
-        self.stands = self.stands and not self.walks and age <= proof.pair_trust
+    def _has_walked(self, now: float) -> bool:
+        p = self._proof
+        pace = p.slow_speed if self._apart >= p.apart * self._scans else p.speed
+        far = self._furthest >= max(p.way, pace * (now - self._rested_at))
+        return far and self._seen >= p.seen * self._scans and self._share >= p.walker_legs

@@ -125,27 +125,29 @@ class PeopleTracker:
         # A laser sees the near half of a leg; its middle is further away.
         middles = clusters.middles * (1 + _DEPTH / np.maximum(clusters.distances, _NEAREST))[:, None]
         legs, both = middles[use] @ turn + (x, y), both[use]
-        taken = self._give(legs, both, now)
+        seen = clusters.middles[use] @ turn + (x, y)
+        stand = np.array([self._background.stands(place, now) for place in seen], bool)
+        taken = self._give(legs, both, stand, now)
         self._tracks = [person for person in self._tracks if self._stays(person, now)]
         self._tracks = [person for person in self._tracks if not self._is_a_leg_of_another(person)]
-        self._find(legs, [leg for leg in range(len(legs)) if not both[leg] and leg not in taken], now)
+        new = np.flatnonzero(~both & ~stand).tolist()
+        self._find(legs, [leg for leg in new if leg not in taken], now)
         self._background.look(rays.points @ turn + (x, y), now)
         return self.people
 
-    def _give(self, legs: Floats, both: NDArray[np.bool_], now: float) -> set[int]:
+    def _give(self, legs: Floats, both: NDArray[np.bool_], stand: NDArray[np.bool_], now: float) -> set[int]:
         """Give legs to people; returns the legs that were given."""
         tracks = self._tracks
         places = np.array([person.place for person in tracks]).reshape(-1, 2)
         spreads = np.array([person.spread for person in tracks])
         known = np.array([person.known for person in tracks], bool)
         # A pillar takes the place of nobody who walks by.
-        stands = np.array([self._background.stands(leg, now) for leg in legs], bool)
         walking = np.array([math.hypot(*person.velocity.tolist()) > _WALKING for person in tracks], bool)
-        impossible = walking[:, None] & stands[None, :]
+        impossible = walking[:, None] & stand[None, :]
         given: set[int] = set()
         for person, mine in zip(tracks, assign(places, spreads, known, legs, both, impossible), strict=True):
             full = len(mine) == 2 or (len(mine) == 1 and bool(both[mine[0]]))
-            person.look(legs[mine], full, now, self._params.proof)
+            person.look(legs[mine], full, now)
             given.update(mine)
         return given
 
@@ -168,17 +170,16 @@ class PeopleTracker:
         )
 
     def _find(self, legs: Floats, free: list[int], now: float) -> None:
-        """Begin tracks with legs that are nobody's and have not stood there all the time."""
+        """Begin tracks with legs that are nobody's."""
         free = [
             leg
             for leg in free
-            if not self._background.stands(legs[leg], now)
-            and all(
-                math.dist(legs[leg], person.place) > (_ROOM_KNOWN if person.known else _ROOM)
-                for person in self._tracks
+            if all(
+                math.dist(legs[leg], person.place) > (_ROOM_KNOWN if person.known else _ROOM) for person in self._tracks
             )
         ]
         for found in pairs(legs, free, _PAIR):
             if len(self._tracks) < _MOST:
-                self._tracks.append(Person.at(self._next, legs[list(found)].mean(axis=0), now))
+                place = legs[list(found)].mean(axis=0)
+                self._tracks.append(Person.at(self._next, place, now, self._params.proof))
                 self._next += 1

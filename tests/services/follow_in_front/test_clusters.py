@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from leg_scans import FIRST, LIMITS, STEP, scan
+
 from skytether_services.follow_in_front.clusters import Clusters, clusters_of, rays_of
 from skytether_services.follow_in_front.legs import both_legs, leg_like
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 from leg_scans import FIRST, LIMITS, STEP, feet, scan
+
 from skytether_services.follow_in_front.person import Person
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
@@ -171,3 +172,37 @@ def test_a_scan_full_of_posts_costs_a_bounded_number_of_tracks() -> None:
     for _, people in run(tracker, lambda _: posts, 1.0, walls=[]):
         assert len(tracker.tracks) <= 60
         assert len(people) <= 60
+
+
+def test_a_slow_walker_is_one_who_walks_also_after_a_rest() -> None:
+    # As slow as in front of the thesis's walker: 0.3 m/s, seen from ahead; after 8 s of standing.
+    def place(time: float) -> tuple[float, float]:
+        return 2.5 - 0.3 * max(time - 8, 0), 0.0
+
+    tracker = PeopleTracker()
+    numbers: set[int] = set()
+    for at, _ in run(tracker, lambda t: feet(place(t), math.pi, 2.5 - place(t)[0]), 12.0):
+        near = [person for person in tracker.tracks if math.dist(person.place, place(at)) < 0.3]
+        assert len(near) == 1, at
+        numbers.add(near[0].id)
+        if at > 7:
+            assert near[0].paired
+        if 6.5 < at < 8:
+            assert not near[0].known, "it may be a chair"
+        if at > 11.5:
+            assert near[0].walks
+    assert len(numbers) == 1
+
+
+def test_a_coarse_laser_sees_people_too() -> None:
+    # 245 rays over 270 degrees: at 3 m two rays meet a leg.
+    random, step = np.random.default_rng(2), math.radians(270 / 245)
+    tracker, one = PeopleTracker(), walker((3.0, -1.5), math.pi / 2, 0.9)
+    found = 0
+    for number in range(35):
+        at = number * PERIOD
+        ranges = scan(one(at)[1], WALL, random=random, step=step)
+        people = tracker.step(ranges, FIRST, step, LIMITS, (0.0, 0.0, 0.0), at)
+        found += any(math.dist(person.place, one(at)[0]) < 0.35 for person in people)
+        assert len(people) <= 1
+    assert found >= 15

@@ -1,0 +1,163 @@
+"""Whom to follow: one of the people about the robot is picked, and kept until they are gone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+from .person import Person
+
+
+class Choice(StrEnum):
+    """How it stands with the operator.
+
+    Attributes:
+        NOBODY: Nobody stands where an operator does.
+        SEVERAL: More than one does: the robot does not guess.
+        FOLLOWED: There is one.
+        LOST: There was one, who is not in sight; nobody else is taken for a while.
+    """
+
+    NOBODY = "nobody"
+    SEVERAL = "several"
+    FOLLOWED = "followed"
+    LOST = "lost"
+
+
+class Operator(NamedTuple):
+    """Whom the robot follows.
+
+    Attributes:
+        id: Of the track; changes if a track was lost and the person found again.
+        x: In the robot's frame, x ahead [m]; an operator is behind.
+        y: To the left [m].
+        vx: Velocity over the floor, along the robot's x [m/s].
+        vy: Likewise, along its y [m/s].
+        seen_at: When a leg was last seen [s].
+    """
+
+    id: int
+    x: float
+    y: float
+    vx: float
+    vy: float
+    seen_at: float
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorParams:
+    """Where an operator stands, and for how long one is waited for.
+
+    Attributes:
+        near: Distance from the robot's middle at the least [m].
+        far: At the most, to be picked [m].
+        side: Off the line straight back at the most, to be picked [rad].
+        apart: Of two who could be, one is picked only if this much nearer to that line than the other [m].
+        gone: Whoever is further away than this is followed no more [m].
+        again: One who was lost is found again within this distance of where they would be [m].
+        memory: And within this time [s]. Nobody else is picked meanwhile.
+    """
+
+    near: float = 0.4
+    far: float = 2.0
+    side: float = math.radians(35)
+    apart: float = 0.4
+    gone: float = 3.5
+    again: float = 0.6
+    memory: float = 2.0
+
+
+_DEFAULT = OperatorParams()
+
+
+class OperatorChoice:
+    """Picks the operator and keeps them.
+
+    Who only stands may be a chair: one is picked who has walked, or whose face the camera sees. A change of operator is
+    never silent: `choice` leaves ``FOLLOWED`` for `OperatorParams.memory` at the least, and `picked` counts.
+    """
+
+    def __init__(self, params: OperatorParams = _DEFAULT) -> None:
+        self._params = params
+        self._last: tuple[Person, float] | None = None
+        self.choice = Choice.NOBODY
+        """How it stands."""
+        self.picked = 0
+        """So many operators were picked so far."""
+
+    def step(
+        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, *, face: bool = False
+    ) -> Operator | None:
+        """Take the people of a scan.
+
+        Args:
+            people: All tracks (`PeopleTracker.tracks`), in a frame that does not move.
+            robot: Pose of the robot in that frame: x [m], y [m], heading [rad].
+            now: When the scan was made [s].
+            face: Whether the camera sees one face, and no other.
+
+        Returns:
+            Whom to follow; None: `choice` says why.
+        """
+        kept = self._kept(people, robot, now)
+        if kept is None and self._last is not None and 0 <= now - self._last[1] <= self._params.memory:
+            self.choice = Choice.LOST
+            return None
+        if kept is None:
+            self._last = None
+            kept = self._pick(people, robot, face)
+        if kept is None:
+            return None
+        self._last, self.choice = (kept, now), Choice.FOLLOWED
+        return _seen_from(robot, kept)
+
+    def _kept(self, people: Sequence[Person], robot: tuple[float, float, float], now: float) -> Person | None:
+        """The operator of the last scan, under the same number or another."""
+        if self._last is None:
+            return None
+        last, then = self._last
+        same = next((person for person in people if person.id == last.id), None)
+        if same is None and 0 <= now - then <= self._params.memory:
+            expected = (last.place + last.velocity * (now - then)).tolist()
+            near = [
+                person
+                for person in people
+                if (person.known or person.paired) and math.dist(person.place, expected) <= self._params.again
+            ]
+            same = near[0] if len(near) == 1 else None
+        if same is None or math.dist(same.place, robot[:2]) > self._params.gone:
+            return None
+        return same
+
+    def _pick(self, people: Sequence[Person], robot: tuple[float, float, float], face: bool) -> Person | None:
+        p = self._params
+        found: list[tuple[float, Person]] = []
+        for person in people:
+            seen = _seen_from(robot, person)
+            distance, off = math.hypot(seen.x, seen.y), abs(math.atan2(seen.y, -seen.x))
+            if p.near <= distance <= p.far and off <= p.side and person.legs and _trusted(person, face):
+                found.append((abs(seen.y), person))
+        found.sort(key=lambda one: one[0])
+        if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart):
+            self.choice = Choice.SEVERAL if found else Choice.NOBODY
+            return None
+        self.picked += 1
+        return found[0][1]
+
+
+def _trusted(person: Person, face: bool) -> bool:
+    """Whether it is a person for sure."""
+    return person.walks or (face and person.paired)
+
+
+def _seen_from(robot: tuple[float, float, float], person: Person) -> Operator:
+    x, y, heading = robot
+    cos, sin = math.cos(heading), math.sin(heading)
+    dx, dy = (person.place - (x, y)).tolist()
+    vx, vy = person.velocity.tolist()
+    return Operator(
+        person.id, cos * dx + sin * dy, cos * dy - sin * dx, cos * vx + sin * vy, cos * vy - sin * vx, person.seen_at
+    )
