@@ -56,14 +56,20 @@ def test_a_container_of_it_drives_a_robot_and_compiles_nothing(docker_site: Dock
     assert kept == brought
 
 
-def use_docker(operator: Client, site: DockerSite, image: str, standby: int = 0) -> None:
+def use_docker(operator: Client, site: DockerSite, image: str) -> None:
     """Make the engine the only site, and have it run this image."""
     manifest = operator.get_service("navigation")
-    needs = manifest.spec.needs.model_copy(update={"standby": standby})
-    spec = manifest.spec.model_copy(update={"image": image, "needs": needs})
+    spec = manifest.spec.model_copy(update={"image": image})
     operator.put_service("navigation", manifest.model_copy(update={"spec": spec}))
     operator.create_site(SiteCreate(name="docker", tier="edge", runtime="docker", options=site.options()))
     operator.delete_site("local")
+
+
+def keep_a_standby(operator: Client) -> None:
+    manifest = operator.get_service("navigation")
+    needs = manifest.spec.needs.model_copy(update={"standby": 1})
+    spec = manifest.spec.model_copy(update={"needs": needs})
+    operator.put_service("navigation", manifest.model_copy(update={"spec": spec}))
 
 
 def until(what: Callable[[], bool], told: Callable[[], object]) -> None:
@@ -76,11 +82,12 @@ def until(what: Callable[[], bool], told: Callable[[], object]) -> None:
 def test_a_standby_moves_the_robot_and_is_not_started_for_it(docker_site: DockerSite, navigation_image: str) -> None:
     asking, watch = ROBOTS["navigation"](), Watch()
     with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
-        use_docker(operator, docker_site, navigation_image, standby=1)
+        use_docker(operator, docker_site, navigation_image)
         token = operator.create_robot(RobotCreate(name="pioneer", services=("navigation",))).token
         # A standby is made for what was asked for last.
         asked = InstanceCreate(robot="pioneer", service="navigation", params=dict(asking.params))
         operator.delete_instance(operator.create_instance(asked).id)
+        keep_a_standby(operator)
 
         def standbys() -> list[Instance]:
             nobodys = (one for one in operator.instances() if not one.robot and not one.state.final)

@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -285,3 +287,10 @@ def test_costs_are_published_as_costmap_2d_does() -> None:
     message = costmap_message(Costmap(costs, 0.05, (1.0, 2.0)), 0.0)
     assert message.data.tolist() == [0, 0, 49, 98, 99, 100, -1, 0, 0]
     assert (message.info.width, message.info.height, message.info.origin.position.x) == (3, 3, 1.0)
+
+
+@pytest.mark.slow  # another process loads all of the service
+def test_who_only_drives_waits_for_no_scipy() -> None:
+    said = "import sys, skytether_services.navigation.service; print('scipy.linalg' in sys.modules)"
+    done = subprocess.run([sys.executable, "-P", "-c", said], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
