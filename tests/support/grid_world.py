@@ -105,7 +105,7 @@ def drive(
                 return result
             control = controller.control(arrival.pose, arrival.velocity, local)
             result.blocked += control.status is ControlStatus.BLOCKED
-            predicted.sent(tick, control.velocity, now, one_way)
+            predicted.sent(control.velocity, now, one_way)
             flying.append((now + one_way, control.velocity))
         while flying and flying[0][0] <= now + 1e-9:
             command = flying.popleft()[1]

@@ -100,7 +100,6 @@ class Navigator:
         """How often somebody gave goals, or tried to."""
         self._state = self._arrival = State(Pose(0.0, 0.0, 0.0), STANDSTILL, 0.0)
         self._command = STANDSTILL
-        self._number = 0
         self._task: Task | None = None
         self._checked = False
         self._paused = False
@@ -222,8 +221,7 @@ class Navigator:
                 self._drive()
         elif self._doing is Doing.WAITING:
             self._trouble = trouble
-        self._number += 1
-        self._predicted.sent(self._number, self._command, now, delay)
+        self._predicted.sent(self._command, now, delay)
         return self._command
 
     def _stand(self, doing: Doing, trouble: Trouble | None) -> None:

@@ -71,7 +71,6 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    number: int
     velocity: Velocity
     sent: float
     arrives: float
@@ -115,29 +114,16 @@ class PredictedState:
         self._params = params
         self._sent: deque[_Sent] = deque(maxlen=MAX_COMMANDS)
 
-    def sent(self, number: int, velocity: Velocity, now: float, delay: float) -> None:
+    def sent(self, velocity: Velocity, now: float, delay: float) -> None:
         """A command was sent.
 
         Args:
-            number: Of the message, rising.
             velocity: The command.
             now: When [s].
             delay: How long such a message takes at present, as the bridge measures it [s].
         """
         delay = min(max(delay, 0.0), self._params.max_delay) if math.isfinite(delay) else 0.0
-        self._sent.append(_Sent(number, velocity, now, now + delay))
-
-    def arrived(self, number: int, delay: float) -> None:
-        """The robot tells how long this command took [s]; unknown numbers, and what is no delay, change nothing."""
-        if not (math.isfinite(delay) and delay >= 0):
-            return
-        for i, entry in enumerate(self._sent):
-            if entry.number == number:
-                self._sent[i] = _Sent(number, entry.velocity, entry.sent, entry.sent + delay)
-
-    def lost(self, number: int) -> None:
-        """This command never arrives."""
-        self._sent = deque((entry for entry in self._sent if entry.number != number), maxlen=MAX_COMMANDS)
+        self._sent.append(_Sent(velocity, now, now + delay))
 
     def clear(self) -> None:
         """Forget all commands: the robot did not obey them (it stopped, or its fallback drove)."""
