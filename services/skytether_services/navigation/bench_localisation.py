@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.likelihood_field import LikelihoodField, likelihood_field
 from skytether_services.navigation.localisation import Estimate, Localisation
-from skytether_services.navigation.occupancy import Beams, map_from_scans
+from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.poses import between, wrap
 
 Array = NDArray[np.float64]
@@ -88,10 +88,8 @@ def run(
     split = int(MAP_SHARE * len(stamps))
     if split < 20 or len(stamps) - split < 20:
         raise ValueError(f"the log has {len(stamps)} scans; 50 are needed to build a map and to drive through it")
-    beams = Beams(float(angles[0]), float(angles[1] - angles[0]), max_range)
     progress(f"building the map from {split} scans")
-    grid = map_from_scans(ranges[:split].astype(np.float64), laser[:split], beams)
-    field = likelihood_field(grid)
+    field = likelihood_field(occupancy(ranges[:split], angles, max_range, laser[:split]))
     rest = [scan_points(scan, angles, max_range) for scan in ranges[split:]]
 
     def drive(seed: int) -> Drive:

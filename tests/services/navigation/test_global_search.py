@@ -11,7 +11,7 @@ from skytether_services.navigation.global_search import search
 from skytether_services.navigation.grid_map import GridMap
 from skytether_services.navigation.likelihood_field import likelihood_field
 from skytether_services.navigation.localisation import Localisation
-from skytether_services.navigation.occupancy import Beams, map_from_scans
+from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.poses import between, compose
 from skytether_services.navigation.scan_matching import scan_points
 
@@ -22,8 +22,7 @@ pytestmark = pytest.mark.slow
 
 def room_map() -> GridMap:
     seen = np.array([[0.0, 0.0, turn] for turn in (0.0, math.pi / 2, math.pi, -math.pi / 2)])
-    beams = Beams(float(ANGLES[0]), float(ANGLES[1] - ANGLES[0]), 30.0)
-    return map_from_scans(np.array([room(pose) for pose in seen], np.float64), seen, beams)
+    return occupancy(np.array([room(pose) for pose in seen]), ANGLES, 30.0, seen)
 
 
 def test_the_place_of_a_scan_is_found_in_the_whole_map() -> None:

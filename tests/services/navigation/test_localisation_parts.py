@@ -22,7 +22,6 @@ from skytether_services.navigation.likelihood_field import (
 )
 from skytether_services.navigation.localisation import LocalisationParams, lead_needed
 from skytether_services.navigation.motion_model import move_particles
-from skytether_services.navigation.occupancy import Beams, beam_ends
 from skytether_services.navigation.particles import bin_keys, heaviest_cluster, kld_count, low_variance_sample, moments
 from skytether_services.navigation.poses import between, compose, wrap
 
@@ -108,13 +107,6 @@ def test_a_beam_is_explained_by_a_wall_that_was_seen_from_its_side() -> None:
     np.testing.assert_allclose([both.telling, both.against], [0.5, 0.5])
     nothing = explain(field, pose, starts[:1], ends[1:2])
     assert (nothing.known, nothing.telling, nothing.against) == (1.0, 0.0, 0.0)
-
-
-def test_beams_that_met_nothing_only_clear() -> None:
-    beams = Beams(0.0, math.pi / 2, 10.0, (0.5, 0.0, 0.0))
-    hits, misses = beam_ends(np.array([1.0, 2.0, np.nan, 30.0]), beams, np.array([1.0, 1.0, 0.0]), 4.0)
-    np.testing.assert_allclose(hits, [[2.5, 1.0], [1.5, 3.0]], atol=1e-12)
-    assert len(misses) == 0  # beyond the laser's range nothing is known
 
 
 def test_near_hypotheses_are_one() -> None:

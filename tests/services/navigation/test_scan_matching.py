@@ -113,6 +113,15 @@ def test_beams_free_what_they_cross() -> None:
     assert grid.at(4.2, 0.0) == -1
 
 
+def test_beams_that_met_nothing_say_nothing_and_long_ones_free_what_is_near() -> None:
+    ranges = np.array([[1.0, 25.0, np.nan, 30.0]], np.float32)
+    grid = occupancy(ranges, np.array([0.0, 0.5, 1.0, 1.5]) * np.pi, 30.0, np.array([[0.0, 0.0, 0.0]]))
+    assert grid.at(1.01, 0.01) > 50
+    # Along y it saw something 25 m off: free as far as beams are followed, but nothing stands there.
+    assert [grid.at(0.01, 10.0) < 50, grid.at(0.01, 19.99) > 50] == [True, False]
+    assert [grid.at(-0.5, 0.01), grid.at(0.01, -0.5)] == [-1, -1]
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_a_drive_around_the_room(measured: bool) -> None:
     turn = np.linspace(0, 2 * np.pi, 160)
