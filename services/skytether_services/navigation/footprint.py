@@ -7,7 +7,7 @@ turns; below the cost at the circumscribed radius it cannot. Only in between the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,40 @@ def footprint_cost(
     return cost
 
 
+@compiled
+def misfits(
+    path: NDArray[np.float64],
+    costs: NDArray[np.uint8],
+    frame: NDArray[np.float64],
+    samples: NDArray[np.float64],
+    check_from: int,
+) -> NDArray[np.bool_]:
+    """Where along a path the robot's outline collides, while it faces along the path and turns from piece to piece.
+
+    Args:
+        path: n by 3: x [m], y [m], yaw to the next pose [rad].
+        costs: Inflated, rows by columns.
+        frame: Resolution, and x, y of the corner of cell (0, 0) [m].
+        samples: Of the footprint.
+        check_from: As in ``footprint_cost``.
+    """
+    found = np.zeros(path.shape[0], np.bool_)
+    yaw = path[0, 2]
+    for i in range(path.shape[0]):
+        turn = path[i, 2] - yaw
+        turn -= 2 * math.pi * math.floor((turn + math.pi) / (2 * math.pi))
+        steps = max(1, math.ceil(abs(turn) / 0.1))
+        for k in range(1, steps + 1):
+            at = yaw + turn * k / steps
+            cos, sin = math.cos(at), math.sin(at)
+            cost = footprint_cost(
+                costs, frame[0], frame[1], frame[2], path[i, 0], path[i, 1], cos, sin, samples, check_from
+            )
+            found[i] = found[i] or cost == _LETHAL
+        yaw = path[i, 2]
+    return found
+
+
 def cost_at(costmap: Costmap, footprint: Footprint, pose: Pose) -> int:
     """Cost of the robot standing at a pose: 254 where any of it is in a lethal cell, else that of its centre."""
     samples = footprint.samples(costmap.resolution / 2)
@@ -161,8 +195,10 @@ def cost_at(costmap: Costmap, footprint: Footprint, pose: Pose) -> int:
 class FootprintChecks:
     """What ``footprint_cost`` needs, for one footprint and costmaps of one inflation."""
 
-    def __init__(self, footprint: Footprint, inflation: InflationParams) -> None:
+    def __init__(self, footprint: Footprint, inflation: InflationParams, margin: float = 0.0) -> None:
+        """Take the outline with so much more around it [m]."""
         self._footprint, self._inflation = footprint, inflation
+        self._wider = replace(footprint, padding=footprint.padding + margin)
         self._known: tuple[float, NDArray[np.float64], int] | None = None
 
     def on(self, costmap: Costmap) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
@@ -170,8 +206,8 @@ class FootprintChecks:
         resolution = costmap.resolution
         if self._known is None or self._known[0] != resolution:
             # A cell more: both the centre and the obstacle may be anywhere in theirs.
-            reach = self._footprint.circumscribed + resolution
+            reach = self._wider.circumscribed + resolution
             cost = cost_of_distance(reach, self._footprint.inscribed, self._inflation.decay)
             check_from = cost if reach <= self._inflation.radius else 0
-            self._known = (resolution, self._footprint.samples(resolution), check_from)
+            self._known = (resolution, self._wider.samples(resolution), check_from)
         return np.array([resolution, *costmap.origin]), self._known[1], self._known[2]

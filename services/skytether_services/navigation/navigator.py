@@ -22,7 +22,7 @@ from .checkers import GoalChecker, ProgressChecker
 from .controller import Controller, ControlStatus, FollowedPath, turn_towards
 from .costmap import INSCRIBED, LETHAL, Costmap
 from .dwa import Dwa
-from .footprint import cost_at
+from .footprint import FootprintChecks, cost_at
 from .geometry import Pose, advance
 from .grid_map import GridMap
 from .mppi import Mppi
@@ -91,6 +91,7 @@ class Navigator:
         self.no_map: Trouble | None = None
         self._controller = self._make_controller(for_controller)
         self._predicted = PredictedState(params.delay)
+        self._checks = FootprintChecks(self._footprint, params.inflation, params.planner.margin)
         self._goals = GoalChecker(params.goal)
         self._progress = ProgressChecker(params.progress)
         path = Path(params.behaviours) if params.behaviours else BUILT_IN
@@ -341,7 +342,7 @@ class Navigator:
         start = self.pose
         pieces: list[NDArray[np.float64]] = []
         for goal in self._asked.until_stop(_LEGS):
-            found = plan(whole, start, goal, self._params.planner)
+            found = plan(whole, start, goal, self._params.planner, self._checks)
             if found.status is not PlanStatus.FOUND or found.goal is None:
                 if pieces:
                     break  # the goals after the present one can wait

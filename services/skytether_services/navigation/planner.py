@@ -6,14 +6,21 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skytether.service import param
 
 from .costmap import INSCRIBED, UNKNOWN, Costmap
+from .footprint import FootprintChecks, misfits
 from .geometry import Pose
 from .search import relax, search, shortcut, walk_back
+
+_TRIES = 6
+"""Paths that are searched until the outline fits along one."""
+_CLOSED = 0.15
+"""So far around where it does not fit the next path must not lead [m]."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,15 @@ class PlannerParams:
     allow_unknown: bool = param(True, doc="plan through what nobody has seen")
     spacing: float = param(0.05, unit="m", gt=0, doc="between neighbouring poses of the path")
     smoothing_rounds: int = param(40, ge=0, le=1000, doc="rounds over the path; 0 leaves its corners")
+    margin: float = param(
+        0.08, unit="m", ge=0, le=1, doc="a path that leaves so much room around the robot's outline is looked for,"
+    )
+    detour: float = param(
+        10.0,
+        unit="m",
+        ge=0,
+        doc="and taken if it is longer by no more than this; 0: the shortest is, as narrow as it is",
+    )
 
 
 class PlanStatus(StrEnum):
@@ -65,17 +81,24 @@ class Plan:
     @property
     def length(self) -> float:
         """Of the path [m]."""
-        return float(np.hypot(*np.diff(self.path[:, :2], axis=0).T).sum())
+        return _length(self.path)
 
 
-def plan(costmap: Costmap, start: Pose, goal: Pose, params: PlannerParams) -> Plan:
+def plan(
+    costmap: Costmap, start: Pose, goal: Pose, params: PlannerParams, checks: FootprintChecks | None = None
+) -> Plan:
     """Search a path.
+
+    A search over cells knows nothing of the robot's heading, so where the robot cannot turn its path may have a bend.
+    With ``checks``, the outline is moved along the path; where it does not fit, another path is searched that leaves
+    these places out.
 
     Args:
         costmap: Inflated.
         start: Of the robot.
         goal: In the same frame.
         params: How.
+        checks: Of the outline with `PlannerParams.margin` around it; None: the path is not checked.
     """
     if not all(math.isfinite(value) for value in (*start, *goal)):
         return Plan(PlanStatus.NOT_FINITE, "The start or the goal has a coordinate that is not a finite number.")
@@ -119,9 +142,10 @@ def plan(costmap: Costmap, start: Pose, goal: Pose, params: PlannerParams) -> Pl
         goal, last = Pose(x, y, goal.yaw), free
         end = last[0] * columns + last[1]
         message = f"The goal {why}; the path ends at {_at(goal)}, the nearest place that can be reached."
-    way = walk_back(before, end)
-    points = np.column_stack((way % columns, way // columns)) + 0.5
+    points = _points(before, end, columns)
     path = _smooth(costs, points, costmap, goal, params)
+    if checks is not None and params.detour > 0:
+        path = _roomy(costs, path, costmap, (begin, end), goal, params, checks)
     # Where the robot stands the path begins, if a straight piece leads there.
     if costmap.cell(start.x, start.y) == first:
         path[0, :2] = start[:2]
@@ -150,6 +174,51 @@ def with_headings(points: NDArray[np.float64], last: float) -> NDArray[np.float6
     """
     ahead = np.diff(points, axis=0)
     return np.column_stack((points, np.append(np.arctan2(ahead[:, 1], ahead[:, 0]), last)))
+
+
+def _points(before: NDArray[np.int32], end: int, columns: int) -> NDArray[np.float64]:
+    """(column, row) of a way's cells, their middles, n by 2."""
+    way = walk_back(before, end)
+    return np.column_stack((way % columns, way // columns)) + np.float64(0.5)
+
+
+def _length(path: NDArray[np.float64]) -> float:
+    return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
+
+
+def _roomy(
+    costs: NDArray[np.uint8],
+    path: NDArray[np.float64],
+    costmap: Costmap,
+    ends: tuple[int, int],
+    goal: Pose,
+    params: PlannerParams,
+    checks: FootprintChecks,
+) -> NDArray[np.float64]:
+    """The path, or one that is not much longer, along which the outline fits; the path itself where none is found."""
+    frame, samples, check_from = checks.on(costmap)
+    if not len(samples):
+        return path  # what is round fits in its cells whichever way it faces
+    longest = _length(path) + params.detour
+    closed, tried = costs.copy(), path
+    for _ in range(_TRIES):
+        narrow = misfits(tried[:-1], costs, frame, samples, check_from)
+        fits = np.flatnonzero(~narrow)
+        # In the narrow place where the robot is, and in the one to which it is to go, it has no choice.
+        narrow = narrow[fits[0] : fits[-1]] if len(fits) else narrow[:0]
+        if not narrow.any():
+            return tried if len(fits) else path
+        for x, y in tried[fits[0] : fits[-1], :2][narrow].tolist():
+            at = costmap.cell(x, y)
+            if at is not None:
+                cv2.circle(closed, at[::-1], math.ceil(_CLOSED / costmap.resolution), INSCRIBED, cv2.FILLED)
+        best, before = search(closed, *ends, params.cost_weight, params.allow_unknown)
+        if not np.isfinite(best[ends[1]]):
+            return path
+        tried = _smooth(closed, _points(before, ends[1], costs.shape[1]), costmap, goal, params)
+        if _length(tried) > longest:
+            return path
+    return path
 
 
 def _smooth(

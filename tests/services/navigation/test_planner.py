@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skytether_services.navigation.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams
-from skytether_services.navigation.footprint import Footprint
+from skytether_services.navigation.footprint import Footprint, FootprintChecks, misfits
 from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.layers import LayeredCostmap
 from skytether_services.navigation.planner import PlannerParams, PlanStatus, plan, resample, with_headings
@@ -135,3 +135,54 @@ def test_at_the_goal_the_path_is_two_poses() -> None:
     assert result.status is PlanStatus.FOUND
     assert len(result.path) == 2
     assert result.path[-1].tolist() == pytest.approx([1.01, 3.01, 2.0])
+
+
+LONG = Footprint(corners=((0.35, 0.25), (-0.35, 0.25), (-0.35, -0.25), (0.35, -0.25)), padding=0.0)
+"""0.7 m by 0.5 m: its corners are 0.43 m from its middle."""
+
+
+def with_gaps(*gaps: tuple[float, float]) -> Costmap:
+    """A wall along x = 5 m, 0.4 m thick, with gaps, each from y to y [m]."""
+    costs = np.zeros((120, 200), dtype=np.uint8)
+    costs[:, 96:104] = LETHAL
+    for low, high in gaps:
+        costs[round(low * 20) : round(high * 20), 96:104] = 0
+    return LayeredCostmap(Costmap(costs, 0.05), LONG, inflation=InflationParams(radius=0.6)).compose()
+
+
+def crossing(costmap: Costmap, start: Pose, goal: Pose, margin: float = 0.05, **params: float) -> float:
+    """Where a path crosses the wall: y [m]."""
+    checks = FootprintChecks(LONG, InflationParams(radius=0.6), margin)
+    result = plan(costmap, start, goal, PlannerParams(margin=margin, **params), checks)
+    assert result.status is PlanStatus.FOUND
+    assert result.path[-1, :2].tolist() == pytest.approx(goal[:2])
+    return float(np.interp(5.0, result.path[:, 0], result.path[:, 1]))
+
+
+@pytest.mark.slow
+def test_a_gap_that_leaves_no_room_beside_the_robot_is_left_for_a_wider_one_near_by() -> None:
+    gaps = ((1.0, 1.55), (4.6, 5.7))
+    start, goal = Pose(3.0, 1.25, 0.0), Pose(7.0, 1.25, 0.0)
+    assert crossing(with_gaps(*gaps), start, goal, detour=0.0) == pytest.approx(1.28, abs=0.05)
+    assert 4.7 < crossing(with_gaps(*gaps), start, goal) < 5.6
+    # Not for one that is farther off than the detour may be, and not where there is no other.
+    assert crossing(with_gaps(*gaps), start, goal, detour=0.3) == pytest.approx(1.28, abs=0.05)
+    assert crossing(with_gaps(gaps[0]), start, goal) == pytest.approx(1.28, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_robot_in_a_narrow_place_goes_on_through_it() -> None:
+    gaps = ((1.0, 1.55), (4.6, 5.7))
+    assert crossing(with_gaps(*gaps), Pose(4.95, 1.28, 0.0), Pose(7.0, 1.25, 0.0)) == pytest.approx(1.28, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_path_bends_only_where_the_robot_has_room_to_turn() -> None:
+    costmap = with_gaps((1.0, 1.65))
+    checks = FootprintChecks(LONG, InflationParams(radius=0.6), 0.0)
+    frame, samples, check_from = checks.on(costmap)
+    straight = np.array([(x, 1.325, 0.0) for x in np.arange(4.0, 6.0, 0.05)])
+    assert not misfits(straight, costmap.costs, frame, samples, check_from).any()
+    # The same places, but in the gap it faces 0.6 rad to the side for one of them.
+    straight[20, 2] = 0.6
+    assert np.flatnonzero(misfits(straight, costmap.costs, frame, samples, check_from)).tolist() == [20, 21]
