@@ -171,7 +171,18 @@ def _print_steps(found: dict[str, Any]) -> None:
 def _print_delays(found: dict[str, Any]) -> None:
     from rich.table import Table
 
-    table = Table("round trip", "jitter", "loss", "compensation", "ended", "time", "path error", "contacts")
+    table = Table(
+        "round trip",
+        "jitter",
+        "loss",
+        "compensation",
+        "ended",
+        "time",
+        "path error",
+        "prediction",
+        "across",
+        "contacts",
+    )
     for row in found["rows"]:
         table.add_row(
             f"{1000 * row['round_trip']:.0f} ms",
@@ -180,14 +191,17 @@ def _print_delays(found: dict[str, Any]) -> None:
             row["compensation"],
             row["state"],
             f"{row['seconds']:.1f} s",
-            f"{1000 * row['path_error']:.0f} mm",
+            *(f"{1000 * row[error]:.1f} mm" for error in ("path_error", "prediction_error", "prediction_across")),
             str(row["contacts"]),
         )
     console.print(table)
     for name, text in (
         ("time_within_bar", "At the longest round trip within 5 % of the time without delay"),
-        ("measured_beats_fixed", "With jitter and loss measured is nearer to the path than fixed"),
-        ("measured_halves_off", "and at most half as far off as without compensation"),
+        (
+            "measured_beats_fixed",
+            "With jitter and loss measured predicts the robot's place better than fixed, along its way and across",
+        ),
+        ("measured_halves_off", "and leaves at most half the path error of none"),
     ):
         console.print(f"{text}: {'yes' if found[name] else 'no'}.", highlight=False)
 

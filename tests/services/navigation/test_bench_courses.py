@@ -32,6 +32,22 @@ def test_a_prediction_is_held_against_the_motion_and_not_the_place() -> None:
     assert len(predictions.errors) == 1
 
 
+def test_a_command_that_is_late_is_an_error_along_the_way_and_a_wrong_turn_one_across_it() -> None:
+    predictions = Predictions(0.0)
+    # Each tick 0.01 m along a heading that it turned to in the first one.
+    for tick in range(1, 9):
+        predictions.saw(Pose(0.01 * tick * np.cos(0.5), 0.01 * tick * np.sin(0.5), 0.5 if tick > 1 else 0.0))
+    still = Velocity(0.0, 0.0)
+    seen, far = State(Pose(0.0, 0.0, 0.0), still, 0.01), 0.05
+    for tick, place in ((3, (far * np.cos(0.5), far * np.sin(0.5))), (4, (far, 0.0))):
+        expected = State(Pose(float(place[0]), float(place[1]), 0.5), still, 0.07)
+        predictions.sent(tick / 100, seen, expected)
+        predictions.arrived(tick / 100, 0.08)
+    # It truly went 0.06 m.
+    np.testing.assert_allclose(predictions.across, [0.0, 0.05 * np.sin(0.5)], atol=1e-12)
+    np.testing.assert_allclose(predictions.errors[0], 0.01, atol=1e-12)
+
+
 def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
     assert score(True, 10.0, 12.0) == pytest.approx(1 / 2)
     assert score(True, 10.0, 40.0) == pytest.approx(1 / 4)
@@ -42,7 +58,14 @@ def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
 def rows(off: float, fixed: float, measured: float, late: float, state: str = "succeeded") -> list[dict[str, Any]]:
     def row(trip: float, jitter: float, kind: str, error: float, seconds: float) -> dict[str, Any]:
         told = {"round_trip": trip, "jitter": jitter, "compensation": kind}
-        return {**told, "path_error": error, "prediction_error": error, "seconds": seconds, "state": state}
+        return {
+            **told,
+            "path_error": error,
+            "prediction_error": error,
+            "prediction_across": error / 9,
+            "seconds": seconds,
+            "state": state,
+        }
 
     plain = [row(0.0, 0.0, "measured", 0.02, 100.0), row(0.2, 0.0, "measured", 0.02, late)]
     errors = {"off": off, "fixed": fixed, "measured": measured}

@@ -149,7 +149,7 @@ class DelaysBench(Protocol):
 
         Returns:
             ``time_within_bar, measured_beats_fixed, measured_halves_off``, and ``rows``, each a drive: ``round_trip,
-            jitter, loss, compensation, state, seconds, path_error, contacts``.
+            jitter, loss, compensation, state, seconds, path_error, prediction_error, prediction_across, contacts``.
 
         Raises:
             skytether.lab.world.model.WorldError: The simulated world cannot be made.
