@@ -29,6 +29,8 @@ _STANDS = 0.05
 """A robot that is slower stands [m/s]."""
 _SETTLED = 0.3
 """A turn on the spot ends slower than this: of the scores for an arc none would end it [rad/s]."""
+_ALMOST = 0.1
+"""So far from the goal's heading a turn at the goal need not be free: near enough counts [rad]."""
 _SLOW = 0.2
 """As fast the robot drives away from what keeps it from turning [m/s]."""
 
@@ -218,7 +220,7 @@ class Dwa(PathController):
         elif near > 2.5 * self._params.goal_within:
             self._at_goal = False
         if self._at_goal:
-            return self._turn(pose, velocity, costmap, goal.yaw - pose.yaw)
+            return self._turn(pose, velocity, costmap, goal.yaw - pose.yaw, _ALMOST)
         ahead = poses[min(len(poses) - 1, math.ceil(2 * self._params.front / costmap.resolution))]
         away = math.dist(ahead[:2], pose[:2])
         error = wrap(math.atan2(ahead[1] - pose.y, ahead[0] - pose.x) - pose.yaw) if away > 0.1 else 0.0
