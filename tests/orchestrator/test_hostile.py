@@ -297,8 +297,18 @@ def test_instances_and_streams_that_a_robot_asks_for_starve_nobody(
     honest.was_in_time()
 
 
-def test_a_pattern_freezes_nobody(program: Program, honest: Honest, hostile: Hostile) -> None:
-    schema = {"properties": {"name": {"type": "string", "pattern": "^(a+)+$"}}}
+TWICE = [{"$ref": f"#/$defs/d{level + 1}"} for level in range(30)]
+SCHEMAS = {
+    "pattern": {"type": "string", "pattern": "^(a+)+$"},
+    "dialect": {"$schema": "https://json-schema.org/draft/2020-12/schema", "pattern": "^(a+)+$"},
+    "references": {"$ref": "#/$defs/d0"},
+}
+
+
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_a_pattern_or_a_schema_freezes_nobody(kind: str, program: Program, honest: Honest, hostile: Hostile) -> None:
+    definitions = {f"d{level}": {"anyOf": [next_one, next_one]} for level, next_one in enumerate(TWICE)}
+    schema = {"$defs": {**definitions, "d30": {"type": "number"}}, "properties": {"name": SCHEMAS[kind]}}
     evil = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "evil"}}
     with operator_of(program) as operator:
         operator.put_service("evil", {**evil, "spec": {"entrypoint": "x", "params": schema}})

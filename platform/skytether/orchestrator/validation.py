@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from jsonschema import Draft202012Validator
-from jsonschema.exceptions import SchemaError, ValidationError
+from jsonschema.exceptions import ValidationError
 from pydantic import BaseModel
 from pydantic import ValidationError as PydanticError
 from referencing import Registry
@@ -15,10 +15,18 @@ from referencing.jsonschema import DRAFT202012
 
 from skytether.api.faults import MAX_FAULTS, Fault, explain, unknown
 
+from .effort import UNUSABLE, EffortError, Validator, bounded
 from .errors import InvalidError
-from .patterns import PatternError, Validator, wrong_with
+from .patterns import PatternError, wrong_with
 
 Model = TypeVar("Model", bound=BaseModel)
+
+_SCHEMA_OF_SCHEMAS: Any = Validator(Draft202012Validator.META_SCHEMA)
+_NAMING = ("properties", "patternProperties", "$defs", "dependentSchemas")
+"""Keywords whose keys are names, whatever they are."""
+_NO_ADDRESS = "an $id or $ref in it is no address"
+_LONGEST = 300
+"""Characters of what is said of a value."""
 
 
 def parse(model: type[Model], document: Any, what: str = "", prefix: Sequence[str] = ()) -> Model:
@@ -39,30 +47,43 @@ def check_schema(schema: Mapping[str, Any], prefix: str) -> None:
     Raises:
         InvalidError: It is none; the fault names the key inside it.
     """
+    error = next(_SCHEMA_OF_SCHEMAS.iter_errors(schema), None)
+    if error is not None:
+        raise InvalidError([Fault(_join(prefix, error.absolute_path), error.message[:_LONGEST])])
+    _check_keywords(schema, prefix)
     try:
-        Draft202012Validator.check_schema(schema)
-    except SchemaError as error:
-        raise InvalidError([Fault(_join(prefix, error.absolute_path), error.message)]) from None
-    _check_patterns(schema, prefix)
-    here = Registry().with_resource("", DRAFT202012.create_resource(dict(schema))).resolver()
+        here = _places_in(schema)
+    except ValueError:
+        raise InvalidError([Fault(prefix, _NO_ADDRESS)]) from None
     for path, reference in _references(schema):
         try:
             here.lookup(reference)
-        except Unresolvable:
+        except (Unresolvable, ValueError):  # the latter: it is no address
             text = f"there is no '{reference}' in this schema, and nothing is fetched from elsewhere"
             raise InvalidError([Fault(_join(prefix, path), text)]) from None
 
 
-def _check_patterns(schema: Mapping[str, Any], prefix: str) -> None:
-    faults, both = [], set()
+def _places_in(schema: Mapping[str, Any]) -> Any:
+    """Finds what a schema's references mean. It has looked through it once, and does not for each name again.
+
+    Raises:
+        ValueError: An address in it is none.
+    """
+    # Nothing but the schema is in there: a manifest must not make this server fetch a reference from somewhere.
+    resource = DRAFT202012.create_resource(dict(schema))
+    name = resource.id() or ""
+    return Registry().with_resource(name, resource).crawl().resolver(name)
+
+
+def _check_keywords(schema: Mapping[str, Any], prefix: str) -> None:
+    faults = []
     for path, key, value in _keywords(schema):
         patterns = [value] if key == "pattern" and isinstance(value, str) else []
         if key == "patternProperties" and isinstance(value, Mapping):
             patterns = [str(pattern) for pattern in value]
         faults += [Fault(_join(prefix, path), f"'{p[:80]}' {why}") for p in patterns if (why := wrong_with(p))]
-        both |= {key} & {"patternProperties", "unevaluatedProperties"}
-    if len(both) > 1:
-        faults.append(Fault(prefix, "unevaluatedProperties beside patternProperties: write additionalProperties"))
+        if key in UNUSABLE and path[-2:-1] not in [(word,) for word in _NAMING]:
+            faults.append(Fault(_join(prefix, path), f"cannot be used; write {UNUSABLE[key]}"))
     if faults:
         raise InvalidError(faults[:MAX_FAULTS])
 
@@ -92,14 +113,19 @@ def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: 
         InvalidError: With each wrong key.
     """
     closed = {"additionalProperties": False, **schema}
-    # An empty registry: a manifest must not make this server fetch a reference from somewhere.
-    validator = Validator(closed, registry=Registry())
     try:
-        errors = sorted(validator.iter_errors(params), key=lambda e: [str(p) for p in e.absolute_path])
+        validator = Validator(closed, registry=Registry(), _resolver=_places_in(closed))
+        with bounded(params):
+            errors = sorted(validator.iter_errors(params), key=lambda e: [str(p) for p in e.absolute_path])
     except Unresolvable as error:
         raise InvalidError([Fault("spec.params", f"cannot resolve the reference {error.ref}")], service) from None
     except PatternError as error:
         raise InvalidError([Fault("spec.params", f"{error}: correct the manifest")], service) from None
+    except ValueError:
+        raise InvalidError([Fault("spec.params", f"{_NO_ADDRESS}: correct the manifest")], service) from None
+    except EffortError as error:
+        text = f"{error}: give fewer of them, or let the manifest's schema say less"
+        raise InvalidError([Fault("params", text)], f"service '{service}'") from None
     except RecursionError:
         text = "the schema refers to itself without end: correct the manifest"
         raise InvalidError([Fault("spec.params", text)], service) from None
@@ -121,7 +147,7 @@ def _params_faults(error: ValidationError) -> list[Fault]:
         known = schema.get("properties", {})
         extra = [key for key in error.instance if key not in known]
         return [Fault(_join("params", [*here, key]), unknown(str(key), known)) for key in extra]
-    return [Fault(_join("params", here), error.message[:300])]
+    return [Fault(_join("params", here), error.message[:_LONGEST])]
 
 
 def _join(prefix: str, path: Iterable[Any]) -> str:
