@@ -190,3 +190,48 @@ def test_a_request_before_the_last_answer_ends_the_connection_after_that_answer(
 def test_who_sends_on_and_on_instead_of_waiting_is_cut_off() -> None:
     answers, served = asyncio.run(answers_to(get("/a"), *(get("/b") * 5000,) * 4))
     assert (answers, served) == (b"", ["/a"])
+
+
+TOO_LARGE = b"The request's headers are too large."
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        (b"GET / HTTP/1.1\r\n" + b"a:b\r\n" * 102,),
+        (b"GET / HTTP/1.1\r\n", *(b"a:b\r\n" * 50,) * 3),
+        (b"GET / HTTP/1.1\r\n" + b"a:" + b"b" * 60_000 + b"\r\n",),
+        (b"GET / HTTP/1.1\r\na:" + b"b" * 70_000,),
+        (b"GET / HTTP/1.1\r\na:", *(b"b" * 15_000,) * 4),
+        (b"GET /" + b"b" * 40_000,),
+        (b"GET /?" + b"b" * 20_000 + b" HTTP/1.1\r\na:" + b"b" * 13_000 + b"\r\nc:d",),
+    ],
+    ids=["many", "many later", "long", "without end", "without end later", "path", "in sum"],
+)
+def test_a_head_is_bounded_before_it_is_complete(asked: tuple[bytes, ...]) -> None:
+    answers, served = asyncio.run(answers_to(*asked))
+    assert (answers[:12], answers[-len(TOO_LARGE) :], served) == (b"HTTP/1.1 400", TOO_LARGE, [])
+
+
+def test_heads_and_bodies_as_people_send_them_are_served() -> None:
+    headers = b"Host: localhost\r\n" + b"".join(b"x-%d: %s\r\n" % (n, b"v" * 200) for n in range(98))
+    answers, served = asyncio.run(answers_to(b"GET /a?q=" + b"v" * 8_000 + b" HTTP/1.1\r\n" + headers + b"\r\n"))
+    assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/a"])
+    body = b"POST /b HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\n" + b"v" * 100_000
+    answers, served = asyncio.run(answers_to(body))
+    assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/b"])
+
+
+def test_what_comes_after_a_body_is_no_header() -> None:
+    seen: list[Any] = []
+
+    class Watched(GuardedProtocol):
+        def on_message_complete(self) -> None:
+            seen.extend(self.scope["headers"])
+            super().on_message_complete()
+
+    head = b"POST /a HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    chunks = b"1\r\nx\r\n0\r\nauthorization: x\r\n\r\n"
+    answers, served = asyncio.run(answers_to(head + chunks, make=Watched))
+    assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/a"])
+    assert [name for name, _ in seen] == [b"host", b"transfer-encoding"]

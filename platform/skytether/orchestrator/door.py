@@ -41,6 +41,12 @@ _CROWD = 256
 """After so many connections have gone, what they used is given back to the system."""
 _MOST_AROUND = 1 << 18
 """Bytes of a request that are not its body: line, headers, what frames chunks."""
+_MOST_HEAD = 1 << 15
+"""Bytes of its line and headers. Strangers hold 1,024 of them."""
+_MOST_FIELDS = 100
+"""Headers of a request: each takes more memory than it has bytes, 5 MB for 256 KiB of short ones."""
+_PIECE = 1 << 14
+"""Bytes that the parser gets at once: what it has of a header that goes on is not told before the next ones."""
 
 
 class Guest:
@@ -167,6 +173,10 @@ class _AheadError(Exception):
     """A request came before the answer to the one before."""
 
 
+class _HeadError(Exception):
+    """A request's head is too large; the parser goes no further."""
+
+
 class GuardedProtocol(HttpToolsProtocol):
     """Uvicorn's, with a deadline for each part of a request, a bound on what is not body, and one request at a time."""
 
@@ -174,6 +184,10 @@ class GuardedProtocol(HttpToolsProtocol):
     book: Book
     limits: Limits
     _around = 0
+    _head = 0
+    """Bytes of the line and of headers that are complete."""
+    _reads_head = False
+    _too_large = False
     _reads_body = False
     _idle = False
     _ahead = False
@@ -190,17 +204,25 @@ class GuardedProtocol(HttpToolsProtocol):
         self.guest.protocol = self.cycle = None  # type: ignore[assignment]
 
     def data_received(self, data: bytes) -> None:
+        for begin in range(0, len(data), _PIECE):
+            if not self.transport.is_closing():
+                self._feed(data[begin : begin + _PIECE])
+
+    def _feed(self, data: bytes) -> None:
         self._around += len(data)
         if self._ahead:  # what comes until it is answered is thrown away, and who sends on and on is cut off
-            return self.transport.abort() if self._around > _MOST_AROUND else None
+            if self._around > _MOST_AROUND:
+                self.transport.abort()
+            return
         super().data_received(data)
-        if self._around > _MOST_AROUND and not self.transport.is_closing():
-            self.send_400_response("The request's headers are too large.")
-        return None
+        most = _MOST_HEAD if self._reads_head else _MOST_AROUND
+        if self._around > most and not self.transport.is_closing():
+            self._too_large = True
+            self.send_400_response("")
 
     def send_400_response(self, msg: str) -> None:
         if not self._ahead:  # there is an answer under way
-            super().send_400_response(msg)
+            super().send_400_response("The request's headers are too large." if self._too_large else msg)
 
     def on_message_begin(self) -> None:
         if self.cycle is not None and not self.cycle.response_complete:
@@ -209,15 +231,37 @@ class GuardedProtocol(HttpToolsProtocol):
             # 9112, 9.3.2); the error keeps the parser from the others.
             self._ahead, self.cycle.keep_alive = True, False
             raise _AheadError
-        self._around = 0
+        self._around = self._head = 0
+        self._reads_head = True
         super().on_message_begin()
         self.scope[GUEST] = self.guest  # type: ignore[literal-required]
         if self._idle:  # the first head is due from the moment when the connection was taken
             self._idle = False
             self._owes(self.limits.head_s)
 
+    def on_url(self, url: bytes) -> None:
+        self._keep(len(url))
+        super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if not self._reads_head:
+            return  # after the body: nobody here asks for those
+        self._keep(len(name) + len(value))
+        if len(self.headers) >= _MOST_FIELDS:
+            self._refuse_head()
+        super().on_header(name, value)
+
+    def _keep(self, size: int) -> None:
+        self._head += size
+        if self._head > _MOST_HEAD:
+            self._refuse_head()
+
+    def _refuse_head(self) -> None:
+        self._too_large = True
+        raise _HeadError
+
     def on_headers_complete(self) -> None:
-        self._reads_body = True
+        self._reads_head, self._reads_body = False, True
         self._owes(self.limits.body_s)
         super().on_headers_complete()
         self.guest.busy = True
