@@ -62,6 +62,7 @@ TOGETHER = (
     "orchestrator/test_faults.py",
     "orchestrator/test_faults_engine.py",
     "orchestrator/test_images.py",
+    "orchestrator/test_left_behind.py",
     "orchestrator/test_migrations.py",
     "orchestrator/test_moves.py",
     "orchestrator/test_navigation_image.py",

@@ -64,6 +64,8 @@ _OWN_MB = 64
 """MiB that a run may have in its own folder, which is also its home and has its temporary files."""
 _WEIGH = 2.0
 """Seconds between two looks at how much robots' services have written."""
+_EMPTY = 0.2
+"""Seconds at a time for what runs that have ended left behind."""
 _MEASURE = 2.0
 """Seconds between two readings of processor time, memory and ready file of a child that runs; whether it still does is
 looked at each time."""
@@ -416,6 +418,16 @@ class ProcessRuntime(Runtime):
                 if os.stat(path).st_size > self._options.log_bytes:
                     with self._fence.acting(instance):
                         keep_newer_half(Path(path), self._options.log_bytes // 2)
+        self._empty_some()
+
+    def _empty_some(self) -> None:
+        """Own folders of runs that have ended, for a while: others wait, and the rest has its turn at the next call."""
+        began = time.monotonic()
+        for instance, run in self._runs.all().items():
+            if run.ended and not run.emptied and time.monotonic() - began < _EMPTY:
+                with self._fence.acting(instance):
+                    if self._runs.find(instance, acting=True) is run:  # else somebody has begun it anew
+                        run.empty()
 
 
 _left_running: list[subprocess.Popen[bytes]] = []

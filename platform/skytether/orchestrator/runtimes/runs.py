@@ -22,6 +22,7 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.service_report import FILE_NAME, ServiceReport, pull_reports
 
 from .base import Observation, Phase, RuntimeFailure
+from .disk import remove_tree, size_of
 from .fence import Fence
 from .notes import noted_port, read_json, write_private
 from .procfs import BOOT_ID, ProcessId, find_by_environment, session_members, stat_of, user_of
@@ -29,6 +30,8 @@ from .users import end_all_of, give_user_back, keep_user, noted_user
 
 OWN = "own"
 """A run's own folder, in that of its instance."""
+_TOLD_BYTES = 1 << 20
+"""On disk, of what a run has told, at most."""
 _PASSES = 20
 """Looks at a session that is being ended: whoever forks meanwhile is in the next one."""
 _WHOLE = 1.0
@@ -68,6 +71,8 @@ class Run:
     """Which ready file was read, and its port."""
     reported: tuple[Stamp, tuple[ServiceReport, ...]] | None = None
     """Which file of reports was read, and what is in it."""
+    emptied: bool = False
+    """Of what it left in its own folder."""
 
     @property
     def ended(self) -> Observation | None:
@@ -105,6 +110,26 @@ class Run:
         if self.reported is None or self.reported[0] != written:
             self.reported = written, pull_reports(read_json(Path(path)))
         return self.reported[1]
+
+    def empty(self) -> None:
+        """End what it left behind once it has ended, and remove its own folder's content, but for what it told.
+
+        The instance is kept for a day, so that people can ask for its log: so long its home and its temporary files
+        would count for nobody, however large, and its grant would be there to be read.
+        """
+        own = f"{self.folder}/{OWN}"
+        told = [Path(own, os.path.basename(self.ready_file)), Path(own, FILE_NAME)]
+        with contextlib.suppress(OSError):  # its folder is gone, or the disk is full
+            size = size_of(own, _TOLD_BYTES)
+            if size is None or size > _TOLD_BYTES or not {*os.listdir(own)} <= {path.name for path in told}:
+                self.kill()  # what its main process left behind would write on
+                documents = [(path, read_json(path)) for path in told]
+                remove_tree(own)
+                os.mkdir(own, 0o700)
+                for path, document in documents:
+                    if document:
+                        write_private(path, json.dumps(document))
+        self.emptied = True
 
     def kill(self) -> None:
         """Kill it and everything in its session, and of its own user: it may have left the session."""
