@@ -50,6 +50,15 @@ def test_a_face_to_the_left_turns_to_the_left_by_what_exceeds_the_dead_band() ->
         assert formation.step(3.05).velocity.angular == pytest.approx(math.radians(expected), abs=1e-6)
 
 
+def test_what_was_turned_since_the_last_face_is_counted_off_if_it_predicts() -> None:
+    for predict in (True, False):
+        formation = Formation(FormationParams(predict=predict))
+        settled(formation, angle=math.radians(30))
+        turns = [formation.step(at).velocity.angular for at in (3.1, 3.2, 3.3, 3.4)]  # no new face
+        assert turns == sorted(turns, reverse=True)
+        assert (turns[0] > turns[-1] + 0.01) == predict
+
+
 def test_an_operator_aside_slows_it_and_one_far_aside_stops_it() -> None:
     formation = Formation(FormationParams(predict=False))
     for step in range(31):
