@@ -277,6 +277,24 @@ def test_what_it_wrote_before_it_had_a_user_is_its_own_and_nothing_else_is(tmp_p
     runtime.remove("i1")
 
 
+@pytest.mark.slow
+def test_what_holds_is_found_under_a_clock_that_is_faked_too(faketime: str) -> None:
+    program = (
+        "from skytether.orchestrator.runtimes.confinement import _imported, readable, this_machine\n"
+        "tried = set()\n"
+        "for _ in range(10):\n"
+        "    this_machine.cache_clear()\n"
+        "    _imported.cache_clear()\n"
+        "    tried.add((this_machine(), tuple(readable(()))))\n"
+        "print(*tried, sep='\\n')"
+    )
+    faked = {**os.environ, "LD_PRELOAD": faketime, "FAKETIME": "+1h", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+    command = [sys.executable, "-c", program]
+    told = [subprocess.check_output(command, text=True, env=env).splitlines() for env in (dict(os.environ), faked)]
+    assert told[0] == told[1]
+    assert len(told[0]) == 1
+
+
 def test_nobody_else_is_ended() -> None:
     for user in (-1, 0, 1000, users.USERS[1] + 1):
         with pytest.raises(ValueError, match="no instance's own user"):

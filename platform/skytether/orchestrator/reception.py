@@ -61,7 +61,11 @@ class Doorman(Protocol):
         """
 
     def recent(self, token: str | None, address: str) -> Principal | None:
-        """The same at once, if it was known a moment ago, or refused; takes no request of who was known."""
+        """The same at once, if it was known a moment ago; takes no request of who was.
+
+        Raises:
+            DomainError: Nobody, as was found a moment ago, or too often.
+        """
 
     def spend(self, caller: Principal) -> None:
         """Take a request of who was known a moment ago, at once.

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from . import confine
 from .base import RuntimeFailure
@@ -74,10 +75,8 @@ class Machine:
 @functools.cache
 def this_machine() -> Machine:
     """Tried once, by a process that ends."""
-    command = [sys.executable, "-I", "-S", confine.__file__, '{"probe": true}']
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_S, check=True)
-        has = json.loads(done.stdout)
+        has = _answer("-S", confine.__file__, '{"probe": true}')
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         return Machine(0, seccomp=False, user=False, why=str(error))
     return Machine(has["landlock"], has["seccomp"], has["user"], has.get("why", ""), has["hidden"])
@@ -100,13 +99,25 @@ def _imported() -> tuple[str, ...]:
     This process's own ``sys.path`` has more: the folder that the orchestrator was started in, which is nobody's code
     and would stand, closed to the services, before what is in it; PYTHONPATH; a home's packages.
     """
-    command = [sys.executable, "-I", "-c", "import json, sys; print(json.dumps(sys.path))"]
     try:
-        # Without a time-out it is simply read: a wait for several pipes fails now and then under a clock that is faked.
-        told = subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True)
-        return tuple(path for path in json.loads(told) if os.path.isabs(path))
+        paths = _answer("-c", "import json, sys; print(json.dumps(sys.path))")
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         raise RuntimeFailure(f"{sys.executable} does not say where it imports from: {error}") from error
+    return tuple(path for path in paths if os.path.isabs(path))
+
+
+def _answer(*arguments: str) -> Any:
+    """What a Python that is started as services are prints, as JSON.
+
+    The time-out is not `subprocess`'s: that sleeps, which fails now and then under a clock that is faked (libfaketime).
+
+    Raises:
+        OSError: It cannot be started.
+        ValueError: That is no JSON.
+        SubprocessError: It failed, or took too long.
+    """
+    command = ["timeout", str(_PROBE_S), sys.executable, "-I", *arguments]
+    return json.loads(subprocess.check_output(command, stderr=subprocess.DEVNULL))
 
 
 def opened(secret: Path, read: Sequence[str]) -> str | None:
