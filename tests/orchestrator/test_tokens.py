@@ -167,6 +167,19 @@ def test_what_was_refused_a_moment_ago_is_refused_again_at_once_and_counted(stor
     assert access.recent(token, "10.0.0.1").robot == "walker"
 
 
+def test_a_token_that_expired_by_a_clock_set_wrong_is_good_as_soon_as_the_clock_is_right(
+    store: Store, tmp_path: Any, clock: Any
+) -> None:
+    access = Access(store, Secrets(tmp_path), clock, Throttle(100, 100, lambda: 0.0))
+    _, token = access.register("walker", ("*",), ttl_s=60)
+    clock.set_by(3600)
+    with pytest.raises(UnauthenticatedError, match="expired"):
+        access.authenticate(token)
+    assert access.recent(token) is None
+    clock.set_by(-3600)
+    assert access.authenticate(token).robot == "walker"
+
+
 def refused(call: Callable[[], Any]) -> int:
     with pytest.raises(ApiError) as caught:
         call()

@@ -28,6 +28,7 @@ from .errors import (
     NotFoundError,
     TooManyError,
     UnauthenticatedError,
+    UnknownTokenError,
 )
 from .security import PREFIX_LENGTH, Secrets, TokenHash, new_token
 from .store import Store
@@ -115,7 +116,8 @@ class Access:
         self._recent: OrderedDict[str, tuple[Principal, float]] = OrderedDict()
         """Who showed a token, by its SHA-256, and the monotonic time when the database knew it last."""
         self._unknown: OrderedDict[str, tuple[str, float]] = OrderedDict()
-        """Why a token was refused, likewise."""
+        """Why a token that nobody knew was refused, likewise. One that expired is asked about each time: the clock may
+        be set back."""
 
     def authenticate(self, token: str | None, address: str = "") -> Principal:
         """Find out who asks.
@@ -147,7 +149,8 @@ class Access:
             principal = self._find(token)
         except UnauthenticatedError as error:
             self._recent.pop(digest, None)
-            _keep(self._unknown, digest, str(error))
+            if isinstance(error, UnknownTokenError):
+                _keep(self._unknown, digest, str(error))
             raise
         self._unknown.pop(digest, None)
         _keep(self._recent, digest, principal)
@@ -171,7 +174,7 @@ class Access:
         """Who showed this token in the last seconds, at once: for what tells nothing that matters, takes no request.
 
         Raises:
-            UnauthenticatedError: It was refused a moment ago, or there is none: likewise without a wait.
+            UnauthenticatedError: Nobody knew it a moment ago, or there is none: likewise without a wait.
             TooManyError: They asked too often; those who do are to cost as little as can be.
         """
         digest, now = _digest(token or ""), time.monotonic()
@@ -199,7 +202,7 @@ class Access:
         for row, robot in self._store.holders(token[:PREFIX_LENGTH]):
             if row.hash.matches(token):
                 return self._principal(row, robot)
-        raise UnauthenticatedError("this token is not known here: it was revoked, or is another orchestrator's")
+        raise UnknownTokenError("this token is not known here: it was revoked, or is another orchestrator's")
 
     def _principal(self, row: TokenRow, robot: RobotRow | None) -> Principal:
         now = self._clock()

@@ -41,7 +41,11 @@ class ForbiddenError(DomainError):
 
 
 class UnauthenticatedError(DomainError):
-    """No token, or one that nobody was given."""
+    """No token, or one that is not good."""
+
+
+class UnknownTokenError(UnauthenticatedError):
+    """A token that nobody was given, or that was revoked."""
 
 
 class SilentSiteError(DomainError):
