@@ -11,8 +11,9 @@ from types import ModuleType
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+from .figure import head_xml, scene_xml, trunk_xml
 from .plan import Box, Plan, Walk
-from .robot import RobotParams
+from .robot import RearParams, RobotParams
 
 PHYSICS_STEP = 0.005
 """Of MuJoCo, s."""
@@ -43,25 +44,30 @@ def load_mujoco() -> ModuleType:
     return mujoco  # type: ignore[no-any-return]
 
 
-def compile_model(plan: Plan, people: tuple[Walk, ...], robots: int, params: RobotParams) -> Any:
-    """An ``MjModel``.
+def compile_model(
+    plan: Plan, people: tuple[Walk, ...], robots: int, params: RobotParams, operator: str | None = None
+) -> Any:
+    """An ``MjModel``; ``operator`` is the name of one who has a head.
 
     Raises:
         WorldError: MuJoCo is missing, or does not take the plan.
     """
     mujoco = load_mujoco()
     try:
-        return mujoco.MjModel.from_xml_string(model_xml(plan, people, robots, params))
+        return mujoco.MjModel.from_xml_string(model_xml(plan, people, robots, params, operator))
     except ValueError as error:
         raise WorldError(f"MuJoCo does not take the plan {plan.name}: {error}") from error
 
 
-def model_xml(plan: Plan, people: tuple[Walk, ...], robots: int, params: RobotParams) -> str:
+def model_xml(
+    plan: Plan, people: tuple[Walk, ...], robots: int, params: RobotParams, operator: str | None = None
+) -> str:
     """MJCF of all of it."""
+    before, inside = scene_xml(params.rear) if params.rear is not None else ("", "")
     parts = [
         f'<mujoco model={quoteattr(plan.name)}><option timestep="{PHYSICS_STEP}" gravity="0 0 0"'
         ' integrator="implicitfast"/><default><geom condim="3" friction="0.3 0.005 0.0001" contype="0"'
-        ' conaffinity="1"/></default><worldbody>'
+        f' conaffinity="1"/></default>{before}<worldbody>{inside}'
     ]
     parts += [_box(box) for box in plan.boxes]
     parts += [
@@ -71,6 +77,8 @@ def model_xml(plan: Plan, people: tuple[Walk, ...], robots: int, params: RobotPa
     ]
     parts += [_robot(index, params) for index in range(robots)]
     parts += [_person(person) for person in people]
+    if operator is not None:
+        parts += [_legs(operator, 0.0, 0.0), trunk_xml(operator, 0.0, 0.0), head_xml(operator, 0.0, 0.0)]
     parts.append("</worldbody></mujoco>")
     return "".join(parts)
 
@@ -96,22 +104,38 @@ def _robot(index: int, params: RobotParams) -> str:
     return (
         f'<body name="{name}"><inertial pos="0 0 {z}" mass="{p.mass}" diaginertia="{inertia} {inertia} {inertia}"/>'
         f'<joint name="{name}-x" type="slide" axis="1 0 0"/><joint name="{name}-y" type="slide" axis="0 1 0"/>'
-        f'<joint name="{name}-turn" type="hinge" axis="0 0 1"/>{geoms}</body>'
+        f'<joint name="{name}-turn" type="hinge" axis="0 0 1"/>{geoms}{_camera(name, p.rear)}</body>'
+    )
+
+
+def _camera(name: str, rear: RearParams | None) -> str:
+    """Looks back and up; x is to the right in the picture, y up."""
+    if rear is None:
+        return ""
+    sin, cos = math.sin(rear.camera_up), math.cos(rear.camera_up)
+    high = 2 * math.atan(math.tan(rear.camera_field / 2) * rear.height / rear.width)
+    return (
+        f'<camera name="{name}-camera" pos="{rear.camera_x} 0 {rear.camera_z}" xyaxes="0 1 0 {sin} 0 {cos}"'
+        f' fovy="{math.degrees(high)}"/>'
     )
 
 
 def _person(person: Walk) -> str:
     """Legs that the laser sees, and a trunk above them; each is moved by itself."""
     x, y = person.way[0]
-    legs = "".join(
-        f'<body name={quoteattr(f"{person.name}-{leg}")} mocap="true" pos="{x} {y} 0"><geom type="cylinder"'
-        f' name={quoteattr(f"{person.name}-{leg}-leg")} size="{_LEG_RADIUS} {_LEG_HEIGHT / 2}"'
-        f' pos="0 0 {_LEG_HEIGHT / 2}"/></body>'
-        for leg in LEGS
-    )
     low = _LEG_HEIGHT
     return (
-        f'{legs}<body name={quoteattr(f"{person.name}-trunk")} mocap="true" pos="{x} {y} 0"><geom type="cylinder"'
+        f'{_legs(person.name, x, y)}<body name={quoteattr(f"{person.name}-trunk")} mocap="true" pos="{x} {y} 0">'
+        '<geom type="cylinder"'
         f' name={quoteattr(f"{person.name}-body")} size="{_BODY_RADIUS} {(_BODY_TOP - low) / 2}"'
         f' pos="0 0 {(_BODY_TOP + low) / 2}"/></body>'
+    )
+
+
+def _legs(name: str, x: float, y: float) -> str:
+    return "".join(
+        f'<body name={quoteattr(f"{name}-{leg}")} mocap="true" pos="{x} {y} 0"><geom type="cylinder"'
+        f' name={quoteattr(f"{name}-{leg}-leg")} size="{_LEG_RADIUS} {_LEG_HEIGHT / 2}"'
+        f' pos="0 0 {_LEG_HEIGHT / 2}" rgba="0.20 0.20 0.24 1"/></body>'
+        for leg in LEGS
     )

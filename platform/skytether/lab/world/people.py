@@ -17,7 +17,7 @@ from .plan import Walk
 CLEARANCE = 0.85
 """From the middle of a robot to a person who goes on walking, m: half a robot, a leg, and a stride of a foot."""
 
-_HIP = 0.11
+HIP = 0.11
 """Of each leg beside the middle, m."""
 _STRIDE = 0.45
 """Way of one step, m; the legs swing by half of it."""
@@ -102,7 +102,7 @@ class Person:
         swing = self._swing * _STRIDE / 2 * math.sin(self._phase)
 
         def foot(side: float) -> tuple[float, float]:
-            along, across = side * swing, side * _HIP
+            along, across = side * swing, side * HIP
             return x + cos * along - sin * across, y + sin * along + cos * across
 
         return Stance(foot(1.0), foot(-1.0), (x, y))

@@ -157,6 +157,12 @@ def building() -> Plan:
     return parse_plan(files(__package__).joinpath("building.yaml").read_text(encoding="utf-8"))
 
 
+@cache
+def hall() -> Plan:
+    """The hall of the follow-in-front experiment, with some furniture about the path (``hall.yaml``)."""
+    return parse_plan(files(__package__).joinpath("hall.yaml").read_text(encoding="utf-8"))
+
+
 def read_plan(path: Path) -> Plan:
     """Read a plan of one's own, written like ``building.yaml``.
 

@@ -158,14 +158,14 @@ def _map_to_odom(robot: Robot, stamp: Time) -> TFMessage:
 
 def _people(simulation: Simulation, stamp: Time) -> MarkerArray:
     markers = []
-    for person, stance in zip(simulation.people, simulation.stances, strict=True):
+    for name, stance in zip(simulation.names, simulation.stances, strict=True):
         for part, (x, y) in enumerate(stance):
             trunk = part == 2
             size = Vector3(0.4, 0.4, 0.7) if trunk else Vector3(0.12, 0.12, 0.85)
             markers.append(
                 Marker(
                     header=Header(stamp, "map"),
-                    ns=person.walk.name,
+                    ns=name,
                     id=part,
                     type=_CYLINDER,
                     pose=PoseMessage(Point(x, y, 1.2 if trunk else 0.425)),

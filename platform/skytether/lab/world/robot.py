@@ -16,6 +16,35 @@ from skytether.lab.trail import ORIGIN, Pose
 
 
 @dataclass(frozen=True, slots=True)
+class RearParams:
+    """What looks at the person behind a robot that has it: a laser for the legs, a camera for the face.
+
+    Rays, field, ranges and noise are those of the laser in front.
+
+    Attributes:
+        laser_x: Of the laser in front of the robot's middle [m]; it looks back.
+        laser_z: Of the laser above the floor [m]: it stands on the body, far enough in to measure a foot at its rear.
+        camera_x: Of the camera in front of the middle [m]; it looks back and a little up.
+        camera_z: Of the camera above the floor [m].
+        camera_up: Angle of its axis above the horizontal [rad]: faces 1.4 to 1.7 m high are in view from 0.7 to 2.2 m.
+        camera_field: Horizontal field of view [rad].
+        width: Of a picture [pixels].
+        height: Likewise.
+        rate: Pictures a second [Hz].
+    """
+
+    laser_x: float = -0.05
+    laser_z: float = 0.46
+    camera_x: float = -0.05
+    camera_z: float = 1.2
+    camera_up: float = math.radians(18)
+    camera_field: float = math.radians(62)
+    width: int = 640
+    height: int = 480
+    rate: float = 15.0
+
+
+@dataclass(frozen=True, slots=True)
 class RobotParams:
     """The machine.
 
@@ -53,6 +82,7 @@ class RobotParams:
         slip: Standard deviation of the way rolled per square root of metre [m^0.5].
         turn_slip: Of the angle per square root of radian turned [rad^0.5].
         drift: Of the angle per square root of metre rolled [rad/m^0.5].
+        rear: Laser and camera that look back; None: it has neither.
     """
 
     length: float = 0.70
@@ -88,6 +118,7 @@ class RobotParams:
     slip: float = 0.01
     turn_slip: float = 0.02
     drift: float = 0.01
+    rear: RearParams | None = None
 
     @property
     def circumscribed(self) -> float:

@@ -16,6 +16,7 @@ from skytether.messages import (
     Odometry,
     Point,
     PoseWithCovariance,
+    Quaternion,
     Range,
     TFMessage,
     Time,
@@ -29,7 +30,7 @@ from skytether.messages import (
 from skytether.messages import Pose as PoseMessage
 
 from .model import load_mujoco
-from .robot import Motion, RobotParams
+from .robot import Motion, RearParams, RobotParams
 
 _SONAR_RAYS = 7
 """In the cone of one sonar, flat: the nearest answers."""
@@ -54,14 +55,35 @@ class Eyes:
 
     def ranges(self, pose: Pose) -> NDArray[np.float64]:
         """Of the laser without any noise [m]; infinite where nothing is within reach."""
-        p = self._params
-        x, y = pose.x + p.laser_x * math.cos(pose.heading), pose.y + p.laser_x * math.sin(pose.heading)
-        return self._cast((x, y, p.laser_z), self._angles + pose.heading, p.laser_max)
+        return self._sweep(pose, self._params.laser_x, self._params.laser_z)
+
+    def rear_ranges(self, pose: Pose) -> NDArray[np.float64]:
+        """Likewise of the laser that looks back.
+
+        Raises:
+            ValueError: The robot has none.
+        """
+        rear = self._params.rear
+        if rear is None:
+            raise ValueError("this robot has no laser that looks back")
+        x, y, heading = pose
+        return self._sweep(Pose(x, y, heading + math.pi), -rear.laser_x, rear.laser_z)
 
     def scan(self, pose: Pose, header: Header, period: float) -> LaserScan:
         """One sweep, taken at once."""
+        return self._measured(self.ranges(pose), header, period)
+
+    def rear_scan(self, pose: Pose, header: Header, period: float) -> LaserScan:
+        """The same of the laser that looks back; ValueError where there is none."""
+        return self._measured(self.rear_ranges(pose), header, period)
+
+    def _sweep(self, pose: Pose, ahead: float, height: float) -> NDArray[np.float64]:
+        """Of a laser so far ahead of this pose, that looks along it."""
+        x, y = pose.x + ahead * math.cos(pose.heading), pose.y + ahead * math.sin(pose.heading)
+        return self._cast((x, y, height), self._angles + pose.heading, self._params.laser_max)
+
+    def _measured(self, ranges: NDArray[np.float64], header: Header, period: float) -> LaserScan:
         p, random = self._params, self._random
-        ranges = self.ranges(pose)
         ranges += random.normal(size=len(ranges)) * p.laser_noise
         ranges[random.random(len(ranges)) < p.laser_lost] = np.inf
         ranges[ranges > p.laser_max] = np.inf
@@ -120,14 +142,29 @@ def odometry(pose: Pose, motion: Motion, stamp: Time, prefix: str) -> Odometry:
 
 
 def transforms(pose: Pose, params: RobotParams, stamp: Time, prefix: str) -> TFMessage:
-    """Base in the odometry's frame, and laser on the base."""
-    return TFMessage(
-        (
-            _transform(f"{prefix}odom", f"{prefix}base_link", (pose.x, pose.y, 0.0), pose.heading, stamp),
-            _transform(f"{prefix}base_link", f"{prefix}laser", (params.laser_x, 0.0, params.laser_z), 0.0, stamp),
-        )
-    )
+    """Base in the odometry's frame, and what looks on the base.
+
+    The frame ``camera`` is one of bodies, not of pictures: x along the camera's axis, z up in the picture.
+    """
+    base, rear = f"{prefix}base_link", params.rear
+    found = [
+        _transform(f"{prefix}odom", base, (pose.x, pose.y, 0.0), quaternion_from_yaw(pose.heading), stamp),
+        _transform(base, f"{prefix}laser", (params.laser_x, 0.0, params.laser_z), quaternion_from_yaw(0.0), stamp),
+    ]
+    if rear is not None:
+        back = quaternion_from_yaw(math.pi)
+        found += [
+            _transform(base, f"{prefix}rear_laser", (rear.laser_x, 0.0, rear.laser_z), back, stamp),
+            _transform(base, f"{prefix}camera", (rear.camera_x, 0.0, rear.camera_z), _back_and_up(rear), stamp),
+        ]
+    return TFMessage(tuple(found))
 
 
-def _transform(parent: str, child: str, at: Sequence[float], heading: float, stamp: Time) -> TransformStamped:
-    return TransformStamped(Header(stamp, parent), child, Transform(Vector3(*at), quaternion_from_yaw(heading)))
+def _back_and_up(rear: RearParams) -> Quaternion:
+    """Half a turn about z, and then about the new y, which lifts x by the angle."""
+    half = rear.camera_up / 2
+    return Quaternion(x=math.sin(half), z=math.cos(half), w=0.0)
+
+
+def _transform(parent: str, child: str, at: Sequence[float], turned: Quaternion, stamp: Time) -> TransformStamped:
+    return TransformStamped(Header(stamp, parent), child, Transform(Vector3(*at), turned))

@@ -11,10 +11,12 @@ import math
 import numpy as np
 
 from skytether.lab.trail import Pose
-from skytether.messages import Header, LaserScan, Message, Odometry, Range, TFMessage, Time, Twist
+from skytether.messages import CompressedImage, Header, LaserScan, Message, Odometry, Range, TFMessage, Time, Twist
 
 from .contacts import Contact, Judge, Touched
 from .model import LEGS, PHYSICS_STEP, WorldError, compile_model, load_mujoco
+from .operator import NAME as OPERATOR
+from .operator import Operator
 from .people import Person, Stance
 from .plan import Plan
 from .robot import Drive, Motion, Odometer, RobotParams
@@ -24,8 +26,11 @@ TICK = 0.01
 """What one `Simulation.tick` lasts, s."""
 SUBSTEPS = round(TICK / PHYSICS_STEP)
 
-SCAN_EVERY, ODOMETRY_EVERY, SONAR_EVERY = 12, 10, 10
-"""Ticks between messages; those of /tf come each tick. Periods of Table 4 of the thesis: 120, 100 and 10 ms."""
+SCAN_EVERY, ODOMETRY_EVERY, SONAR_EVERY, REAR_SCAN_EVERY = 12, 10, 10, 10
+"""Ticks between messages; those of /tf come each tick. Periods of Tables 2 and 4 of the thesis: 120, 100 and 10 ms."""
+
+REAR_SCAN, CAMERA = "rear_scan", "camera/compressed"
+"""Topics of a robot that has them. Pictures are taken by `camera.Camera`, not by the simulation."""
 
 MAX_ROBOTS = 4
 _PARAMS = RobotParams()
@@ -46,7 +51,15 @@ class Robot:
         odometer: Its dead reckoning.
     """
 
-    def __init__(self, index: int, start: Pose, eyes: Eyes, params: RobotParams, random: np.random.Generator) -> None:
+    def __init__(
+        self,
+        index: int,
+        start: Pose,
+        eyes: Eyes,
+        rear_eyes: Eyes,
+        params: RobotParams,
+        random: np.random.Generator,
+    ) -> None:
         self.index = index
         self.pose = start
         self.motion = Motion(0.0, 0.0, 0.0)
@@ -54,7 +67,7 @@ class Robot:
         self.scan: LaserScan | None = None
         self.odometer = Odometer(params, random)
         self.drive = Drive(params)
-        self.eyes = eyes
+        self.eyes, self.rear_eyes = eyes, rear_eyes
         self._params = params
         self._command = Twist()
         self._silent = math.inf
@@ -63,7 +76,8 @@ class Robot:
     def topics(params: RobotParams = _PARAMS) -> dict[str, type[Message]]:
         """What a robot measures, by name."""
         sonars = {f"sonar_{index}": Range for index in range(len(params.sonar_angles))}
-        return {"tf": TFMessage, "odom": Odometry, "scan": LaserScan, **sonars}
+        rear: dict[str, type[Message]] = {REAR_SCAN: LaserScan, CAMERA: CompressedImage} if params.rear else {}
+        return {"tf": TFMessage, "odom": Odometry, "scan": LaserScan, **sonars, **rear}
 
     def write(self, twist: Twist) -> None:
         """Command a velocity; the motors stop when none comes for `RobotParams.timeout`."""
@@ -96,6 +110,9 @@ class Robot:
             found.append(("scan", self.scan))
         if ticks % SONAR_EVERY == 0:
             found += [(f"sonar_{i}", r) for i, r in enumerate(self.eyes.sonars(self.pose, stamp))]
+        if self._params.rear is not None and ticks % REAR_SCAN_EVERY == 0:
+            header = Header(stamp, f"{prefix}rear_laser")
+            found.append((REAR_SCAN, self.rear_eyes.rear_scan(self.pose, header, REAR_SCAN_EVERY * TICK)))
         return found
 
 
@@ -108,13 +125,25 @@ class Simulation:
         robots: How many; each has its start in the plan.
         rounds: How many of the plan's rounds are walked: people beyond those who are always there.
         params: Of the robots.
+        operator: Who walks behind the first robot.
+
+    Attributes:
+        stances: Where people are, in the order of `names`.
+        stamp: Of the messages of the last tick.
 
     Raises:
         WorldError: MuJoCo is missing, or the plan has no places for so many.
     """
 
     def __init__(
-        self, plan: Plan, *, seed: int, robots: int = 1, rounds: int = 0, params: RobotParams = _PARAMS
+        self,
+        plan: Plan,
+        *,
+        seed: int,
+        robots: int = 1,
+        rounds: int = 0,
+        params: RobotParams = _PARAMS,
+        operator: Operator | None = None,
     ) -> None:
         places = min(len(plan.starts), MAX_ROBOTS)
         if not 1 <= robots <= places:
@@ -126,21 +155,28 @@ class Simulation:
         self.plan, self.params, self.seed = plan, params, seed
         walks = (*plan.people, *plan.rounds[:rounds])
         self.people = tuple(Person(walk) for walk in walks)
+        self.operator = operator
+        self.names = (*(walk.name for walk in walks), *([OPERATOR] if operator else []))
+        self.stamp = Time()
         self.stances: tuple[Stance, ...] = ()
         self.ticks = 0
         self._judge = Judge()
         self._mujoco = load_mujoco()
-        self._model = compile_model(plan, walks, robots, params)
+        self._model = compile_model(plan, walks, robots, params, OPERATOR if operator else None)
         self._data = self._mujoco.MjData(self._model)
         self._kinds = self._geoms()
-        self._mocap = [[self._mocap_of(f"{w.name}-{part}") for part in (*LEGS, "trunk")] for w in walks]
-        # Independent streams: a robot's noise is the same, whoever else is there.
-        streams = np.random.default_rng(seed).spawn(2 * MAX_ROBOTS)
+        self._mocap = [[self._mocap_of(f"{name}-{part}") for part in (*LEGS, "trunk")] for name in self.names]
+        self._head = self._mocap_of(f"{OPERATOR}-head") if operator else -1
+        # Independent streams: a robot's noise is the same, whoever else is there, and whatever else it has.
+        streams = np.random.default_rng(seed).spawn(3 * MAX_ROBOTS)
         self.robots = tuple(
             Robot(
                 index,
                 plan.starts[index],
-                Eyes(self._model, self._data, self._body(f"robot-{index}"), params, streams[2 * index]),
+                *(
+                    Eyes(self._model, self._data, self._body(f"robot-{index}"), params, streams[stream])
+                    for stream in (2 * index, 2 * MAX_ROBOTS + index)
+                ),
                 params,
                 streams[2 * index + 1],
             )
@@ -182,7 +218,7 @@ class Simulation:
         self.ticks += 1
         # Positions are those of the end of the step, what was computed of them is not yet: rays need it.
         self._mujoco.mj_kinematics(self._model, self._data)
-        stamp = Time.from_seconds(self.time if now is None else now)
+        self.stamp = stamp = Time.from_seconds(self.time if now is None else now)
         found = []
         for robot in self.robots:
             robot.moved(*self._state(robot.index), TICK)
@@ -221,6 +257,16 @@ class Simulation:
     def _walk(self, dt: float) -> None:
         middles = [(robot.pose.x, robot.pose.y) for robot in self.robots]
         self.stances = tuple(person.step(middles, dt) for person in self.people)
+        if self.operator is not None:
+            first = self.robots[0]
+            figure = self.operator.step(first.pose, first.motion, dt)
+            self.stances += (figure.stance,)
+            for body, heading, at in (
+                (self._mocap[-1][2], figure.body, figure.stance.trunk),
+                (self._head, figure.head, figure.stance.trunk),
+            ):
+                self._data.mocap_pos[body] = (*at, 0.0)
+                self._data.mocap_quat[body] = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
         for bodies, stance in zip(self._mocap, self.stances, strict=True):
             for body, (x, y) in zip(bodies, stance, strict=True):
                 self._data.mocap_pos[body] = (x, y, 0.0)
@@ -239,11 +285,7 @@ class Simulation:
     def _geoms(self) -> list[tuple[Touched, str, int]]:
         """Kind, name and robot of each geom, by its number."""
         walls = {box.name for box in self.plan.boxes if box.wall}
-        people = {
-            f"{person.walk.name}-{part}": person.walk.name
-            for person in self.people
-            for part in (*(f"{leg}-leg" for leg in LEGS), "body")
-        }
+        people = {f"{name}-{part}": name for name in self.names for part in (*(f"{leg}-leg" for leg in LEGS), "body")}
         found: list[tuple[Touched, str, int]] = []
         for geom in range(self._model.ngeom):
             name = self._model.geom(geom).name
