@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes.util
 import json
 import os
 import secrets
@@ -268,6 +269,13 @@ def faketime() -> str:
     if not found:
         require("faketime", "there is no libfaketimeMT.so.1: install libfaketime")
     return str(found[0])
+
+
+@pytest.fixture(scope="session")
+def gl() -> None:
+    """What draws without a display, for the simulated camera."""
+    if all(ctypes.util.find_library(name) is None for name in ("OSMesa", "EGL")):
+        require("gl", "there is no OpenGL that draws without a display: install libosmesa6")
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from .figure import head_xml, scene_xml, trunk_xml
+from .figure import assets, head_xml, scene_xml, trunk_xml
 from .plan import Box, Plan, Walk
 from .robot import RearParams, RobotParams
 
@@ -54,7 +54,8 @@ def compile_model(
     """
     mujoco = load_mujoco()
     try:
-        return mujoco.MjModel.from_xml_string(model_xml(plan, people, robots, params, operator))
+        xml = model_xml(plan, people, robots, params, operator)
+        return mujoco.MjModel.from_xml_string(xml, assets() if params.rear is not None else {})
     except ValueError as error:
         raise WorldError(f"MuJoCo does not take the plan {plan.name}: {error}") from error
 
@@ -78,7 +79,11 @@ def model_xml(
     parts += [_robot(index, params) for index in range(robots)]
     parts += [_person(person) for person in people]
     if operator is not None:
-        parts += [_legs(operator, 0.0, 0.0), trunk_xml(operator, 0.0, 0.0), head_xml(operator, 0.0, 0.0)]
+        parts += [
+            _legs(operator, 0.0, 0.0),
+            trunk_xml(operator, 0.0, 0.0),
+            head_xml(operator, 0.0, 0.0, face=params.rear is not None),
+        ]
     parts.append("</worldbody></mujoco>")
     return "".join(parts)
 

@@ -7,8 +7,10 @@ with a clock, see `agent`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.lab.trail import Pose
 from skytether.messages import CompressedImage, Header, LaserScan, Message, Odometry, Range, TFMessage, Time, Twist
@@ -37,6 +39,17 @@ _PARAMS = RobotParams()
 
 Readings = list[tuple[str, Message]]
 """Topics and messages of one robot."""
+
+Floats = NDArray[np.float64]
+
+
+class State(NamedTuple):
+    """Where everything is: what a camera needs to know, as MuJoCo keeps it, at a time of the robots' clock."""
+
+    stamp: Time
+    qpos: Floats
+    mocap_pos: Floats
+    mocap_quat: Floats
 
 
 class Robot:
@@ -129,7 +142,7 @@ class Simulation:
 
     Attributes:
         stances: Where people are, in the order of `names`.
-        stamp: Of the messages of the last tick.
+        model: The ``MjModel``.
 
     Raises:
         WorldError: MuJoCo is missing, or the plan has no places for so many.
@@ -157,12 +170,12 @@ class Simulation:
         self.people = tuple(Person(walk) for walk in walks)
         self.operator = operator
         self.names = (*(walk.name for walk in walks), *([OPERATOR] if operator else []))
-        self.stamp = Time()
+        self._stamp = Time()
         self.stances: tuple[Stance, ...] = ()
         self.ticks = 0
         self._judge = Judge()
         self._mujoco = load_mujoco()
-        self._model = compile_model(plan, walks, robots, params, OPERATOR if operator else None)
+        self.model = self._model = compile_model(plan, walks, robots, params, OPERATOR if operator else None)
         self._data = self._mujoco.MjData(self._model)
         self._kinds = self._geoms()
         self._mocap = [[self._mocap_of(f"{name}-{part}") for part in (*LEGS, "trunk")] for name in self.names]
@@ -218,12 +231,17 @@ class Simulation:
         self.ticks += 1
         # Positions are those of the end of the step, what was computed of them is not yet: rays need it.
         self._mujoco.mj_kinematics(self._model, self._data)
-        self.stamp = stamp = Time.from_seconds(self.time if now is None else now)
+        self._stamp = stamp = Time.from_seconds(self.time if now is None else now)
         found = []
         for robot in self.robots:
             robot.moved(*self._state(robot.index), TICK)
             found.append(robot.read(self.ticks - 1, stamp))
         return found
+
+    def state(self) -> State:
+        """After the last tick; a copy."""
+        data = self._data
+        return State(self._stamp, data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
 
     def place(self, index: int, pose: Pose) -> None:
         """Lift a robot and put it somewhere else; its odometry does not notice."""
