@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from skytether_services.navigation.geometry import Pose
-from skytether_services.navigation.odometry_track import KEPT, OdometryTrack, Reach
+from skytether_services.planar.geometry import Pose
+from skytether_services.planar.odometry_track import KEPT, OdometryTrack, Reach
 
 REACH = Reach(1.0, 2.0, 0.1, 0.2)
 

@@ -13,11 +13,11 @@ from skytether_services.navigation.checkers import GoalChecker, GoalParams
 from skytether_services.navigation.controller import Controller, ControlStatus, MotionLimits
 from skytether_services.navigation.costmap import LETHAL, Costmap, InflationParams
 from skytether_services.navigation.footprint import Footprint
-from skytether_services.navigation.geometry import Pose, advance
 from skytether_services.navigation.layers import LayeredCostmap, WindowParams
 from skytether_services.navigation.obstacles import Scan
 from skytether_services.navigation.planner import PlannerParams, PlanStatus, plan
 from skytether_services.navigation.prediction import DelayParams, PredictedState, State
+from skytether_services.planar.geometry import Pose, advance
 
 RESOLUTION = 0.05
 PERIOD = 1 / 30

@@ -10,6 +10,7 @@ from .goals import ActionServer, Goal, GoalError
 from .mailbox import RawReceived, Received
 from .main import run
 from .params import NoParams, param
+from .rate import Rate
 from .service import Context, Service, params_schema
 from .topics import Action, AnyInput, Call, Input, Output, answers
 
@@ -27,6 +28,7 @@ __all__ = [
     "Input",
     "NoParams",
     "Output",
+    "Rate",
     "RawReceived",
     "Received",
     "Service",

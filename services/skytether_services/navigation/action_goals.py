@@ -26,13 +26,12 @@ from skytether.messages import (
     NavigateToPoseResult,
     PoseStamped,
 )
-from skytether.service import ActionServer, Goal
+from skytether.service import ActionServer, Goal, Rate
+from skytether_services.planar.geometry import Pose
 
 from . import conversions as convert
-from .geometry import Pose
 from .navigator import Navigator
 from .status import Code, State, Trouble
-from .surroundings import Rate
 from .task import refusal
 
 FEEDBACK_HZ = 5.0

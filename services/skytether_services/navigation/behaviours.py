@@ -14,8 +14,8 @@ from py_trees.common import Status
 
 from skytether.control.admittance import Velocity
 from skytether.service import NoParams, param
+from skytether_services.planar.geometry import Pose, wrap
 
-from .geometry import Pose, wrap
 from .status import Code, Trouble
 
 P = TypeVar("P")

@@ -20,13 +20,13 @@ from skytether.lab.world.cluttered import field
 from skytether.lab.world.plan import Plan, building
 from skytether.lab.world.simulation import TICK
 from skytether.testing.drive import Drive
+from skytether_services.planar.geometry import Pose
+from skytether_services.planar.transforms import step
 
 from .controller import MotionLimits
-from .geometry import Pose
 from .navigator import Navigator
 from .prediction import Compensation, State
 from .service import Navigation
-from .transforms import step
 
 Progress = Callable[[str], None]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from skytether.control.admittance import Velocity
 from skytether.service import param
-
-from .geometry import Pose, wrap
+from skytether_services.planar.geometry import Pose, wrap
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
+from skytether_services.planar.geometry import Pose, wrap
 
 from .costmap import Costmap
-from .geometry import Pose, wrap
 
 
 @dataclass(frozen=True)

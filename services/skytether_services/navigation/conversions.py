@@ -24,9 +24,9 @@ from skytether.messages import (
     yaw_of,
 )
 from skytether.messages import Pose as PoseMessage
+from skytether_services.planar.geometry import Pose
 
 from .costmap import INSCRIBED, Costmap
-from .geometry import Pose
 from .grid_map import MAX_CELLS, GridMap
 from .navigator import Report
 from .whereabouts import Whereabouts

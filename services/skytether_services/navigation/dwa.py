@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
+from skytether_services.planar.geometry import Pose, advance, wrap
 
 from .compiled import compiled
 from .controller import Control, ControlStatus, FollowedPath, MotionLimits, PathController, turn_towards
 from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams
 from .footprint import Footprint, FootprintChecks, footprint_cost
-from .geometry import Pose, advance, wrap
 
 _INSCRIBED, _LETHAL, _UNKNOWN = INSCRIBED, LETHAL, UNKNOWN
 _TURN_STEP = 0.05

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether_services.planar.geometry import Pose
+
 from .compiled import compiled
 from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams, cost_of_distance
-from .geometry import Pose
 
 # Machine code knows a module's own constants only.
 _INSCRIBED, _LETHAL, _UNKNOWN = INSCRIBED, LETHAL, UNKNOWN

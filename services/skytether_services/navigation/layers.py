@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .costmap import (
     FREE,
@@ -23,7 +24,6 @@ from .costmap import (
     window,
 )
 from .footprint import Footprint
-from .geometry import Pose
 from .obstacles import ObstacleParams, Scan, mark_and_clear
 from .zones import Mask, keep_out_costs
 

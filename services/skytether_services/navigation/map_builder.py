@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Pose
+from skytether_services.planar.geometry import Pose
+from skytether_services.planar.transforms import as_array, as_pose, compose, inverse, step
+
 from .grid_map import FREE, OCCUPIED, UNKNOWN, GridMap, draw_map, save_map, save_png
 from .log_odds import occupancy
 from .mapping import Mapper
 from .senses import LaserScan
-from .transforms import as_array, as_pose, compose, inverse, step
 
 MAX_SCANS = 200_000
 """Of one map: seven hours of driving at 8 Hz, 100 MB; the graph of them has far fewer."""

@@ -11,14 +11,15 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
-from .geometry import Pose
+from skytether.service import Rate
+from skytether_services.planar.geometry import Pose
+from skytether_services.planar.transforms import compose, inverse
+
 from .grid_map import GridMap, MapError
 from .map_builder import MapBuilder, Progress, save
 from .params import Params
 from .senses import LaserScan, Senses
 from .status import Code, Trouble
-from .surroundings import Rate
-from .transforms import compose, inverse
 
 WAITING = 50
 """Scans that wait to be matched, at most: six seconds. Of more the newest are left out; odometry bridges that."""

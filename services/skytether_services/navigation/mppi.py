@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .controller import Control, ControlStatus, FollowedPath, MotionLimits, PathController
 from .costmap import INSCRIBED, Costmap, InflationParams
 from .footprint import Footprint, FootprintChecks
-from .geometry import Pose
 from .mppi_kernels import (
     COLLISION,
     correlate,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from py_trees.common import Status as TreeStatus
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether_services.planar.geometry import Pose, advance
 
 from .behaviour_tree import BUILT_IN, load_tree
 from .checkers import GoalChecker, ProgressChecker
@@ -23,7 +24,6 @@ from .controller import Controller, ControlStatus, FollowedPath, turn_towards
 from .costmap import INSCRIBED, LETHAL, Costmap
 from .dwa import Dwa
 from .footprint import FootprintChecks, cost_at
-from .geometry import Pose, advance
 from .grid_map import GridMap
 from .mppi import Mppi
 from .params import ControllerName, Params

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .costmap import FREE, LETHAL, UNKNOWN, Costmap, Costs
 from .footprint import Footprint
-from .geometry import Pose
 from .obstacles import ObstacleParams, Scan, mark_and_clear
 from .shared_word import MOST_CORNERS, MOST_ROBOTS, Said, Unheard, Word, map_id, read_word, write_word
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .compiled import compiled
 from .costmap import FREE, LETHAL, Costs
-from .geometry import Pose
 
 _FREE, _LETHAL = FREE, LETHAL
 

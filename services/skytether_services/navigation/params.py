@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .checkers import GoalParams, ProgressParams
 from .controller import MotionLimits
 from .costmap import InflationParams
 from .dwa import DwaParams
 from .footprint import Footprint
-from .geometry import Pose
 from .layers import WindowParams
 from .localisation import LocalisationParams
 from .mppi import MppiParams

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.service import param
+from skytether_services.planar.geometry import Pose
 
 from .costmap import INSCRIBED, UNKNOWN, Costmap
 from .footprint import FootprintChecks, misfits
-from .geometry import Pose
 from .search import relax, search, shortcut, walk_back
 
 _TRIES = 6

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.control.admittance import STANDSTILL
+from skytether_services.planar.geometry import Pose, advance
 
-from .geometry import Pose, advance
 from .grid_map import FREE, OCCUPIED, GridMap
 from .map_builder import MapBuilder
 from .navigator import Navigator

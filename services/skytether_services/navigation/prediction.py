@@ -15,8 +15,7 @@ from itertools import pairwise
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.service import param
-
-from .geometry import Pose, advance
+from skytether_services.planar.geometry import Pose, advance
 
 MAX_COMMANDS = 256
 """Remembered: more than eight seconds of commands at 30 Hz. Older ones have arrived, or never will."""

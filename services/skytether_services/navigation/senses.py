@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether_services.planar.geometry import Pose, wrap
+from skytether_services.planar.odometry_track import OdometryTrack, Reach, Sample
+from skytether_services.planar.transforms import step
 
 from .controller import MotionLimits
-from .geometry import Pose, wrap
-from .odometry_track import OdometryTrack, Reach, Sample
 from .params import SensorParams
 from .status import Code, Trouble
-from .transforms import step
 
 _PATIENCE = 0.15
 """A scan waits so long for odometry that is as new as it is [s]; then the newest has to do."""

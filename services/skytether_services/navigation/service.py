@@ -33,11 +33,11 @@ from skytether.messages import (
     Vector3,
 )
 from skytether.messages import Path as PathMessage
-from skytether.service import Action, ConfigError, Input, Output, Received, Service, answers
+from skytether.service import Action, ConfigError, Input, Output, Rate, Received, Service, answers
+from skytether_services.planar.frames import Frames
 
 from . import conversions as convert
 from .action_goals import ActionGoals
-from .frames import Frames
 from .grid_map import GridMap, MapError, load_map
 from .navigator import Navigator, Report
 from .params import ModeName, Params
@@ -45,7 +45,7 @@ from .senses import LaserScan as Scan
 from .senses import Senses
 from .shared_word import read_said
 from .status import Code, State, Trouble
-from .surroundings import Rate, mask_of
+from .surroundings import mask_of
 from .zones import Mask
 
 if TYPE_CHECKING:

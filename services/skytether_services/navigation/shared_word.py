@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether_services.planar.geometry import Pose
+
 from .costmap import Costmap
-from .geometry import Pose
 
 MOST_TEXT = 8192
 """Characters of a word: what an orchestrator carries."""

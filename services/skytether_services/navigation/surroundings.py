@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from skytether.service import Rate
+from skytether_services.planar.geometry import Pose
+
 from .costmap import INSCRIBED, LETHAL, Costmap, Costs, static_costs
 from .footprint import Footprint
-from .geometry import Pose
 from .grid_map import GridMap
 from .layers import LayeredCostmap
 from .neighbours import Neighbours
@@ -15,22 +17,6 @@ from .params import Params
 from .status import Code
 from .whereabouts import Sighting
 from .zones import Mask, speed_limit
-
-
-class Rate:
-    """Says when something that is done so often is due; what is late is not made up for."""
-
-    def __init__(self, hertz: float) -> None:
-        self._period = 1 / hertz if hertz > 0 else math.inf
-        self._next = -math.inf
-
-    def due(self, now: float) -> bool:
-        """Whether to do it now [s]; then the next time is a period later."""
-        # A little early is better than a whole step of the loop late.
-        if now < self._next - 1e-4 or math.isinf(self._period):
-            return False
-        self._next = max(self._next + self._period, now) if math.isfinite(self._next) else now + self._period
-        return True
 
 
 def mask_of(grid: GridMap) -> Mask:

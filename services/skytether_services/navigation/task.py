@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .geometry import Pose
+from skytether_services.planar.geometry import Pose
+
 from .status import Code, Trouble
 
 MAX_GOALS = 1000

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether_services.planar.geometry import Pose
+from skytether_services.planar.transforms import as_array, as_pose, compose, inverse, step
+
 from .controller import MotionLimits
-from .geometry import Pose
 from .grid_map import GridMap
 from .likelihood_field import likelihood_field
 from .localisation import Estimate, Localisation
@@ -21,7 +23,6 @@ from .params import LocaliserParams, SensorParams
 from .prediction import State
 from .senses import Senses
 from .status import Code, Trouble
-from .transforms import as_array, as_pose, compose, inverse, step
 
 
 @dataclass(frozen=True)

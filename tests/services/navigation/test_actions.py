@@ -34,8 +34,8 @@ from skytether.testing.actions import ActionClient
 from skytether.testing.drive import Drive
 from skytether.testing.service import Harness
 from skytether_services.navigation.action_goals import way_left
-from skytether_services.navigation.geometry import Pose as At
 from skytether_services.navigation.service import Navigation
+from skytether_services.planar.geometry import Pose as At
 
 DWA = {"controller": "dwa"}
 """Its constructor compiles nothing."""

@@ -8,8 +8,8 @@ from py_trees.common import Status
 from skytether.control.admittance import Velocity
 from skytether.service import ConfigError
 from skytether_services.navigation.behaviour_tree import BUILT_IN, MAX_NODES, load_tree
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.status import Code, Trouble
+from skytether_services.planar.geometry import Pose
 
 
 class FakeRobot:

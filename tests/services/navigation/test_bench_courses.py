@@ -7,8 +7,8 @@ import pytest
 
 from skytether.control.admittance import Velocity
 from skytether_services.navigation.bench_courses import Predictions, delay_verdict, distance_from, score
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.prediction import State
+from skytether_services.planar.geometry import Pose
 
 
 def test_distance_from_a_path() -> None:

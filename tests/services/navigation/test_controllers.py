@@ -11,7 +11,6 @@ from skytether_services.navigation.controller import Controller, ControlStatus
 from skytether_services.navigation.costmap import LETHAL, Costmap
 from skytether_services.navigation.dwa import Dwa, best_velocity, spread
 from skytether_services.navigation.footprint import Footprint
-from skytether_services.navigation.geometry import Pose, advance
 from skytether_services.navigation.layers import LayeredCostmap
 from skytether_services.navigation.mppi import Mppi, MppiParams
 from skytether_services.navigation.mppi_kernels import (
@@ -25,6 +24,7 @@ from skytether_services.navigation.mppi_kernels import (
     weighted_mean,
 )
 from skytether_services.navigation.prediction import DelayParams
+from skytether_services.planar.geometry import Pose, advance
 
 pytestmark = pytest.mark.slow
 

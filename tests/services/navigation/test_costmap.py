@@ -21,9 +21,9 @@ from skytether_services.navigation.costmap import (
     window,
 )
 from skytether_services.navigation.footprint import Footprint
-from skytether_services.navigation.geometry import Pose, advance, wrap
 from skytether_services.navigation.layers import LayeredCostmap, WindowParams
 from skytether_services.navigation.zones import Mask, keep_out_costs, speed_limit
+from skytether_services.planar.geometry import Pose, advance, wrap
 
 
 def grid(rows: int, columns: int, value: int = FREE) -> np.ndarray:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from skytether_services.navigation.costmap import FREE, LETHAL, UNKNOWN, Costmap, Costs
 from skytether_services.navigation.footprint import Footprint
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.neighbours import Neighbours, SharingParams
 from skytether_services.navigation.obstacles import ObstacleParams, Scan
 from skytether_services.navigation.shared_word import Said, Word, map_id, read_word, write_word
+from skytether_services.planar.geometry import Pose
 
 # 10 m by 10 m, with walls all around.
 STATIC = Costmap(np.pad(np.full((98, 98), FREE, dtype=np.uint8), 1, constant_values=LETHAL), 0.1)

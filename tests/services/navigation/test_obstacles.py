@@ -7,9 +7,9 @@ import pytest
 
 from skytether_services.navigation.costmap import FREE, INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams
 from skytether_services.navigation.footprint import Footprint, cost_at
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.layers import LayeredCostmap
 from skytether_services.navigation.obstacles import ObstacleParams, Scan, mark_and_clear
+from skytether_services.planar.geometry import Pose
 
 pytestmark = pytest.mark.slow
 

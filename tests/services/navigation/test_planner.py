@@ -7,9 +7,9 @@ import pytest
 
 from skytether_services.navigation.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap, InflationParams
 from skytether_services.navigation.footprint import Footprint, FootprintChecks, misfits
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.layers import LayeredCostmap
 from skytether_services.navigation.planner import PlannerParams, PlanStatus, plan, resample, with_headings
+from skytether_services.planar.geometry import Pose
 
 
 def empty(rows: int = 60, columns: int = 100) -> np.ndarray:

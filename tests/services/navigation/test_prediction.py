@@ -8,7 +8,6 @@ import pytest
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether_services.navigation.checkers import GoalChecker, GoalParams, ProgressChecker, ProgressParams
 from skytether_services.navigation.controller import FollowedPath, MotionLimits, braking, turn_towards
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.prediction import (
     MAX_COMMANDS,
     Compensation,
@@ -18,6 +17,7 @@ from skytether_services.navigation.prediction import (
     replay,
     respond,
 )
+from skytether_services.planar.geometry import Pose
 
 ORIGIN = Pose(0.0, 0.0, 0.0)
 PROMPT = {"linear_acceleration": 1e6, "angular_acceleration": 1e6}

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether_services.navigation.costmap import FREE, LETHAL, Costmap
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.shared_word import (
     MOST_CELLS,
     MOST_ROBOTS,
@@ -24,6 +23,7 @@ from skytether_services.navigation.shared_word import (
     read_word,
     write_word,
 )
+from skytether_services.planar.geometry import Pose
 
 SQUARE = np.array([[0.3, 0.2], [-0.3, 0.2], [-0.3, -0.2], [0.3, -0.2]])
 SHAPE = (100, 200)

@@ -18,10 +18,10 @@ from skytether.messages import Header, Point, PoseStamped, String
 from skytether.messages import Pose as PoseMessage
 from skytether.testing.service import Harness
 from skytether_services.navigation.costmap import FREE, LETHAL, Costmap, static_costs
-from skytether_services.navigation.geometry import Pose as MapPose
 from skytether_services.navigation.grid_map import load_map
 from skytether_services.navigation.service import Navigation
 from skytether_services.navigation.shared_word import Word, map_id, write_word
+from skytether_services.planar.geometry import Pose as MapPose
 
 pytestmark = pytest.mark.slow
 

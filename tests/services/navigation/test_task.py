@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from skytether_services.navigation.geometry import Pose
 from skytether_services.navigation.status import Code
 from skytether_services.navigation.task import MAX_GOALS, Task, refusal
+from skytether_services.planar.geometry import Pose
 
 A, B, C = (Pose(float(i), 0.0, 0.0) for i in range(3))
 

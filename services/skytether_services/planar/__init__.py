@@ -1,0 +1,1 @@
+"""Where a robot is, and was, in the plane: what several services need."""
