@@ -255,6 +255,8 @@ class ServiceSpec(Strict):
     params: dict[str, Any] = {}
     """JSON schema (2020-12) of the parameters; ``additionalProperties`` is false unless it says otherwise."""
     topics: Topics = ()
+    states: Annotated[tuple[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")], ...], Field(max_length=32)] = ()
+    """Codes of its reports that tell in which state it is: the last one reported is a metric."""
     needs: Needs = Needs()
     limits: Limits = Limits()
 
@@ -300,9 +302,10 @@ class ServiceSpec(Strict):
         if not self.image and not self.entrypoint:
             raise ValueError("one of 'image' and 'entrypoint' is needed")
         names = [t.name for t in self.topics]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"topic '{name}' is listed twice")
+        for what, listed in (("topic", names), ("state", list(self.states))):
+            for name in listed:
+                if listed.count(name) > 1:
+                    raise ValueError(f"{what} '{name}' is listed twice")
         for direction in ("in", "out"):
             shared = [t.name for t in self.topics if t.shared and t.direction == direction]
             if len(shared) > 1:

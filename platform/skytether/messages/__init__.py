@@ -45,6 +45,7 @@ from .codec import (
 )
 from .geometry import (
     Point,
+    Point32,
     Pose,
     PoseArray,
     PoseStamped,
@@ -64,7 +65,18 @@ from .geometry import (
 )
 from .nav import MapMetaData, OccupancyGrid, Odometry, Path, TFMessage
 from .plain import decode_plain, encode_plain
-from .sensor import CompressedImage, Imu, JointState, Joy, LaserScan, PointCloud2, PointField, Range
+from .sensor import (
+    ChannelFloat32,
+    CompressedImage,
+    Imu,
+    JointState,
+    Joy,
+    LaserScan,
+    PointCloud,
+    PointCloud2,
+    PointField,
+    Range,
+)
 from .srv import (
     GetMap,
     GetMapRequest,
@@ -92,6 +104,7 @@ __all__ = [
     "CancelGoal",
     "CancelGoalRequest",
     "CancelGoalResponse",
+    "ChannelFloat32",
     "ColorRGBA",
     "CompressedImage",
     "DecodeError",
@@ -136,6 +149,8 @@ __all__ = [
     "Odometry",
     "Path",
     "Point",
+    "Point32",
+    "PointCloud",
     "PointCloud2",
     "PointField",
     "Pose",

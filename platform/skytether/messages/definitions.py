@@ -22,6 +22,7 @@ _BOTH = {
     "builtin_interfaces/msg/Duration": "int32 sec, uint32 nanosec",
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
     "geometry_msgs/msg/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/msg/Point32": "float32 x, float32 y, float32 z",
     "geometry_msgs/msg/Pose": "geometry_msgs/msg/Point position, geometry_msgs/msg/Quaternion orientation",
     "geometry_msgs/msg/PoseArray": "std_msgs/msg/Header header, geometry_msgs/msg/Pose[] poses",
     "geometry_msgs/msg/PoseStamped": "std_msgs/msg/Header header, geometry_msgs/msg/Pose pose",
@@ -70,6 +71,10 @@ _BOTH = {
         "std_msgs/msg/Header header, float32 angle_min, float32 angle_max, float32 angle_increment, "
         "float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, float32[] ranges, "
         "float32[] intensities"
+    ),
+    "sensor_msgs/msg/ChannelFloat32": "string name, float32[] values",
+    "sensor_msgs/msg/PointCloud": (
+        "std_msgs/msg/Header header, geometry_msgs/msg/Point32[] points, sensor_msgs/msg/ChannelFloat32[] channels"
     ),
     "sensor_msgs/msg/PointCloud2": (
         "std_msgs/msg/Header header, uint32 height, uint32 width, sensor_msgs/msg/PointField[] fields, "

@@ -29,6 +29,15 @@ class Point(Message):
     z: float = 0.0
 
 
+@message("geometry_msgs/msg/Point32")
+class Point32(Message):
+    """A position in single precision, m."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
 @message("geometry_msgs/msg/Quaternion")
 class Quaternion(Message):
     """A rotation as a unit quaternion; the default turns nothing."""

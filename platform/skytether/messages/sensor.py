@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .base import Float32s, Float64s, Int32s, Message, Uint8s, array, message
-from .geometry import Quaternion, Vector3
+from .geometry import Point32, Quaternion, Vector3
 from .std import Header
 
 
@@ -79,6 +79,23 @@ class CompressedImage(Message):
     header: Header = Header()
     format: str = ""
     data: Uint8s = array(np.uint8)
+
+
+@message("sensor_msgs/msg/ChannelFloat32")
+class ChannelFloat32(Message):
+    """A value for each point of a `PointCloud`, in its order."""
+
+    name: str = ""
+    values: Float32s = array(np.float32)
+
+
+@message("sensor_msgs/msg/PointCloud")
+class PointCloud(Message):
+    """Points, as old drivers give them (RosAria's sonars); others use `PointCloud2`."""
+
+    header: Header = Header()
+    points: Sequence[Point32] = ()
+    channels: Sequence[ChannelFloat32] = ()
 
 
 @message("sensor_msgs/msg/PointField")

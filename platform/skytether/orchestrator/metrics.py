@@ -180,6 +180,7 @@ class Metrics:
         }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
+        yield _states(running)
         led = Sums()
         led.put((), self._epoch())
         yield gauge("leader_epoch", "Epoch in which this orchestrator leads; 0: another one does", (), led)
@@ -219,6 +220,17 @@ def _memory(running: Iterable[Running]) -> Family:
             labels = (one.record.robot, one.record.service, one.record.site or "")
             memory.add(labels, one.observation.memory_bytes)
     return gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
+
+
+def _states(running: Iterable[Running]) -> Family:
+    """Only what a manifest lists: no service makes up series."""
+    states = Sums()
+    for one in running:
+        listed = one.record.spec.states
+        said = [report.code for report in one.observation.reports if report.code in listed] if one.observation else []
+        if said:
+            states.add((one.record.robot, one.record.service, one.record.site or "", said[-1]), 1)
+    return gauge("service_state", "1: the state that the service reported last", (*INSTANCE, "state"), states)
 
 
 def _of_quotas(quotas: Quotas, running: Iterable[Running]) -> Iterator[Family]:

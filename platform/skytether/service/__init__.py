@@ -7,7 +7,7 @@ Everything that knows of sockets, sessions or the orchestrator is behind it; a s
 from .calls import Caller
 from .errors import CallError, ConfigError, ServiceError
 from .goals import ActionServer, Goal, GoalError
-from .mailbox import RawReceived, Received
+from .mailbox import Arrived, RawReceived, Received
 from .main import run
 from .params import NoParams, param
 from .rate import Rate
@@ -18,6 +18,7 @@ __all__ = [
     "Action",
     "ActionServer",
     "AnyInput",
+    "Arrived",
     "Call",
     "CallError",
     "Caller",

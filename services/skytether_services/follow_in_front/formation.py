@@ -97,7 +97,7 @@ class FormationParams:
         slow_share: What of the speed is left then.
         sharpest: An operator further off the line straight back than this is not followed [rad].
         predict: Whether to predict.
-        lead: From a command to its effect, for the prediction: the way down, and half the wheels' lag [s].
+        lead: From a command to its effect, for the prediction, at first: the way down, and half the wheels' lag [s].
     """
 
     distance: float = 0.9
@@ -151,6 +151,8 @@ class Formation:
 
     def __init__(self, params: FormationParams = _DEFAULT) -> None:
         self._params = params
+        self.lead = params.lead
+        """From a command to its effect [s], as far as it is known now."""
         self._legs: _Legs | None = None
         self._change = 0.0
         self._face: tuple[float, float] | None = None
@@ -163,6 +165,11 @@ class Formation:
     def face_rate(self) -> float:
         """Faces a second, lately; 0 until two came."""
         return 1 / self._interval if self._interval > 0 else 0.0
+
+    @property
+    def aside(self) -> bool:
+        """Whether the operator is too far off the line straight back to be followed."""
+        return self._legs is not None and abs(self._legs.off) > self._params.sharpest
 
     def legs(self, x: float, y: float, vx: float, vy: float, at: float) -> None:
         """Take where the operator was; what is not finite, or not newer than the last, is ignored.
@@ -254,8 +261,8 @@ class Formation:
         p = self._params
         distance, speed = legs.distance, legs.speed
         if p.predict:
-            ahead = now - legs.at + p.lead
-            way = sum(part * velocity.linear for part, velocity in self._acting(legs.at - p.lead, now))
+            ahead = now - legs.at + self.lead
+            way = sum(part * velocity.linear for part, velocity in self._acting(legs.at - self.lead, now))
             distance += way * math.cos(legs.off) - (speed + self._change * ahead / 2) * ahead
             speed += self._change * ahead
         return (max(speed, 0.0) + p.distance_gain * (p.distance - distance)) * math.cos(legs.off)
@@ -264,13 +271,12 @@ class Formation:
         p = self._params
         angle, at = face
         if p.predict:
-            angle -= self._turned(at, now + p.lead)
+            angle -= self._turned(at, now + self.lead)
         return p.steering_gain * math.copysign(max(abs(angle) - p.dead_band, 0.0), angle)
 
     def _turned(self, since: float, until: float) -> float:
         """What the robot turned between two times by its commands, which act `lead` after they are given [rad]."""
-        lead = self._params.lead
-        return sum(part * velocity.angular for part, velocity in self._acting(since - lead, until - lead))
+        return sum(part * velocity.angular for part, velocity in self._acting(since - self.lead, until - self.lead))
 
     def _acting(self, since: float, until: float) -> list[tuple[float, Velocity]]:
         """Commands given between two times, and for how long each held [s]; before the first one it stood."""

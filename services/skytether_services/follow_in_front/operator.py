@@ -56,6 +56,7 @@ class OperatorParams:
         far: At the most, to be picked [m].
         side: Off the line straight back at the most, to be picked [rad].
         apart: Of two who could be, one is picked only if this much nearer to that line than the other [m].
+        settle: And only who has been the one to pick for so long [s]: of two who come up, one is seen to walk first.
         gone: Whoever is further away than this is followed no more [m].
         again: One who was lost is found again within this distance of where they would be [m].
         memory: And within this time [s]. Nobody else is picked meanwhile.
@@ -65,12 +66,15 @@ class OperatorParams:
     far: float = 2.0
     side: float = math.radians(35)
     apart: float = 0.4
+    settle: float = 0.4
     gone: float = 3.5
     again: float = 0.6
     memory: float = 2.0
 
 
 _DEFAULT = OperatorParams()
+_MOVES = 0.25
+"""What moves faster may be one who is about to walk, m/s."""
 
 
 class OperatorChoice:
@@ -83,6 +87,7 @@ class OperatorChoice:
     def __init__(self, params: OperatorParams = _DEFAULT) -> None:
         self._params = params
         self._last: tuple[Person, float] | None = None
+        self._next: tuple[int, float] | None = None
         self.choice = Choice.NOBODY
         """How it stands."""
         self.picked = 0
@@ -108,7 +113,7 @@ class OperatorChoice:
             return None
         if kept is None:
             self._last = None
-            kept = self._pick(people, robot, face)
+            kept = self._pick(people, robot, now, face)
         if kept is None:
             return None
         self._last, self.choice = (kept, now), Choice.FOLLOWED
@@ -132,20 +137,36 @@ class OperatorChoice:
             return None
         return same
 
-    def _pick(self, people: Sequence[Person], robot: tuple[float, float, float], face: bool) -> Person | None:
+    def _pick(
+        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, face: bool
+    ) -> Person | None:
         p = self._params
         found: list[tuple[float, Person]] = []
         for person in people:
             seen = _seen_from(robot, person)
             distance, off = math.hypot(seen.x, seen.y), abs(math.atan2(seen.y, -seen.x))
-            if p.near <= distance <= p.far and off <= p.side and person.legs and _trusted(person, face):
+            if p.near <= distance <= p.far and off <= p.side and person.legs and _perhaps(person, face):
                 found.append((abs(seen.y), person))
         found.sort(key=lambda one: one[0])
-        if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart):
-            self.choice = Choice.SEVERAL if found else Choice.NOBODY
+        sure = any(_trusted(person, face) for _, person in found)
+        self.choice = Choice.SEVERAL if sure and len(found) > 1 else Choice.NOBODY
+        if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart) or not _trusted(found[0][1], face):
+            self._next = None
+            return None
+        person = found[0][1]
+        if self._next is None or self._next[0] != person.id or not 0 <= now - self._next[1] <= p.memory:
+            self._next = (person.id, now)
+        if now - self._next[1] < p.settle:
+            self.choice = Choice.NOBODY
             return None
         self.picked += 1
-        return found[0][1]
+        self._next = None
+        return person
+
+
+def _perhaps(person: Person, face: bool) -> bool:
+    """Whether it may be a person, so that nobody beside it is picked: one who stands or moves, be it a chair."""
+    return _trusted(person, face) or person.stands or math.hypot(*person.velocity.tolist()) > _MOVES
 
 
 def _trusted(person: Person, face: bool) -> bool:

@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from skytether_services.follow_in_front.operator import Choice, OperatorChoice
+from skytether_services.follow_in_front.operator import Choice, OperatorChoice, OperatorParams
 from skytether_services.follow_in_front.person import Person
 
 ORIGIN = (0.0, 0.0, 0.0)
+AT_ONCE = OperatorParams(settle=0.0)
 
 
 def person(
@@ -28,7 +29,7 @@ def person(
 
 
 def test_one_who_stands_behind_and_has_walked_is_picked() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     operator = choice.step([person(3, -1.0, 0.1)], ORIGIN, 0.0)
     assert operator is not None
     assert (operator.id, operator.x, operator.y) == (3, pytest.approx(-1.0), pytest.approx(0.1))
@@ -37,14 +38,14 @@ def test_one_who_stands_behind_and_has_walked_is_picked() -> None:
 
 @pytest.mark.parametrize(("x", "y"), [(1.0, 0.0), (-0.2, 0.0), (-3.0, 0.0), (-1.0, 1.0)])
 def test_who_is_not_behind_or_too_near_or_too_far_is_not_picked(x: float, y: float) -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     assert choice.step([person(3, x, y)], ORIGIN, 0.0) is None
     assert (choice.choice, choice.picked) == (Choice.NOBODY, 0)
 
 
 def test_place_and_velocity_are_told_in_the_robots_frame() -> None:
     # The robot looks along y; the person stands 1 m behind it and walks along y, which is ahead.
-    operator = OperatorChoice().step([person(1, 2.0, 1.0, velocity=(0.0, 0.5))], (2.0, 2.0, math.pi / 2), 0.0)
+    operator = OperatorChoice(AT_ONCE).step([person(1, 2.0, 1.0, velocity=(0.0, 0.5))], (2.0, 2.0, math.pi / 2), 0.0)
     assert operator is not None
     assert (operator.x, operator.y) == (pytest.approx(-1.0), pytest.approx(0.0))
     assert (operator.vx, operator.vy) == (pytest.approx(0.5), pytest.approx(0.0))
@@ -52,14 +53,14 @@ def test_place_and_velocity_are_told_in_the_robots_frame() -> None:
 
 def test_legs_that_never_walked_need_a_face() -> None:
     chair = person(2, -1.0, 0.0, walks=False)
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     assert choice.step([chair], ORIGIN, 0.0) is None
     operator = choice.step([chair], ORIGIN, 0.1, face=True)
     assert operator is not None
 
 
 def test_of_two_who_could_be_none_is_guessed() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     left, right = person(1, -1.0, 0.3), person(2, -1.0, -0.3)
     assert choice.step([left, right], ORIGIN, 0.0) is None
     assert choice.choice == Choice.SEVERAL
@@ -69,8 +70,31 @@ def test_of_two_who_could_be_none_is_guessed() -> None:
     assert operator.id == 1
 
 
-def test_the_operator_stays_though_others_come_nearer() -> None:
+def test_of_two_who_come_up_the_one_who_is_seen_to_walk_first_is_not_picked() -> None:
     choice = OperatorChoice()
+    late = person(2, -1.0, -0.3)
+    late.walks = False
+    late.stands = False
+    for scan in range(3):
+        assert choice.step([person(1, -1.0, 0.3), late], ORIGIN, 0.1 * scan) is None
+    late.walks = True
+    assert choice.step([person(1, -1.0, 0.3), late], ORIGIN, 0.3) is None
+    assert (choice.choice, choice.picked) == (Choice.SEVERAL, 0)
+    for scan in range(4, 9):
+        alone = choice.step([person(1, -1.0, 0.3)], ORIGIN, 0.1 * scan)
+    assert alone is not None
+
+
+def test_beside_one_who_may_be_about_to_walk_nobody_is_picked() -> None:
+    moving = person(2, -1.0, -0.3, velocity=(0.5, 0.0))
+    moving.walks = False
+    choice = OperatorChoice(AT_ONCE)
+    assert choice.step([person(1, -1.0, 0.3), moving], ORIGIN, 0.0) is None
+    assert choice.choice == Choice.SEVERAL
+
+
+def test_the_operator_stays_though_others_come_nearer() -> None:
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.2)], ORIGIN, 0.0)
     for scan in range(1, 20):
         operator = choice.step([person(9, -0.8, 0.0), person(1, -1.0, 0.2 + 0.05 * scan)], ORIGIN, 0.1 * scan)
@@ -80,7 +104,7 @@ def test_the_operator_stays_though_others_come_nearer() -> None:
 
 
 def test_one_who_is_lost_is_found_again_where_they_would_be() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0, velocity=(0.4, 0.0))], ORIGIN, 0.0)
     assert choice.step([], ORIGIN, 0.5) is None
     assert choice.choice == Choice.LOST
@@ -92,7 +116,7 @@ def test_one_who_is_lost_is_found_again_where_they_would_be() -> None:
 
 
 def test_nobody_takes_the_place_of_one_who_is_lost_at_once() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.5, 0.0)], ORIGIN, 0.0)
     stranger = person(2, -0.8, 0.1)  # 0.7 m from where the operator was
     for at in (0.1, 1.0, 2.0):
@@ -103,14 +127,14 @@ def test_nobody_takes_the_place_of_one_who_is_lost_at_once() -> None:
 
 
 def test_of_two_who_might_be_the_lost_one_none_is_guessed() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 0.0)
     assert choice.step([person(2, -1.0, 0.3), person(3, -1.0, -0.3)], ORIGIN, 0.5) is None
     assert choice.choice == Choice.LOST
 
 
 def test_one_who_walks_away_is_not_followed() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 0.0)
     assert choice.step([person(1, -3.6, 0.0)], ORIGIN, 0.1) is None
     assert choice.choice == Choice.LOST
@@ -119,7 +143,7 @@ def test_one_who_walks_away_is_not_followed() -> None:
 
 
 def test_a_clock_that_was_set_back_makes_nobody_lost_for_ever() -> None:
-    choice = OperatorChoice()
+    choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 1000.0)
     choice.step([], ORIGIN, 1.0)
     assert choice.choice == Choice.NOBODY
