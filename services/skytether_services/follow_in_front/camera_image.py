@@ -30,7 +30,7 @@ def decode(data: bytes | memoryview | NDArray[np.uint8]) -> Picture:
         PictureError: It is broken, too large or too small, or black.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(memoryview(data)), formats=("JPEG", "PNG")) as image:
             width, height = image.size
             if width * height > _LARGEST:
                 raise PictureError(f"the picture has {width} x {height} pixels, more than {_LARGEST} in all")

@@ -89,7 +89,8 @@ def _in_the_head(points: Floats) -> Floats:
     across /= np.linalg.norm(across)
     ahead = np.cross(across, (0.0, 0.0, 1.0))
     ahead /= np.linalg.norm(ahead)
-    return places @ np.stack([ahead, across, np.cross(ahead, across)], axis=1)
+    straight: Floats = places @ np.stack([ahead, across, np.cross(ahead, across)], axis=1)
+    return straight
 
 
 if __name__ == "__main__":

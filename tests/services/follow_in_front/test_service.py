@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
@@ -104,7 +105,7 @@ class Scene:
     harness: Harness[FollowInFront]
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
     picture: bytes | None = ONE
-    people: list[Walker | Chair] | None = field(default_factory=lambda: [Walker()])
+    people: Sequence[Walker | Chair] | None = field(default_factory=lambda: [Walker()])
     late: float = 0.0
     odometry: bool = True
     x: float = 0.0
