@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from .lab_authentication import authentication
+from .lab_face import face
 from .lab_failover import alarms, failover
 from .lab_hostile import hostile
 from .lab_legs import legs
@@ -28,6 +29,7 @@ bench.command("authentication")(authentication)
 bench.command("mapping")(mapping)
 bench.command("localisation")(localisation)
 bench.command("navigation")(navigation)
+bench.command("face")(face)
 bench.command("legs")(legs)
 scenario = typer.Typer(help="Experiments of the thesis, done with the real program.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")

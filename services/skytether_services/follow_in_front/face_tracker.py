@@ -7,7 +7,6 @@ than half of itself from one picture to the next. Others are looked for in all o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,9 +51,16 @@ class Face(NamedTuple):
     score: float
 
 
-@dataclass(slots=True)
-class _Known:
-    box: Box
+class _Known(NamedTuple):
+    """A face of the last picture: its landmarks, and the box of the detector, which is another; None: it was not."""
+
+    landmarks: Landmarks
+    detected: Box | None
+
+    @property
+    def box(self) -> Box:
+        """Around the landmarks."""
+        return self.landmarks.box()
 
 
 class FaceTracker:
@@ -75,47 +81,49 @@ class FaceTracker:
     def step(self, picture: Picture) -> list[Face]:
         """Faces of the next picture, the largest first."""
         image = Image.fromarray(picture)
-        found: list[Landmarks] = []
+        found: list[_Known] = []
         for known in self._known:
-            self._take(found, self._follow(image, known.box))
+            _take(found, self._follow(image, known))
         if not found or self._pictures % _SEARCH_EVERY == 0:
             for part in self._parts(image, everywhere=not found):
                 for box in self._detector.find(image, part):
-                    if not any(_same(box, one.box()) for one in found):
-                        self._take(found, self._look_twice(image, box))
+                    if not any(_same(box, one.box) for one in found):
+                        _take(found, self._look_twice(image, box))
                 if found:
                     break
         self._pictures += 1
-        found.sort(key=lambda one: -one.box().height)
-        self._known = [_Known(one.box()) for one in found[:_MOST]]
-        return [self._face(one, image.size) for one in found]
+        found.sort(key=lambda one: -one.box.height)
+        self._known = found
+        return [self._face(one.landmarks, image.size) for one in found]
 
-    def _follow(self, image: Image.Image, box: Box) -> Landmarks | None:
-        """A face that was in a box before; None: it is not there any more."""
+    def _follow(self, image: Image.Image, known: _Known) -> _Known | None:
+        """A face of the last picture; None: it is not there any more."""
+        box = known.box
         side = round(_AROUND * max(box.width, box.height))
         left, top = round(box.x) - side // 2, round(box.y) - side // 2
         part = (max(left, 0), max(top, 0), min(left + side, image.width), min(top + side, image.height))
-        near = self._detector.find(image, part)
-        if near:
-            return self._look_twice(image, min(near, key=lambda one: _moved(one, box)))
-        found = self._look(image, box)
-        return found if found is not None and _moved(found.box(), box) <= _STILL else None
+        near = min(self._detector.find(image, part), key=lambda one: _moved(one, box), default=None)
+        if near is None:
+            found = self._look(image, box)
+            return _Known(found, None) if found is not None and _moved(found.box(), box) <= _STILL else None
+        before = known.detected
+        if before is not None:
+            expected = box._replace(x=box.x + near.x - before.x, y=box.y + near.y - before.y)
+            found = self._look(image, expected)
+            if found is not None and _moved(found.box(), expected) <= _STILL:
+                return _Known(found, near)
+        return self._look_twice(image, near)
 
-    def _look_twice(self, image: Image.Image, box: Box) -> Landmarks | None:
+    def _look_twice(self, image: Image.Image, box: Box) -> _Known | None:
         """A face that was detected in a box: boxes of a detector are not those of the landmarks."""
         first = self._look(image, box)
         found = self._look(image, first.box()) if first is not None else None
-        return found if found is not None and _moved(found.box(), box) <= _MOVED_DETECTED else None
+        return _Known(found, box) if found is not None and _moved(found.box(), box) <= _MOVED_DETECTED else None
 
     def _look(self, image: Image.Image, box: Box) -> Landmarks | None:
         found = self._mesh.look(image, box)
         now = found.box()
         return found if found.score >= _LEAST_SCORE and max(now.width, now.height) >= _SMALLEST else None
-
-    @staticmethod
-    def _take(found: list[Landmarks], new: Landmarks | None) -> None:
-        if new is not None and len(found) < _MOST and not any(_same(new.box(), one.box()) for one in found):
-            found.append(new)
 
     def _parts(self, image: Image.Image, *, everywhere: bool) -> list[tuple[int, int, int, int] | None]:
         """What to look at: all of it, and one of the parts in turn, in which small faces are larger."""
@@ -134,6 +142,11 @@ class FaceTracker:
         box = found.box()
         bearing = math.atan((2 * box.x / width - 1) * self._half)
         return Face(turned(found.points) - bearing, bearing, max(box.width, box.height), found.score)
+
+
+def _take(found: list[_Known], new: _Known | None) -> None:
+    if new is not None and len(found) < _MOST and not any(_same(new.box, one.box) for one in found):
+        found.append(new)
 
 
 def _moved(now: Box, before: Box) -> float:
