@@ -10,6 +10,7 @@ import pytest
 
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import Refusal, Report, TopicReport
+from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.accounts import Account, of_robot, of_run
 from skytether.orchestrator.metrics import Metrics, Running, SiteGauges
 from skytether.orchestrator.records import Record
@@ -87,6 +88,7 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
         "instance_restarts_total",
+        "service_state",
         "instance_network_receive_bytes_total",
         "instance_network_transmit_bytes_total",
         "placement_refusals_total",
@@ -134,6 +136,24 @@ def test_series_vanish_with_the_site_and_the_service(new_record: NewRecord) -> N
     metrics.refused("toy", [Refusal(site="lab", reason="cpu", detail="")])
     metrics.forget_service("toy")
     assert 'service="toy"' not in metrics.text().decode()
+
+
+def test_the_state_that_a_service_reported_last_is_a_series_if_its_manifest_lists_it(
+    new_record: NewRecord, manifest: Any
+) -> None:
+    record = new_record(site="lab", manifest=manifest(states=["following", "no_face"]))
+    running = [Running(record, None)]
+    metrics, _ = reported(running)
+
+    def states(*codes: str) -> list[str]:
+        said = tuple(ServiceReport(number, code, "") for number, code in enumerate(codes, start=1))
+        running[:] = [Running(record, Observation(1, Phase.RUNNING, reports=said))]
+        return re.findall(r'^skytether_service_state{.*state="(\w+)"} 1', metrics.text().decode(), re.MULTILINE)
+
+    assert states() == []
+    assert states("following") == ["following"]
+    assert states("following", "no_face", "made_up") == ["no_face"]
+    assert states(*(f"made_up_{n}" for n in range(8))) == []
 
 
 def test_two_instances_of_one_robot_add_up(new_record: NewRecord, manifest: Any) -> None:
