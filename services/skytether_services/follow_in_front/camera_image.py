@@ -23,14 +23,14 @@ class PictureError(Exception):
     """These bytes are no picture that shows anything; the text says why."""
 
 
-def decode(data: bytes | memoryview | NDArray[np.uint8]) -> Picture:
+def decode(data: bytes) -> Picture:
     """JPEG or PNG, whichever it is.
 
     Raises:
         PictureError: It is broken, too large or too small, or black.
     """
     try:
-        with Image.open(io.BytesIO(memoryview(data)), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
             width, height = image.size
             if width * height > _LARGEST:
                 raise PictureError(f"the picture has {width} x {height} pixels, more than {_LARGEST} in all")

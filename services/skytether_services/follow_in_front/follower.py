@@ -129,7 +129,7 @@ class Follower:
         self._waiting = scan
         self._try_scan(now)
 
-    def picture(self, data: bytes | memoryview | NDArray[np.uint8], at: float, now: float) -> None:
+    def picture(self, data: bytes, at: float, now: float) -> None:
         """Take a picture of the camera that was made at a time [s]."""
         self._picture_came = now
         if at <= self._picture_at:

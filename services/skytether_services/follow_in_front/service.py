@@ -93,7 +93,7 @@ class FollowInFront(Service[Params]):
             self._see(scan, now)
         if (picture := self.picture.take()) and now - self._looked_at >= _EARLY / self.params.face_rate:
             self._looked_at = now
-            self._follower.picture(picture.message.data, _made_at(picture), now)
+            self._follower.picture(picture.message.data.tobytes(), _made_at(picture), now)
 
     def _see(self, received: Received[LaserScan], now: float) -> None:
         scan, laser = received.message, self.params.laser

@@ -103,7 +103,6 @@ def test_a_camera_sees_less_than_half_of_the_world() -> None:
 def test_pictures_that_show_nothing_are_refused_with_the_reason() -> None:
     good = jpeg(picture((320, 240, 150)))
     assert decode(good).shape == (480, 640, 3)
-    assert decode(np.frombuffer(good, np.uint8)).shape == (480, 640, 3)
     broken = {
         b"": "broken",
         b"no picture": "broken",
@@ -129,7 +128,7 @@ def test_bytes_of_any_kind_are_a_picture_or_refused() -> None:
         places = random.integers(0, len(bad), 12)
         bad[places] = random.integers(0, 256, 12)
         try:
-            assert decode(bad[: random.integers(1, len(bad))]).ndim == 3
+            assert decode(bad[: random.integers(1, len(bad))].tobytes()).ndim == 3
         except PictureError:
             continue
 
