@@ -21,6 +21,7 @@ NOTES = {
     "eclipse-zenoh": "its user chooses Apache-2.0",
     "psycopg": "extra `postgres`; LGPL: used unchanged as a library, replaceable",
     "psycopg-binary": "extra `postgres`; LGPL: used unchanged as a library, replaceable",
+    "tqdm": "extra `follow-in-front`, asked for by LiteRT, which only its tools use; unchanged",
 }
 _HEAD = """\
 # Licences

@@ -1,18 +1,22 @@
-"""The parameters of the service navigation as a page: ``make docs`` writes it."""
+"""The parameters of a service as a page: ``make docs`` writes it for ``navigation`` and ``follow-in-front``."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from typing import Any
 
-from skytether.service import params_schema
+from skytether.service import Service, params_schema
+from skytether_services.follow_in_front.service import FollowInFront
 from skytether_services.navigation.service import Navigation
 
-_PAGE = """\
-# Parameters of navigation
+_SERVICES: dict[str, type[Service[Any]]] = {"navigation": Navigation, "follow-in-front": FollowInFront}
 
-What a robot may set when it asks for the service [navigation](navigation.md). A wrong key or value is refused by name.
+_PAGE = """\
+# Parameters of {name}
+
+What a robot may set when it asks for the service [{name}]({name}.md). A wrong key or value is refused by name.
 `[]` is an element of a list; what has no default must be given. This page is made from the code (`make docs`).
 
 | parameter | default | unit | limits | means |
@@ -72,14 +76,14 @@ def _rounded(value: Any) -> Any:
     return {key: _rounded(one) for key, one in value.items()} if isinstance(value, dict) else value
 
 
-def page() -> str:
-    """The whole page."""
+def page(service: str) -> str:
+    """The whole page of a service."""
     lines = []
-    for name, *others in rows(params_schema(Navigation)):
+    for name, *others in rows(params_schema(_SERVICES[service])):
         cells = [f"`{name}`", *others]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
-    return _PAGE + "".join(lines)
+    return _PAGE.format(name=service) + "".join(lines)
 
 
 if __name__ == "__main__":
-    print(page(), end="")  # noqa: T201 (what a script prints)
+    print(page(sys.argv[1]), end="")  # noqa: T201 (what a script prints)

@@ -89,14 +89,15 @@ def test_manifest_s_schema_is_the_dataclass_s(manifest: Manifest) -> None:
     assert manifest.spec.params == params_schema(Navigation)
 
 
-def test_the_page_of_parameters_is_current() -> None:
+@pytest.mark.parametrize("service", ["navigation", "follow-in-front"])
+def test_the_page_of_parameters_is_current(service: str) -> None:
     root = FilePath(__file__).parents[3]
     spec = importlib.util.spec_from_file_location("parameters", root / ".ci" / "parameters.py")
     assert spec is not None
     assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    assert (root / "docs" / "navigation-parameters.md").read_text() == script.page(), "run `make docs`"
+    assert (root / "docs" / f"{service}-parameters.md").read_text() == script.page(service), "run `make docs`"
 
 
 def test_manifest_s_topics_are_the_class_s(manifest: Manifest) -> None:
