@@ -46,6 +46,7 @@ TOGETHER = (
     "e2e/test_demo.py::test_demo_prints_one_json_object",
     "e2e/test_replay.py",
     "lab/test_bench_bridge.py",
+    "lab/test_bench_face.py",
     "lab/test_bench_fleet.py",
     "lab/test_bench_legs.py",
     "lab/test_bench_mapping.py",

@@ -14,6 +14,7 @@ from skytether.lab.bench import face as bench
 from skytether_services.follow_in_front.bench_face import look
 
 
+@pytest.mark.slow
 def test_a_head_that_turns_is_seen_to_turn(gl: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "load", lambda _name, _extra: look)
     found = bench.bench_face((0.9,), math.radians(9), [1])

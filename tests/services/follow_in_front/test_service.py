@@ -195,6 +195,7 @@ def test_priorities_are_those_of_table_2(manifest: Manifest) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_robot_goes_ahead_of_the_person_at_its_distance() -> None:
     found = scene()
     found.run(7.0)
@@ -208,6 +209,7 @@ def test_the_robot_goes_ahead_of_the_person_at_its_distance() -> None:
     assert all(linear >= 0 for linear, _ in found.commands)
 
 
+@pytest.mark.slow
 def test_a_face_aside_turns_the_robot_there() -> None:
     """A face that looks into the camera from the picture's right points to the robot's right."""
     found = scene()
