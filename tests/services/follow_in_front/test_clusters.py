@@ -28,6 +28,14 @@ def test_a_leg_is_a_round_cluster_as_wide_as_it_is() -> None:
     assert not both_legs(clusters).any()
 
 
+def test_a_leg_near_to_the_laser_is_one_though_its_many_points_are_noisy() -> None:
+    random = np.random.default_rng(1)
+    clusters = [found(scan([(0.45, 0.1)], random=random)) for _ in range(100)]
+    assert all(leg_like(one).tolist() == [True] for one in clusters)
+    # Half the way round it, and a little more for the noise.
+    assert max(one.girths[0] for one in clusters) < 1.4 * np.pi * 0.055
+
+
 def test_a_wall_is_straight_and_no_leg() -> None:
     clusters = found(scan([], [((2.0, -1.0), (2.0, 1.0))]))
     assert len(clusters) == 1
