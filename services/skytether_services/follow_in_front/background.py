@@ -22,10 +22,10 @@ class Background:
         self._seen: dict[tuple[int, int], tuple[float, float]] = {}
         self._tidied_at = 0.0
 
-    def stands(self, place: NDArray[np.float64], now: float) -> bool:
-        """Whether something was in the square of this place [m, frame that does not move] for a while."""
+    def stands(self, place: NDArray[np.float64], now: float, stood: float = _STOOD) -> bool:
+        """Whether something was in the square of this place [m, frame that does not move] for so long [s]."""
         since = self._seen.get(_square(place))
-        return since is not None and now - since[0] > _STOOD and now - since[1] <= _FORGOTTEN
+        return since is not None and now - since[0] > stood and now - since[1] <= _FORGOTTEN
 
     def look(self, points: NDArray[np.float64], now: float) -> None:
         """Take all points of a scan, n by (x, y) [m, frame that does not move]."""

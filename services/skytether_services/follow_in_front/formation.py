@@ -86,6 +86,7 @@ class FormationParams:
         dead_band: A face that points less than this off the heading does not steer [rad].
         widest: A face that points further off counts as this [rad]: nobody sees the way beyond it.
         filter_time: Time constant of the filter of the face's angle [s].
+        speed_time: Time constant of the filter of the operator's speed [s]: legs swing, about once a second.
         max_linear: Fastest [m/s].
         max_angular: Fastest turn [rad/s].
         acceleration: Of the linear velocity [m/s^2].
@@ -106,6 +107,7 @@ class FormationParams:
     dead_band: float = math.radians(5)
     widest: float = math.radians(60)
     filter_time: float = 0.15
+    speed_time: float = 0.5
     max_linear: float = 0.8
     max_angular: float = 0.6
     acceleration: float = 0.6
@@ -191,6 +193,7 @@ class Formation:
         if before is None or gap > _LONGEST_GAP:
             self._change = 0.0
         else:
+            speed = before.speed + (speed - before.speed) * -math.expm1(-gap / self._params.speed_time)
             change = min(max((speed - before.speed) / gap, -_CHANGE), _CHANGE)
             self._change += (change - self._change) * -math.expm1(-gap / _CHANGE_TIME)
         self._legs = _Legs(at, distance, math.atan2(y, -x), speed)

@@ -16,6 +16,10 @@ _TWO_LEGS = 0.06
 """Standard deviation of the middle of two legs about the person's, m."""
 _ONE_LEG = 0.25
 """Of one leg that is seen alone, m: a foot rests for half a second while the person goes on, and is no white noise."""
+_SHADOW = 0.12
+"""What is this near to the line from the laser through a leg, and behind it, is hidden by it, m."""
+_HIDDEN = 0.75
+"""A leg so hidden is thought to be where it was; of what the person goes, this share goes to the middle's deviation."""
 _BORN = (0.15, 0.8)
 """Standard deviations of place [m] and of each velocity [m/s] of one who was just found."""
 _WEIGHT = 0.12
@@ -83,6 +87,8 @@ class Person:
     walks: bool = False
     stands: bool = False
     legs: int = 0
+    _feet: Floats | None = None
+    _feet_at: float = 0.0
     _rested: Floats = field(default_factory=lambda: np.zeros(2))
     _rested_at: float = 0.0
     _scans: int = 0
@@ -146,19 +152,20 @@ class Person:
         self.state = move @ self.state
         self.covariance = move @ self.covariance @ move.T + noise
 
-    def look(self, legs: Floats, full: bool, now: float) -> None:
+    def look(self, legs: Floats, full: bool, now: float, laser: tuple[float, float]) -> None:
         """Take what a scan showed of it.
 
         Args:
             legs: n by (x, y) [m]; n is 0, 1 or 2.
             full: Both legs are in it, be it in one cluster.
             now: When [s].
+            laser: Where it was [m].
         """
         self._scans += 1
         self.legs = 2 if full else len(legs)
         self._share += _WEIGHT * ((1.0 if full else _ONE if len(legs) else 0.0) - self._share)
         if len(legs):
-            self._correct(legs.mean(axis=0), _TWO_LEGS if full else _ONE_LEG)
+            self._correct(*self._middle(legs, full, now, laser))
             self.seen_at = now
             self._seen += 1
             self._full += full
@@ -171,6 +178,22 @@ class Person:
             self.stands = self.stands or self.paired
         self.stands = self.stands and not self.walks and now - self.born_at <= self._proof.pair_trust
 
+    def _middle(self, legs: Floats, full: bool, now: float, laser: tuple[float, float]) -> tuple[Floats, float]:
+        """Where the middle of both legs is, with its deviation [m].
+
+        A leg that the other one hides rests there at first: it was hidden by a step of the other.
+        """
+        if full:
+            self._feet, self._feet_at = (legs.copy(), now) if len(legs) == 2 else (None, now)
+            return legs.mean(axis=0), _TWO_LEGS
+        gone = math.hypot(*self.velocity.tolist()) * (now - self._feet_at)
+        deviation = math.hypot(_TWO_LEGS, _HIDDEN * gone)
+        if self._feet is not None and deviation < _ONE_LEG:
+            other = self._feet[int(np.argmax(np.hypot(*(self._feet - legs[0]).T)))]
+            if _hides(legs[0] - laser, other - laser):
+                return (legs[0] + other) / 2, deviation
+        return legs.mean(axis=0), _ONE_LEG
+
     def _correct(self, place: Floats, deviation: float) -> None:
         innovation = self.covariance[:2, :2] + np.eye(2) * deviation**2
         gain = self.covariance[:, :2] @ np.linalg.inv(innovation)
@@ -182,3 +205,10 @@ class Person:
         pace = p.slow_speed if self._apart >= p.apart * self._scans else p.speed
         far = self._furthest >= max(p.way, pace * (now - self._rested_at))
         return far and self._seen >= p.seen * self._scans and self._share >= p.walker_legs
+
+
+def _hides(leg: Floats, other: Floats) -> bool:
+    """Whether a leg stands before another, as the laser at the origin sees them [m]."""
+    away = math.hypot(*leg.tolist())
+    beside = abs(float(leg[0] * other[1] - leg[1] * other[0])) / max(away, 1e-6)
+    return beside < _SHADOW and math.hypot(*other.tolist()) > away

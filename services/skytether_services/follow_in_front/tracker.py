@@ -31,7 +31,12 @@ _OTHER_LEG = 0.5
 _LEAST_SHARE = 0.1
 """Who shows fewer legs than this share is gone."""
 _WALKING = 0.5
-"""Whose feet are both where something stood for a second is not as fast, m/s."""
+"""Whose foot is where something has long stood is not as fast, m/s."""
+_LONG = 1.8
+"""A foot rests for 0.6 of a stride, which is 1.2 s at 0.4 m/s and 1.5 s at 0.3 m/s; what stands for longer is none, s.
+
+Who walks so slowly seems to be as fast as `_WALKING` with each step: the middle of both legs is, while one swings.
+"""
 _FASTEST = 3.0
 """What moves faster does not walk, m/s."""
 _MOST = 60
@@ -127,7 +132,8 @@ class PeopleTracker:
         legs, both = middles[use] @ turn + (x, y), both[use]
         seen = clusters.middles[use] @ turn + (x, y)
         stand = np.array([self._background.stands(place, now) for place in seen], bool)
-        taken = self._give(legs, both, stand, now)
+        long = np.array([self._background.stands(place, now, _LONG) for place in seen], bool)
+        taken = self._give(legs, both, long, now, (x, y))
         self._tracks = [person for person in self._tracks if self._stays(person, now)]
         self._tracks = [person for person in self._tracks if not self._is_a_leg_of_another(person)]
         new = np.flatnonzero(~both & ~stand).tolist()
@@ -135,7 +141,14 @@ class PeopleTracker:
         self._background.look(rays.points @ turn + (x, y), now)
         return self.people
 
-    def _give(self, legs: Floats, both: NDArray[np.bool_], stand: NDArray[np.bool_], now: float) -> set[int]:
+    def _give(
+        self,
+        legs: Floats,
+        both: NDArray[np.bool_],
+        stand: NDArray[np.bool_],
+        now: float,
+        laser: tuple[float, float],
+    ) -> set[int]:
         """Give legs to people; returns the legs that were given."""
         tracks = self._tracks
         places = np.array([person.place for person in tracks]).reshape(-1, 2)
@@ -147,7 +160,7 @@ class PeopleTracker:
         given: set[int] = set()
         for person, mine in zip(tracks, assign(places, spreads, known, legs, both, impossible), strict=True):
             full = len(mine) == 2 or (len(mine) == 1 and bool(both[mine[0]]))
-            person.look(legs[mine], full, now)
+            person.look(legs[mine], full, now, laser)
             given.update(mine)
         return given
 

@@ -201,6 +201,14 @@ def test_predicting_the_walk_keeps_the_distance_better(round_trip: float) -> Non
     assert rms(True) < 0.75 * rms(False)
 
 
+def test_the_swing_of_each_step_is_not_driven_after() -> None:
+    """The middle of two legs goes by steps: at 0.4 m/s it has 0.1 to 0.7 m/s, once a second."""
+    log = drive(Formation(), 40.0, speed=lambda t: 0.4 + 0.3 * math.sin(math.tau * t))
+    settled = np.array(log.time) > 10
+    # It brakes harder than it speeds up: driven after, the swing would bring the operator nearer.
+    assert abs(np.array(log.distance)[settled].mean() - 0.9) < 0.06
+
+
 def test_parameters_that_cannot_be_are_refused() -> None:
     for wrong in ({"distance": 0.0}, {"distance_gain": math.nan}, {"lead": -0.1}, {"max_linear": math.inf}):
         with pytest.raises(ValueError, match=next(iter(wrong))):

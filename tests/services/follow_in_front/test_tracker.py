@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from leg_scans import FIRST, LIMITS, STEP, feet, scan
 
+from skytether.lab.trail import Pose
+from skytether.lab.world.gait import Gait
 from skytether_services.follow_in_front.person import Person
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
@@ -206,3 +208,33 @@ def test_a_coarse_laser_sees_people_too() -> None:
         found += any(math.dist(person.place, one(at)[0]) < 0.35 for person in people)
         assert len(people) <= 1
     assert found >= 15
+
+
+def slow_walk(laser: Callable[[float], tuple[float, float, float]]) -> list[float]:
+    """How far the track of one who walks along x at 0.4 m/s, with feet that rest, is from their middle [m]."""
+    tracker, errors, random = PeopleTracker(), [], np.random.default_rng(1)
+    pose = Pose(0.0, 0.0, 0.0)
+    gait = Gait(pose)
+    for tick in range(1200):
+        pose = Pose(pose.x + 0.004, 0.0, 0.0)
+        gait.step(pose, 0.004, 0.01)
+        if tick % 10 == 0:
+            at = laser(pose.x)
+            people = tracker.step(scan(gait.feet, laser=at, random=random), FIRST, STEP, LIMITS, at, 0.01 * tick)
+            if tick > 300:
+                assert len(people) == 1
+                errors.append(math.dist(people[0].place, pose[:2]))
+    return errors
+
+
+def test_the_foot_of_a_slow_walker_rests_for_more_than_a_second_and_is_theirs() -> None:
+    errors = slow_walk(lambda x: (6.0, 0.3, math.pi))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.07
+    assert max(errors) < 0.12
+
+
+def test_a_leg_that_the_other_one_hides_is_still_there() -> None:
+    """As a robot ahead and aside sees them: with each step to its side the other leg is hidden for a moment."""
+    errors = slow_walk(lambda x: (x + 0.8, 0.45, math.pi))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.07
+    assert max(errors) < 0.15
