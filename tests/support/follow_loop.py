@@ -9,7 +9,6 @@ import heapq
 import math
 from collections.abc import Callable
 from itertools import count
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from skytether.lab.world.lemniscate import Lemniscate
 from skytether.lab.world.operator import Operator
 from skytether.lab.world.plan import hall
 from skytether.lab.world.robot import RearParams, RobotParams
-from skytether.lab.world.simulation import TICK, Simulation
+from skytether.lab.world.simulation import TICK, Robot, Simulation
 from skytether.messages import LaserScan, Twist, Vector3
 from skytether_services.follow_in_front.formation import Formation, FormationParams, State
 from skytether_services.follow_in_front.operator import Choice, OperatorChoice
@@ -40,7 +39,8 @@ class Loop:
         path: Of the robot's middle, ten points a second [m], from the first movement on.
         states: The law's, step by step.
         choices: The choice of the operator's, scan by scan.
-        picked: Where the one who is followed was seen, and how far that is from where the operator was [m].
+        errors: How far the one who is followed was seen from where the operator was, scan by scan [m].
+        aside: Direction of the operator's face off the camera's axis, scan by scan [rad].
         begun: When the robot moved first [s].
     """
 
@@ -61,17 +61,28 @@ class Loop:
         self.states: list[State] = []
         self.choices: list[Choice] = []
         self.errors: list[float] = []
+        self.aside: list[float] = []
         self.begun = math.nan
 
     @property
-    def robot(self) -> Any:
+    def robot(self) -> Robot:
         return self.world.robots[0]
+
+    @property
+    def picked(self) -> int:
+        """So many operators were picked."""
+        return self._choice.picked
 
     def run(self, seconds: float) -> bool:
         """Whether the round was done in this time."""
         while self.world.time < seconds and not self.operator.done:
             self._tick()
         return self.operator.done
+
+    def go_on(self, seconds: float) -> None:
+        """Whatever the operator does."""
+        for _ in range(round(seconds / TICK)):
+            self._tick()
 
     def _tick(self) -> None:
         self.robot.write(self._command)
@@ -113,6 +124,7 @@ class Loop:
         )
         seen = self._choice.step(self._tracker.tracks, pose, at, face=at - self._face_at < 0.5)
         self.choices.append(self._choice.choice)
+        self.aside.append(math.atan2(truth[1], REAR.camera_x - truth[0]))
         if seen is not None:
             self.errors.append(math.dist((seen.x, seen.y), truth))
             self._formation.legs(seen.x, seen.y, seen.vx, seen.vy, seen.seen_at)

@@ -104,7 +104,7 @@ def test_the_head_answers_after_the_reaction_time_turns_so_fast_and_so_far() -> 
 def test_how_far_the_face_turns_is_what_the_robots_law_needs_for_the_curve() -> None:
     """On the curve, at 0.4 m/s, without a delay: a turn by the curvature 3 r / w^2 times the speed."""
     for s in (4.0, 4.6, 13.5):
-        prompt = OperatorParams(wander=0.0, reaction=0.0, answer=0.0, head_rate=1000.0)
+        prompt = OperatorParams(wander=0.0, reaction=0.0, answer=0.0, head_rate=1000.0, speed_time=1e-6)
         operator = Operator(CURVE, 1, prompt)
         operator.lap.s = s
         robot = CURVE.at(s)

@@ -140,6 +140,7 @@ class Camera:
         simulation: Whose robots have `RobotParams.rear`.
         publish: Called in this camera's thread with each topic and message, as `WorldGraph.publish`.
         robot: Its number.
+        topic: Of the pictures.
         sensor: Noise and coding; None: usual ones, by the simulation's seed.
 
     Attributes:
@@ -158,13 +159,14 @@ class Camera:
         publish: Callable[[str, Message], object],
         *,
         robot: int = 0,
+        topic: str = CAMERA,
         sensor: Sensor | None = None,
     ) -> None:
         rear = simulation.params.rear
         if rear is None:
             raise WorldError("this robot has no camera")
         self._simulation, self._rear, self._robot, self._publish = simulation, rear, robot, publish
-        self._sensor = sensor or Sensor(rear, simulation.seed)
+        self._topic, self._sensor = topic, sensor or Sensor(rear, simulation.seed)
         self._every = 1 / (rear.rate * TICK)
         self._changed = threading.Condition()
         self._waiting: State | None = None
@@ -249,7 +251,7 @@ class Camera:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
         picture = self._sensor.noisy(renderer.draw(data))
         coded = np.frombuffer(self._sensor.jpeg(picture), np.uint8)
-        self._publish(CAMERA, CompressedImage(Header(state.stamp, "camera"), "jpeg", coded))
+        self._publish(self._topic, CompressedImage(Header(state.stamp, "camera"), "jpeg", coded))
 
 
 class FaceStudio:

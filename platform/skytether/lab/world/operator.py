@@ -42,12 +42,14 @@ class OperatorParams:
         acceleration: [m/s^2].
         turn_rate: Of the body [rad/s].
         distance: Where they stand at the beginning: from the robot's middle, straight behind [m].
-        behind: They walk to the point this far behind the robot's middle, so that the camera sees the face [m].
+        closing: They walk to the point of the line straight behind the robot that is this much nearer to it than they
+            are: so they stay behind it in a curve, where the camera sees the face [m].
         near: Nearer to the robot's middle they stop [m].
         easy: Further away than this they walk as they like; between both slower [m].
         look_ahead: Distance of the point that they steer to from the robot's middle [m].
         gain: Of the robot's law, as they know it [1/s].
         dead_band: Likewise [rad].
+        speed_time: The robot's speed is seen as smoothed with this time constant: it changes with each step [s].
         answer: From a movement of the head to the robot's turning, as they know it [s].
         reaction: From what they see to a movement of the head [s].
         head_rate: Fastest turn of the head [rad/s].
@@ -61,12 +63,13 @@ class OperatorParams:
     acceleration: float = 0.6
     turn_rate: float = 1.5
     distance: float = 1.0
-    behind: float = 0.5
+    closing: float = 0.2
     near: float = 0.65
     easy: float = 0.8
     look_ahead: float = 0.8
     gain: float = 0.9
     dead_band: float = math.radians(5)
+    speed_time: float = 0.8
     answer: float = 0.35
     reaction: float = 0.25
     head_rate: float = 1.5
@@ -123,7 +126,7 @@ class Operator:
         self.pose = Pose(x - away * math.cos(heading), y - away * math.sin(heading), heading)
         self.head = heading
         self._gait = Gait(self.pose)
-        self._pace = 0.0
+        self._pace = self._robot_speed = 0.0
         self._wander = params.wander * float(self._random.normal())
         self._time = 0.0
         self._seen: deque[_Seen] = deque()
@@ -147,7 +150,8 @@ class Operator:
         """Go on for dt seconds behind a robot that is there and moves so."""
         self._time += dt
         self.lap.update(robot.x, robot.y)
-        self._seen.append(_Seen(self._time, robot, motion))
+        self._robot_speed += (motion.forward - self._robot_speed) * -math.expm1(-dt / self.params.speed_time)
+        self._seen.append(_Seen(self._time, robot, Motion(self._robot_speed, 0.0, motion.turning)))
         while len(self._seen) > 1 and self._time - self._seen[1].at >= self.params.reaction:
             self._seen.popleft()
         self._look(robot, dt)
@@ -191,8 +195,10 @@ class Operator:
         wish = 0.0 if self.done else allowed
         # Who is too near stops at once.
         self._pace = min(self._pace + _limited(wish - self._pace, p.acceleration * dt), allowed)
-        to_x, to_y = robot.x - p.behind * math.cos(robot.heading), robot.y - p.behind * math.sin(robot.heading)
         if self._pace > 0:
+            cos, sin = math.cos(robot.heading), math.sin(robot.heading)
+            behind = max((robot.x - x) * cos + (robot.y - y) * sin - p.closing, p.closing)
+            to_x, to_y = robot.x - behind * cos, robot.y - behind * sin
             turn = math.remainder(math.atan2(to_y - y, to_x - x) - heading, math.tau)
             heading = math.remainder(heading + _limited(turn, p.turn_rate * dt), math.tau)
         way = self._pace * dt
