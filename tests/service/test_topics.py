@@ -47,6 +47,29 @@ def test_mailbox_is_empty_at_first() -> None:
     assert box.take() is None
 
 
+def test_a_message_that_is_too_large_is_passed_over_and_counted() -> None:
+    box = Mailbox("value", Float64, logging.getLogger("test"), max_bytes=100)
+    box.put(arrive(encode(Float64(1.0))), "cdr")
+    assert box.latest is not None
+    box.put(arrive(encode(Float64(2.0)) + bytes(100), 1), "cdr")
+    assert box.latest is not None
+    assert (box.latest.message.data, box.undecodable) == (1.0, 1)
+
+
+def test_an_input_says_how_large_its_messages_may_be() -> None:
+    class Small(Service[NoParams]):
+        rate_hz = 10.0
+        value = Input(Float64, max_bytes=4)
+
+        def step(self, now: float) -> None:
+            pass
+
+    harness = Harness(Small)
+    harness.send("value", Float64(1.0))
+    assert harness.service.value.take() is None
+    assert harness.service.value.undecodable == 1
+
+
 def test_latest_stays_and_take_is_once() -> None:
     box = mailbox()
     box.put(arrive(encode(Float64(1.0))), "cdr")

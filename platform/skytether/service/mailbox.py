@@ -57,10 +57,12 @@ class RawReceived(Arrived):
 class Mailbox(Generic[M]):
     """The newest message of one topic."""
 
-    def __init__(self, topic: str, cls: type[M], log: logging.Logger) -> None:
+    def __init__(self, topic: str, cls: type[M], log: logging.Logger, max_bytes: int | None = None) -> None:
         self.topic = topic
+        self.max_bytes = max_bytes
+        """Larger messages are not decoded."""
         self.undecodable = 0
-        """Messages looked at that were none of this type."""
+        """Messages looked at that were none of this type, or too large."""
         self._cls = cls
         self._log = log
         self._slot: tuple[MessageReceived, Encoding] | None = None  # the bridge's thread replaces it as a whole
@@ -91,6 +93,8 @@ class Mailbox(Generic[M]):
 
     def _decode(self, received: MessageReceived, encoding: Encoding) -> None:
         try:
+            if self.max_bytes is not None and len(received.payload) > self.max_bytes:
+                raise DecodeError(f"{len(received.payload)} bytes, more than the {self.max_bytes} that are looked at")
             message = decode(self._cls, received.payload, encoding)
         except DecodeError as error:
             self.undecodable += 1

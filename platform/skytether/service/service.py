@@ -123,7 +123,7 @@ class Service(ABC, Generic[P]):
         """Make what stands behind one declaration."""
         match declared:
             case Input():
-                self.mailboxes[declared.topic] = Mailbox(declared.topic, declared.cls, self.log)
+                self.mailboxes[declared.topic] = Mailbox(declared.topic, declared.cls, self.log, declared.max_bytes)
                 return self.mailboxes[declared.topic]
             case Output():
                 self.senders[declared.topic] = Sender(declared.topic, declared.cls)

@@ -46,9 +46,20 @@ class Typed(Declared, Generic[M]):
 
 
 class Input(Typed[M]):
-    """A topic from the robot, of which the newest message matters: ``force = Input(WrenchStamped)``."""
+    """A topic from the robot, of which the newest message matters: ``force = Input(WrenchStamped)``.
+
+    Args:
+        cls: Of its messages.
+        topic: Its name; the attribute's unless given.
+        max_bytes: Larger messages are counted as undecodable, and not looked at: a list of a hundred thousand
+            transforms would hold up a step by seconds. None: as large as the bridge lets through.
+    """
 
     direction = Direction.IN
+
+    def __init__(self, cls: type[M], topic: str | None = None, *, max_bytes: int | None = None) -> None:
+        super().__init__(cls, topic)
+        self.max_bytes = max_bytes
 
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...

@@ -142,12 +142,15 @@ class Harness(Generic[S]):
         """The robot is gone."""
         self._port.notify(Disconnected("silent"))
 
-    def send(self, topic: str, message: Message | bytes, *, age: float = 0.0) -> None:
-        """A message arrives now, published ``age`` seconds ago; bytes arrive as they are."""
+    def send(self, topic: str, message: Message | bytes, *, age: float = 0.0, clock_error: float = 0.0) -> None:
+        """A message arrives now, published ``age`` seconds ago; bytes arrive as they are.
+
+        The robot's clock is known to within ``clock_error`` [s]; inf: it is not known yet.
+        """
         payload = message if isinstance(message, bytes) else encode(message, self._encoding)
         sequence = self._sequence[topic]
         self._sequence[topic] += 1
-        self._port.deliver(MessageReceived(topic, payload, sequence, self.now - age, 0.0, self.now))
+        self._port.deliver(MessageReceived(topic, payload, sequence, self.now - age, clock_error, self.now))
 
     def skip(self, topic: str) -> None:
         """The link loses the topic's next message."""
