@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .person import Person
 
 
@@ -16,7 +19,7 @@ class Choice(StrEnum):
 
     Attributes:
         NOBODY: Nobody stands where an operator does.
-        SEVERAL: More than one does: the robot does not guess.
+        SEVERAL: More than one does, or somebody came so near that one could be the other: the robot does not guess.
         FOLLOWED: There is one.
         LOST: There was one, who is not in sight; nobody else is taken for a while.
     """
@@ -59,7 +62,10 @@ class OperatorParams:
         settle: And only who has been the one to pick for so long [s]: of two who come up, one is seen to walk first.
         gone: Whoever is further away than this is followed no more [m].
         again: One who was lost is found again within this distance of where they would be [m].
-        memory: And within this time [s]. Nobody else is picked meanwhile.
+        memory: And within this time after they were seen last [s]. Nobody else is picked meanwhile.
+        close: Of somebody who is nearer than this to the operator nobody knows any more which of them is which [m].
+        close_hidden: The same while not both legs of the operator are seen [m].
+        close_scans: For so many scans in a row.
     """
 
     near: float = 0.4
@@ -70,6 +76,31 @@ class OperatorParams:
     gone: float = 3.5
     again: float = 0.6
     memory: float = 2.0
+    close: float = 0.45
+    close_hidden: float = 0.65
+    close_scans: int = 2
+
+
+class _Last(NamedTuple):
+    """The operator as of the last scan in which there was one.
+
+    Attributes:
+        id: Of the track.
+        place: [m].
+        velocity: [m/s].
+        at: When that was [s].
+        seen_at: When a leg was last seen [s]; before ``at`` if the operator was hidden.
+    """
+
+    id: int
+    place: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    at: float
+    seen_at: float
+
+    def expected(self, now: float) -> NDArray[np.float64]:
+        """Where they would be now [m]."""
+        return self.place + self.velocity * (now - self.at)
 
 
 _DEFAULT = OperatorParams()
@@ -81,13 +112,18 @@ class OperatorChoice:
     """Picks the operator and keeps them.
 
     Who only stands may be a chair: one is picked who has walked, or whose face the camera sees. A change of operator is
-    never silent: `choice` leaves ``FOLLOWED`` for `OperatorParams.memory` at the least, and `picked` counts.
+    never silent: `choice` leaves ``FOLLOWED`` for `OperatorParams.memory` at the least, and `picked` counts. Two who
+    come so near to each other that a laser cannot tell whose legs are whose are not told apart: nobody is followed
+    then, and one is picked anew.
     """
 
     def __init__(self, params: OperatorParams = _DEFAULT) -> None:
         self._params = params
-        self._last: tuple[Person, float] | None = None
+        self._last: _Last | None = None
         self._next: tuple[int, float] | None = None
+        self._others: set[int] = set()
+        self._close = 0
+        self._mixed_at = -math.inf
         self.choice = Choice.NOBODY
         """How it stands."""
         self.picked = 0
@@ -108,7 +144,12 @@ class OperatorChoice:
             Whom to follow; None: `choice` says why.
         """
         kept = self._kept(people, robot, now)
-        if kept is None and self._last is not None and 0 <= now - self._last[1] <= self._params.memory:
+        if self._is_mixed_up(kept, people, now):
+            self._last, self._mixed_at, self._next = None, now, None
+        if 0 <= now - self._mixed_at < self._params.memory:
+            self.choice = Choice.SEVERAL
+            return None
+        if kept is None and self._last is not None and self._remembers(self._last, now):
             self.choice = Choice.LOST
             return None
         if kept is None:
@@ -116,23 +157,49 @@ class OperatorChoice:
             kept = self._pick(people, robot, now, face)
         if kept is None:
             return None
-        self._last, self.choice = (kept, now), Choice.FOLLOWED
+        self._last = _Last(kept.id, kept.place.copy(), kept.velocity.copy(), now, kept.seen_at)
+        self.choice = Choice.FOLLOWED
+        self._others &= {person.id for person in people}
+        if kept.legs:
+            self._others |= {person.id for person in people if person.known and person.legs and person is not kept}
         return _seen_from(robot, kept)
 
+    def _is_mixed_up(self, kept: Person | None, people: Sequence[Person], now: float) -> bool:
+        """Whether somebody came so near to the operator that one could have become the other."""
+        p = self._params
+        if self._last is None:
+            self._close = 0
+            return False
+        place = kept.place if kept is not None else self._last.expected(now)
+        if any(one.mixed_at > self._last.at and math.dist(one.place, place) < p.again for one in people):
+            return True
+        limit = p.close if kept is not None and kept.legs == 2 else p.close_hidden
+        close = kept is not None and any(
+            other is not kept and other.known and math.dist(other.place, place) < limit for other in people
+        )
+        self._close = self._close + 1 if close else 0
+        return self._close >= p.close_scans
+
+    def _remembers(self, last: _Last, now: float) -> bool:
+        return last.at <= now <= last.seen_at + self._params.memory
+
     def _kept(self, people: Sequence[Person], robot: tuple[float, float, float], now: float) -> Person | None:
-        """The operator of the last scan, under the same number or another."""
+        """The operator of the last scan, under the same number or another.
+
+        Whoever was seen at the same time as the operator is somebody else, however near.
+        """
         if self._last is None:
             return None
-        last, then = self._last
+        last = self._last
         same = next((person for person in people if person.id == last.id), None)
-        if same is None and 0 <= now - then <= self._params.memory:
-            expected = (last.place + last.velocity * (now - then)).tolist()
+        if same is None and self._remembers(last, now):
+            expected = last.expected(now)
             near = [
                 person
                 for person in people
                 if (person.known or person.paired) and math.dist(person.place, expected) <= self._params.again
             ]
-            same = near[0] if len(near) == 1 else None
+            same = near[0] if len(near) == 1 and near[0].id not in self._others else None
         if same is None or math.dist(same.place, robot[:2]) > self._params.gone:
             return None
         return same
@@ -161,6 +228,7 @@ class OperatorChoice:
             return None
         self.picked += 1
         self._next = None
+        self._others.clear()
         return person
 
 

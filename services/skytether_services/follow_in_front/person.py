@@ -77,6 +77,7 @@ class Person:
         walks: It has walked: a thing does not.
         stands: Both legs were seen for a while, and it has not walked yet.
         legs: Seen in the last scan: 0, 1 or 2.
+        mixed_at: When the track of another person ended in this one: since then it may be either [s].
     """
 
     id: int
@@ -87,6 +88,7 @@ class Person:
     walks: bool = False
     stands: bool = False
     legs: int = 0
+    mixed_at: float = -math.inf
     _feet: Floats | None = None
     _feet_at: float = 0.0
     _rested: Floats = field(default_factory=lambda: np.zeros(2))

@@ -40,7 +40,7 @@ Who walks so slowly seems to be as fast as `_WALKING` with each step: the middle
 _FASTEST = 3.0
 """What moves faster does not walk, m/s."""
 _MOST = 60
-"""Tracks at the same time, people or not; more clusters that look like legs are ignored."""
+"""Tracks at the same time, people or not; of clusters that look like legs the nearest twice as many count."""
 _LONGEST = 1.0
 """After a longer time without a scan all is forgotten, s: people are elsewhere."""
 
@@ -126,6 +126,8 @@ class PeopleTracker:
         clusters = clusters_of(rays, furthest=self._params.furthest)
         single, both = leg_like(clusters), both_legs(clusters)
         use = single | both
+        if use.sum() > 2 * _MOST:
+            use &= clusters.distances <= np.sort(clusters.distances[use])[2 * _MOST - 1]
         self.legs_seen = int(use.sum())
         # A laser sees the near half of a leg; its middle is further away.
         middles = clusters.middles * (1 + _DEPTH / np.maximum(clusters.distances, _NEAREST))[:, None]
@@ -135,7 +137,7 @@ class PeopleTracker:
         long = np.array([self._background.stands(place, now, _LONG) for place in seen], bool)
         taken = self._give(legs, both, long, now, (x, y))
         self._tracks = [person for person in self._tracks if self._stays(person, now)]
-        self._tracks = [person for person in self._tracks if not self._is_a_leg_of_another(person)]
+        self._tracks = [person for person in self._tracks if not self._is_a_leg_of_another(person, now)]
         new = np.flatnonzero(~both & ~stand).tolist()
         self._find(legs, [leg for leg in new if leg not in taken], now)
         self._background.look(rays.points @ turn + (x, y), now)
@@ -172,15 +174,20 @@ class PeopleTracker:
             and math.hypot(*person.velocity.tolist()) < _FASTEST
         )
 
-    def _is_a_leg_of_another(self, person: Person) -> bool:
-        """Whether an older track of a person, with one leg in view or none, is so near that this is its other leg."""
-        return person.legs < 2 and any(
-            other.id < person.id
-            and other.known
-            and other.legs < 2
-            and math.dist(other.place, person.place) < _OTHER_LEG
-            for other in self._tracks
-        )
+    def _is_a_leg_of_another(self, person: Person, now: float) -> bool:
+        """Whether an older track of a person, with one leg in view or none, is so near that this is its other leg.
+
+        If this one is a person, too, one of them may hide the other: that is noted.
+        """
+        if person.legs == 2:
+            return False
+        for other in self._tracks:
+            near = math.dist(other.place, person.place) < _OTHER_LEG
+            if other.id < person.id and other.known and other.legs < 2 and near:
+                if person.known:
+                    other.mixed_at = now
+                return True
+        return False
 
     def _find(self, legs: Floats, free: list[int], now: float) -> None:
         """Begin tracks with legs that are nobody's."""

@@ -97,7 +97,7 @@ def test_the_operator_stays_though_others_come_nearer() -> None:
     choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.2)], ORIGIN, 0.0)
     for scan in range(1, 20):
-        operator = choice.step([person(9, -0.8, 0.0), person(1, -1.0, 0.2 + 0.05 * scan)], ORIGIN, 0.1 * scan)
+        operator = choice.step([person(9, -0.6, -0.2), person(1, -1.0, 0.2 + 0.05 * scan)], ORIGIN, 0.1 * scan)
         assert operator is not None
         assert operator.id == 1
     assert choice.picked == 1
