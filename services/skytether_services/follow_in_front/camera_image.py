@@ -6,7 +6,9 @@ import io
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
+
+from .picture_parts import pixels_only
 
 Picture = NDArray[np.uint8]
 """height x width x 3, red, green, blue."""
@@ -30,15 +32,18 @@ def decode(data: bytes) -> Picture:
         PictureError: It is broken, too large or too small, or black.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(pixels_only(data)), formats=("JPEG", "PNG")) as image:
             width, height = image.size
             if width * height > _LARGEST:
                 raise PictureError(f"the picture has {width} x {height} pixels, more than {_LARGEST} in all")
             if min(width, height) < _LEAST:
                 raise PictureError(f"the picture has {width} x {height} pixels: too few to show a face")
             picture = np.asarray(image.convert("RGB"))
-    # Pillow lets errors of every kind through where bytes are broken.
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError, Image.DecompressionBombError) as error:
+    except PictureError:
+        raise
+    except UnidentifiedImageError:
+        raise PictureError("the picture is broken: its header cannot be read") from None
+    except Exception as error:  # Pillow lets errors of every kind through where bytes are broken
         raise PictureError(f"the picture is broken: {error}") from error
     if picture[::8, ::8].mean() < _BLACK:
         raise PictureError("the picture is black: is the lens covered?")

@@ -7,6 +7,7 @@ ends stand free or are cut off by something nearer.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,10 @@ _COARSE = (0.1, 2.2)
 """Where rays are so far apart that fewer than so many meet a leg of such a width [m], two points are a cluster, too."""
 _STRIDE = 0.025
 """A girth is measured along points so far apart, m: twice the noise of a usual laser, a quarter of a leg."""
+_MOST = 8_000
+"""Rays of a scan; of one that has more, each second one is taken, or each third: no leg needs them closer."""
+_FURTHEST = 1_000.0
+"""No laser of a robot measures further, whatever its limits say, m."""
 _FREE = 0.10
 """What lies before a cluster's end by more than this hides the end, m."""
 
@@ -79,13 +84,20 @@ def rays_of(ranges: NDArray[np.floating], first: float, step: float, least: floa
     Args:
         ranges: One scan [m]; NaN, infinity and what is outside the sensor's limits is no measurement.
         first: Angle of the first ray [rad].
-        step: Between neighbouring rays [rad].
+        step: Between neighbouring rays [rad]; below 0 for a laser that turns to the right, or hangs upside down.
         least: Ranges below are none [m].
         most: Ranges above are none [m].
     """
     values = np.asarray(ranges, np.float64)
+    if not (math.isfinite(first) and math.isfinite(step)):
+        values, first, step = values[:0], 0.0, 0.0
+    if step < 0:
+        values, first, step = values[::-1], first + step * (len(values) - 1), -step
+    if len(values) > _MOST:
+        each = -(-len(values) // _MOST)
+        values, step = values[::each], step * each
     with np.errstate(invalid="ignore"):
-        index = np.flatnonzero((values >= max(least, 1e-3)) & (values <= most))
+        index = np.flatnonzero((values >= max(least, 1e-3)) & (values <= min(most, _FURTHEST)))
     values = values[index]
     angles = first + step * index
     return Rays(np.column_stack([values * np.cos(angles), values * np.sin(angles)]), values, index, step)

@@ -31,6 +31,8 @@ _SEARCH_EVERY = 5
 """While a face is known, others are looked for in each so many pictures only."""
 _MOST = 3
 """Faces at the same time; more are not followed, but two are too many already."""
+_LOOKED_AT = 2 * _MOST
+"""Boxes of a picture at which is looked anew, the surest first: a wall of portraits must not take all the time."""
 _SAME = 0.25
 """Overlap from which two boxes are one face."""
 
@@ -76,25 +78,34 @@ class FaceTracker:
         self._half = math.tan(field_of_view / 2)
         self._detector, self._mesh = FaceDetector(), FaceMesh()
         self._known: list[_Known] = []
+        self._size = (0, 0)
         self._pictures = 0
 
     def step(self, picture: Picture) -> list[Face]:
         """Faces of the next picture, the largest first."""
         image = Image.fromarray(picture)
+        if image.size != self._size:  # another camera, or another mode of it: nothing is where it was
+            self._known, self._size = [], image.size
         found: list[_Known] = []
         for known in self._known:
             _take(found, self._follow(image, known))
         if not found or self._pictures % _SEARCH_EVERY == 0:
-            for part in self._parts(image, everywhere=not found):
-                for box in self._detector.find(image, part):
-                    if not any(_same(box, one.box) for one in found):
-                        _take(found, self._look_twice(image, box))
-                if found:
-                    break
+            self._search(image, found)
         self._pictures += 1
         found.sort(key=lambda one: -one.box.height)
         self._known = found
         return [self._face(one.landmarks, image.size) for one in found]
+
+    def _search(self, image: Image.Image, found: list[_Known]) -> None:
+        """Look for faces that are not among those found, and add them."""
+        left = _LOOKED_AT
+        for part in self._parts(image, everywhere=not found):
+            for box in self._detector.find(image, part):
+                if left and len(found) < _MOST and not any(_same(box, one.box) for one in found):
+                    left -= 1
+                    _take(found, self._look_twice(image, box))
+            if found:
+                break
 
     def _follow(self, image: Image.Image, known: _Known) -> _Known | None:
         """A face of the last picture; None: it is not there any more."""
@@ -102,6 +113,8 @@ class FaceTracker:
         side = round(_AROUND * max(box.width, box.height))
         left, top = round(box.x) - side // 2, round(box.y) - side // 2
         part = (max(left, 0), max(top, 0), min(left + side, image.width), min(top + side, image.height))
+        if part[0] >= part[2] or part[1] >= part[3]:
+            return None
         near = min(self._detector.find(image, part), key=lambda one: _moved(one, box), default=None)
         if near is None:
             found = self._look(image, box)

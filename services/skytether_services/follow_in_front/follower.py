@@ -6,6 +6,7 @@ Times are the service's; whoever calls says when something was measured.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -31,6 +32,8 @@ _REACH = Reach(linear=2.0, angular=4.0, distance=0.15, turn=0.3)
 """What no robot does between two messages of its odometry."""
 _WAITS = 0.3
 """A scan waits so long for the odometry of its moment, s."""
+_MOST_WAITING = 8
+"""So many scans wait at the most."""
 _LAG = 0.1
 """From a velocity's arrival to half of its effect: the base's period and its wheels, s."""
 _MOST_DELAY = 1.0
@@ -102,7 +105,7 @@ class Follower:
         self._tracker = PeopleTracker()
         self._choice = OperatorChoice(params.operator)
         self._track = OdometryTrack(_REACH)
-        self._waiting: Scan | None = None
+        self._waiting: deque[tuple[Scan, float]] = deque(maxlen=_MOST_WAITING)
         self._operator: Operator | None = None
         self._scan_at = self._scan_came = self._odometry_came = -math.inf
         self._picture_at = self._picture_came = self._one_face_at = -math.inf
@@ -120,14 +123,16 @@ class Follower:
 
     def odometry(self, stamp: float, pose: Pose, at: float, now: float) -> None:
         """Take where the robot was, by its own reckoning, at its time ``stamp``, which was ``at`` here [s]."""
+        before = self._track.newest
         self._track.add(stamp, pose, at)
-        self._odometry_came = now
+        if self._track.newest is not before:
+            self._odometry_came = now
 
     def scan(self, scan: Scan, now: float) -> None:
         """Take a sweep of the rear laser."""
         self._scan_came = now
-        self._waiting = scan
-        self._try_scan(now)
+        self._waiting.append((scan, now))
+        self._try_scans(now)
 
     def picture(self, data: bytes, at: float, now: float) -> None:
         """Take a picture of the camera that was made at a time [s]."""
@@ -148,17 +153,19 @@ class Follower:
         legs = math.atan2(operator.y, -operator.x) if operator is not None else None
         face, self._face_choice = choose(faces, legs)
         self._face = face.angle if face is not None else math.nan
-        if face is not None:
+        if face is not None and operator is not None:
             self._formation.face(face.angle, at)
 
-    def step(self, now: float, delay: float) -> Velocity:
+    def step(self, now: float, delay: float, doubt: float = 0.0) -> Velocity:
         """The velocity to command now.
 
         Args:
             now: [s].
             delay: A message's way from here to the robot [s].
+            doubt: What was measured may be older by so much than was said [s]; inf: nobody knows how old it is.
         """
-        self._try_scan(now)
+        self._try_scans(now)
+        self._formation.doubt = doubt
         self._formation.lead = min(max(delay, 0.0), _MOST_DELAY) + _LAG
         velocity, state = self._formation.step(now)
         code = self._code(state, now)
@@ -170,17 +177,19 @@ class Follower:
         )
         return velocity
 
-    def _try_scan(self, now: float) -> None:
-        """Look at the scan that waits, if it is known where the robot was then."""
-        scan = self._waiting
-        if scan is None:
-            return
-        robot = self._track.pose_at(scan.stamp)
-        if robot is None:
-            if now - self._scan_came > _WAITS:
-                self._waiting = None
-            return
-        self._waiting = None
+    def _try_scans(self, now: float) -> None:
+        """Look at the scans that wait, as soon as it is known where the robot was then."""
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        for scan, came in waiting:
+            robot = self._track.pose_at(scan.stamp)
+            if robot is not None:
+                self._look(scan, robot)
+            elif now - came <= _WAITS:
+                self._waiting.append((scan, came))
+
+    def _look(self, scan: Scan, robot: Pose) -> None:
+        """Find the operator in a scan; where the robot was is known."""
         if scan.at <= self._scan_at:
             return
         self._scan_at = scan.at
@@ -205,6 +214,8 @@ class Follower:
             return Code.ODOMETRY_SILENT
         if now - self._scan_came > slow:
             return Code.LASER_UNKNOWN if self.laser_unknown else Code.LASER_SILENT
+        if now - self._scan_at + self._formation.doubt > self._params.stop_after:
+            return Code.LATE
         if self._operator is None:
             by_choice = {Choice.SEVERAL: Code.SEVERAL_PEOPLE, Choice.LOST: Code.OPERATOR_LOST}
             return by_choice.get(self._choice.choice, Code.NO_OPERATOR)

@@ -155,11 +155,14 @@ class Formation:
         self._params = params
         self.lead = params.lead
         """From a command to its effect [s], as far as it is known now."""
+        self.doubt = 0.0
+        """What was measured may be older by so much than is told [s]; inf: nobody knows how old it is."""
         self._legs: _Legs | None = None
         self._change = 0.0
         self._face: tuple[float, float] | None = None
         self._interval = 0.0
         self._velocity = STANDSTILL
+        self._stands_first = False
         self._stepped_at: float | None = None
         self._commands: deque[tuple[float, Velocity]] = deque(maxlen=_MOST)
 
@@ -220,8 +223,9 @@ class Formation:
         self._interval = gap if self._interval == 0 else self._interval + 0.2 * (gap - self._interval)
 
     def lose(self) -> None:
-        """Forget the operator: another one begins anew."""
+        """Forget the operator: another one begins anew, and from a stand."""
         self._legs, self._face, self._change, self._interval = None, None, 0.0, 0.0
+        self._stands_first = True
 
     def step(self, now: float) -> Command:
         """What to do now [s]."""
@@ -239,6 +243,8 @@ class Formation:
             _towards(self._velocity.linear, linear, change * dt),
             _towards(self._velocity.angular, angular, p.angular_acceleration * dt),
         )
+        if self._too_old(now):
+            self._velocity = STANDSTILL  # no ramp: what was measured so long ago moves nothing
         while self._commands and now - self._commands[0][0] > _MEMORY:
             self._commands.popleft()
         self._commands.append((now, self._velocity))
@@ -249,16 +255,23 @@ class Formation:
         p = self._params
         if self._legs is None or self._face is None:
             return State.STANDING, 0.0
+        self._stands_first = self._stands_first and self._velocity != STANDSTILL
+        if self._stands_first or self._too_old(now) or abs(self._legs.off) > p.sharpest:
+            return State.STANDING, 0.0
         legs, face = now - self._legs.at, now - self._face[1]
         worst = max(legs, face)
-        if worst >= p.stop_after or abs(self._legs.off) > p.sharpest:
-            return State.STANDING, 0.0
         share = min((p.stop_after - worst) / (p.stop_after - p.slow_after), 1.0)
         if share < 1:
             return (State.LEGS_LOST if legs >= face else State.FACE_LOST), share
         if self.face_rate < p.least_face_rate * 0.9:  # frames that come late are not fewer
             return State.FACE_SLOW, p.slow_share
         return State.FOLLOWING, 1.0
+
+    def _too_old(self, now: float) -> bool:
+        """Whether legs or face may be as old as the limit."""
+        if self._legs is None or self._face is None:
+            return False
+        return now - min(self._legs.at, self._face[1]) + self.doubt >= self._params.stop_after
 
     def _linear(self, legs: _Legs, now: float) -> float:
         p = self._params

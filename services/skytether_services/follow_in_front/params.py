@@ -11,6 +11,9 @@ from skytether_services.planar.geometry import Pose
 from .formation import FormationParams
 from .operator import OperatorParams
 
+_BEYOND = 1.0
+"""Who was picked may go so much further away, m."""
+
 
 @dataclass(frozen=True)
 class LaserPose:
@@ -30,7 +33,7 @@ class LaserPose:
 class Params:
     """What a robot may set when it asks for the service."""
 
-    rate: float = param(10.0, unit="Hz", ge=2, le=100, doc="how often a velocity is sent")
+    rate: float = param(10.0, unit="Hz", ge=2, le=60, doc="how often a velocity is sent")
     face_rate: float = param(15.0, unit="Hz", ge=0.5, le=60, doc="pictures a second that are looked at, at the most")
     least_face_rate: float = param(5.0, unit="Hz", gt=0, le=60, doc="with fewer faces a second the robot goes slowly")
     distance: float = param(0.9, unit="m", ge=0.5, le=2.0, doc="from the robot's middle to the operator's")
@@ -82,4 +85,5 @@ class Params:
         """
         if self.near >= self.far:
             raise ValueError(f"near must be below far, not {self.near} and {self.far}")
-        return OperatorParams(near=self.near, far=self.far, side=self.side)
+        gone = max(OperatorParams().gone, self.far + _BEYOND)
+        return OperatorParams(near=self.near, far=self.far, side=self.side, gone=gone)

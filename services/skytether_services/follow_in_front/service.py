@@ -33,6 +33,8 @@ _SMOOTH = 0.1
 """Weight of a new delay in the mean of those before."""
 _LASTS = 0.5
 """What lasts for so long [s] is reported."""
+_MOST_TF = 200_000
+"""Bytes of a message of `tf`: 2,000 frames, which take 30 ms to read."""
 _LONGEST_DELAY = 10.0
 """A message that seems to have been on its way for longer was of another clock, s."""
 
@@ -42,7 +44,7 @@ class FollowInFront(Service[Params]):
 
     rate_hz = _STEP_HZ
 
-    tf = Input(TFMessage)
+    tf = Input(TFMessage, max_bytes=_MOST_TF)
     picture = Input(CompressedImage, "usb_cam/image_raw/compressed")
     scan = Input(LaserScan)
     odom = Input(Odometry, "RosAria/pose")
@@ -62,6 +64,7 @@ class FollowInFront(Service[Params]):
         self._frames = Frames()
         self._odom_frame, self._base_frame = "odom", "base_link"
         self._delay = 0.0
+        self._errors = {"scan": math.inf, "picture": math.inf}
         self._commands, self._tells = Rate(params.rate), Rate(_TOLD_HZ)
         self._looked_at = -math.inf
         self._told = ""
@@ -69,20 +72,22 @@ class FollowInFront(Service[Params]):
 
     def step(self, now: float) -> None:
         self._listen(now)
-        if not self._commands.due(now):
-            return
-        velocity = self._follower.step(now, self._delay)
-        self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
-        self._tell(self._follower.report, now)
+        if self._commands.due(now):
+            velocity = self._follower.step(now, self._delay, max(self._errors.values()))
+            self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
+            self._tell(self._follower.report, now)
+        # After the command, which is of this moment: a picture takes some milliseconds, or a stalled machine seconds.
+        self._look(now)
 
     def _listen(self, now: float) -> None:
-        """Hand what the robot measured on."""
+        """Hand what the robot measured on, but for pictures."""
         if tf := self.tf.take():
             self._note(tf)
             self._frames.hear(tf.message)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
                 self._follower.odometry(found[1], found[0], _made_at(tf), now)
         if odom := self.odom.take():
+            self._note(odom)
             message = odom.message
             self._odom_frame = message.header.frame_id or self._odom_frame
             self._base_frame = message.child_frame_id or self._base_frame
@@ -90,9 +95,14 @@ class FollowInFront(Service[Params]):
             pose = Pose(at.position.x, at.position.y, yaw_of(at.orientation))
             self._follower.odometry(message.header.stamp.seconds(), pose, _made_at(odom), now)
         if scan := self.scan.take():
+            self._errors["scan"] = scan.sent_at_error
             self._see(scan, now)
+
+    def _look(self, now: float) -> None:
+        """Look at a picture, if one came and is due."""
         if (picture := self.picture.take()) and now - self._looked_at >= _EARLY / self.params.face_rate:
             self._looked_at = now
+            self._errors["picture"] = picture.sent_at_error
             self._follower.picture(picture.message.data.tobytes(), _made_at(picture), now)
 
     def _see(self, received: Received[LaserScan], now: float) -> None:
@@ -105,7 +115,7 @@ class FollowInFront(Service[Params]):
         stamp, at = scan.header.stamp.seconds(), _made_at(received)
         self._follower.scan(Scan(stamp, at, scan.ranges, scan.angle_min, scan.angle_increment, limits, found[0]), now)
 
-    def _note(self, message: Received[TFMessage]) -> None:
+    def _note(self, message: Received[TFMessage] | Received[Odometry]) -> None:
         """Learn how long messages take. Those to the robot take as long, as far as a service can know."""
         taken = message.received_at - message.sent_at
         if math.isfinite(message.sent_at_error) and 0 <= taken < _LONGEST_DELAY:
@@ -125,8 +135,12 @@ class FollowInFront(Service[Params]):
 def _made_at(
     received: Received[TFMessage] | Received[Odometry] | Received[LaserScan] | Received[CompressedImage],
 ) -> float:
-    """When something was measured, by this machine's clock [s]; when it came, as long as the robot's is not known."""
-    return received.sent_at if math.isfinite(received.sent_at_error) else received.received_at
+    """When something was measured, by this machine's clock [s]; when it came, as long as the robot's is not known.
+
+    Never later than it came: what pretends to be of the future would be new for ever.
+    """
+    known = math.isfinite(received.sent_at_error)
+    return min(received.sent_at, received.received_at) if known else received.received_at
 
 
 def _document(report: Report) -> dict[str, object]:

@@ -38,5 +38,5 @@ SENTENCES = {
     Code.LASER_SILENT: "No scans come from the rear laser.",
     Code.ODOMETRY_SILENT: "No odometry comes from the robot.",
     Code.LASER_UNKNOWN: "No transform tells where the rear laser is: publish it on tf, or set the parameter laser.",
-    Code.LATE: "What the robot measures arrives too late to go by.",
+    Code.LATE: "What the robot measures arrives too late to go by, or nobody knows how late.",
 }

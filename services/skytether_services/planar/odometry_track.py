@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from .geometry import Pose, wrap
 from .transforms import compose, inverse
 
+_FURTHEST = 1e8
+"""Further from the origin is no robot, not even in a frame of the whole earth, m."""
 KEPT = 400
 """Samples: four seconds at 100 Hz."""
 _BACK = 1.0
@@ -75,7 +77,7 @@ class OdometryTrack:
         return self._samples[-1] if self._samples else None
 
     def add(self, stamp: float, pose: Pose, at: float) -> bool:
-        """Take a sample; what is not finite, or not newer than the last one, is left out.
+        """Take a sample; what is not finite, on no robot's earth, or not newer than the last one, is left out.
 
         Args:
             stamp: By the robot's clock [s].
@@ -85,7 +87,7 @@ class OdometryTrack:
         Returns:
             Whether it jumped.
         """
-        if not all(math.isfinite(value) for value in (stamp, *pose, at)):
+        if not all(math.isfinite(value) for value in (stamp, *pose, at)) or math.hypot(pose.x, pose.y) > _FURTHEST:
             return False
         last = self.newest
         if last is None or self._raw is None:
