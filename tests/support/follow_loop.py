@@ -122,7 +122,8 @@ class Loop:
         self._tracker.step(
             scan.ranges, scan.angle_min, scan.angle_increment, (scan.range_min, scan.range_max), laser, at
         )
-        seen = self._choice.step(self._tracker.tracks, pose, at, face=at - self._face_at < 0.5)
+        face = math.atan2(truth[1], -truth[0]) if at - self._face_at < 0.5 else None
+        seen = self._choice.step(self._tracker.tracks, pose, at, face=face)
         self.choices.append(self._choice.choice)
         self.aside.append(math.atan2(truth[1], REAR.camera_x - truth[0]))
         if seen is not None:

@@ -108,7 +108,8 @@ class Follower:
         self._waiting: deque[tuple[Scan, float]] = deque(maxlen=_MOST_WAITING)
         self._operator: Operator | None = None
         self._scan_at = self._scan_came = self._odometry_came = -math.inf
-        self._picture_at = self._picture_came = self._one_face_at = -math.inf
+        self._picture_at = self._picture_came = -math.inf
+        self._only_face: tuple[float, float] | None = None
         self._picture_error = ""
         self.laser_unknown = False
         """Scans came, and nothing told where on the robot they were made."""
@@ -147,8 +148,8 @@ class Follower:
             return
         turn = self._params.camera_turn
         faces = [face._replace(angle=face.angle + turn, bearing=face.bearing + turn) for face in faces]
-        if len(faces) == 1:
-            self._one_face_at = at
+        if faces:
+            self._only_face = (faces[0].bearing, at) if len(faces) == 1 else None
         operator = self._operator
         legs = math.atan2(operator.y, -operator.x) if operator is not None else None
         face, self._face_choice = choose(faces, legs)
@@ -195,8 +196,9 @@ class Follower:
         self._scan_at = scan.at
         self._tracker.step(scan.ranges, scan.first, scan.step, scan.limits, compose(robot, scan.mount), scan.at)
         picked = self._choice.picked
-        one_face = abs(scan.at - self._one_face_at) <= _FACE_COUNTS
-        self._operator = self._choice.step(self._tracker.tracks, robot, scan.at, face=one_face)
+        bearing, face_at = self._only_face or (math.nan, -math.inf)
+        face = bearing if abs(scan.at - face_at) <= _FACE_COUNTS else None
+        self._operator = self._choice.step(self._tracker.tracks, robot, scan.at, face=face)
         if self._choice.picked != picked:
             self._formation.lose()
         if self._operator is not None:

@@ -63,6 +63,7 @@ class OperatorParams:
         gone: Whoever is further away than this is followed no more [m].
         again: One who was lost is found again within this distance of where they would be [m].
         memory: And within this time after they were seen last [s]. Nobody else is picked meanwhile.
+        under: One who only stood so far is a person if the only face in sight is this near to their direction [rad].
         close: Of somebody who is nearer than this to the operator nobody knows any more which of them is which [m].
         close_hidden: The same while not both legs of the operator are seen [m].
         close_scans: For so many scans in a row.
@@ -76,6 +77,7 @@ class OperatorParams:
     gone: float = 3.5
     again: float = 0.6
     memory: float = 2.0
+    under: float = math.radians(14)
     close: float = 0.45
     close_hidden: float = 0.65
     close_scans: int = 2
@@ -111,7 +113,7 @@ _MOVES = 0.25
 class OperatorChoice:
     """Picks the operator and keeps them.
 
-    Who only stands may be a chair: one is picked who has walked, or whose face the camera sees. A change of operator is
+    Who only stands may be a chair: one is picked who has walked, or has a face above. A change of operator is
     never silent: `choice` leaves ``FOLLOWED`` for `OperatorParams.memory` at the least, and `picked` counts. Two who
     come so near to each other that a laser cannot tell whose legs are whose are not told apart: nobody is followed
     then, and one is picked anew.
@@ -130,7 +132,7 @@ class OperatorChoice:
         """So many operators were picked so far."""
 
     def step(
-        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, *, face: bool = False
+        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, *, face: float | None = None
     ) -> Operator | None:
         """Take the people of a scan.
 
@@ -138,7 +140,8 @@ class OperatorChoice:
             people: All tracks (`PeopleTracker.tracks`), in a frame that does not move.
             robot: Pose of the robot in that frame: x [m], y [m], heading [rad].
             now: When the scan was made [s].
-            face: Whether the camera sees one face, and no other.
+            face: Where the only face in sight is, off straight back, positive to the robot's left [rad]; None: there is
+                none, or more than one.
 
         Returns:
             Whom to follow; None: `choice` says why.
@@ -205,19 +208,21 @@ class OperatorChoice:
         return same
 
     def _pick(
-        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, face: bool
+        self, people: Sequence[Person], robot: tuple[float, float, float], now: float, face: float | None
     ) -> Person | None:
         p = self._params
-        found: list[tuple[float, Person]] = []
+        found: list[tuple[float, Person, bool]] = []
         for person in people:
             seen = _seen_from(robot, person)
-            distance, off = math.hypot(seen.x, seen.y), abs(math.atan2(seen.y, -seen.x))
-            if p.near <= distance <= p.far and off <= p.side and person.legs and _perhaps(person, face):
-                found.append((abs(seen.y), person))
+            distance, off = math.hypot(seen.x, seen.y), math.atan2(seen.y, -seen.x)
+            if not (p.near <= distance <= p.far and abs(off) <= p.side and person.legs):
+                continue
+            sure = person.walks or (face is not None and person.paired and abs(face - off) <= p.under)
+            if sure or _perhaps(person):
+                found.append((abs(seen.y), person, sure))
         found.sort(key=lambda one: one[0])
-        sure = any(_trusted(person, face) for _, person in found)
-        self.choice = Choice.SEVERAL if sure and len(found) > 1 else Choice.NOBODY
-        if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart) or not _trusted(found[0][1], face):
+        self.choice = Choice.SEVERAL if len(found) > 1 and any(sure for _, _, sure in found) else Choice.NOBODY
+        if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart) or not found[0][2]:
             self._next = None
             return None
         person = found[0][1]
@@ -232,14 +237,9 @@ class OperatorChoice:
         return person
 
 
-def _perhaps(person: Person, face: bool) -> bool:
+def _perhaps(person: Person) -> bool:
     """Whether it may be a person, so that nobody beside it is picked: one who stands or moves, be it a chair."""
-    return _trusted(person, face) or person.stands or math.hypot(*person.velocity.tolist()) > _MOVES
-
-
-def _trusted(person: Person, face: bool) -> bool:
-    """Whether it is a person for sure."""
-    return person.walks or (face and person.paired)
+    return person.stands or math.hypot(*person.velocity.tolist()) > _MOVES
 
 
 def _seen_from(robot: tuple[float, float, float], person: Person) -> Operator:

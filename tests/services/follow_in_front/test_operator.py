@@ -55,7 +55,8 @@ def test_legs_that_never_walked_need_a_face() -> None:
     chair = person(2, -1.0, 0.0, walks=False)
     choice = OperatorChoice(AT_ONCE)
     assert choice.step([chair], ORIGIN, 0.0) is None
-    operator = choice.step([chair], ORIGIN, 0.1, face=True)
+    assert choice.step([chair], ORIGIN, 0.1, face=0.3) is None, "of somebody beside it"
+    operator = choice.step([chair], ORIGIN, 0.2, face=0.1)
     assert operator is not None
 
 

@@ -90,7 +90,7 @@ def test_a_face_aside_turns_the_robot_there() -> None:
         ({"picture": TWO}, "several_faces"),
         ({"picture": ASIDE}, "no_face"),  # somebody else's: the operator is not there
         ({"picture": None}, "camera_silent"),
-        ({"late": 2.0}, "late"),
+        ({"late": 1.5}, "late"),
         ({"people": None}, "laser_silent"),
         ({"odometry": False}, "odometry_silent"),
         ({"people": []}, "operator_lost"),
