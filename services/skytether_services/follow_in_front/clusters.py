@@ -180,8 +180,8 @@ def _girths(
     kept = (number % strides[owner] == 0) | (number == counts[owner] - 1)
     points, owner = points[kept], owner[kept]
     same = owner[1:] == owner[:-1]
-    steps: Floats = np.hypot(*np.diff(points, axis=0).T)
-    found: Floats = np.bincount(owner[1:][same], weights=steps[same], minlength=len(counts))
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    found: Floats = np.bincount(owner[1:][same], steps[same], minlength=len(counts)).astype(np.float64)
     return found
 
 
