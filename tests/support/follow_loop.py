@@ -1,6 +1,6 @@
 """Following in front in the simulated hall: legs, choice of the operator and law, over a link, in made-up time.
 
-No processes and no pictures: the angle of the face is the true one with noise.
+No processes, and no pictures unless a test brings them: the angle of the face is the true one with noise.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from skytether.lab.world.simulation import TICK, Robot, Simulation
 from skytether.messages import LaserScan, Twist, Vector3
 from skytether_services.follow_in_front.formation import Formation, FormationParams, State
 from skytether_services.follow_in_front.operator import Choice, OperatorChoice
+from skytether_services.follow_in_front.operator import Operator as SeenOperator
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
 REAR = RearParams()
@@ -35,6 +36,8 @@ class Loop:
 
     Attributes:
         world: The hall.
+        eyes: Where the face points off the robot's heading, by a picture taken now [rad]; None: no face is seen.
+        seen: The operator as last seen.
         curve: On its floor.
         path: Of the robot's middle, ten points a second [m], from the first movement on.
         states: The law's, step by step.
@@ -63,6 +66,8 @@ class Loop:
         self.errors: list[float] = []
         self.aside: list[float] = []
         self.begun = math.nan
+        self.eyes: Callable[[], float | None] = self._true_face
+        self.seen: SeenOperator | None = None
 
     @property
     def robot(self) -> Robot:
@@ -94,8 +99,9 @@ class Loop:
                 pose, truth = odometry.pose, self._truth()
                 self._send(lambda s=message, p=pose, t=truth, at=now: self._scan(s, p, t, at))
         if math.floor(now * self._rate + 1e-9) > math.floor((now - TICK) * self._rate + 1e-9):
-            angle = self.operator.face_angle(self.robot.pose) + self._noise * float(self._random.normal())
-            self._send(lambda a=angle, at=now: self._face(a, at))
+            angle = self.eyes()
+            if angle is not None:
+                self._send(lambda a=angle, at=now: self._face(a, at))
         self._deliver(now)
         if self.world.ticks % _STEP == 0:
             command = self._formation.step(now)
@@ -126,9 +132,13 @@ class Loop:
         seen = self._choice.step(self._tracker.tracks, pose, at, face=face)
         self.choices.append(self._choice.choice)
         self.aside.append(math.atan2(truth[1], REAR.camera_x - truth[0]))
+        self.seen = seen
         if seen is not None:
             self.errors.append(math.dist((seen.x, seen.y), truth))
             self._formation.legs(seen.x, seen.y, seen.vx, seen.vy, seen.seen_at)
+
+    def _true_face(self) -> float:
+        return self.operator.face_angle(self.robot.pose) + self._noise * float(self._random.normal())
 
     def _face(self, angle: float, at: float) -> None:
         self._face_at = at

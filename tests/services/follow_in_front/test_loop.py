@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 
 import numpy as np
 import pytest
 from follow_loop import REAR, Loop
 
 from skytether.lab.measures import kinematic_tracking_error
+from skytether.lab.world.camera import Renderer, Sensor
+from skytether.lab.world.model import load_mujoco
+from skytether_services.follow_in_front.camera_image import decode
+from skytether_services.follow_in_front.face_choice import choose
+from skytether_services.follow_in_front.face_tracker import FaceTracker
 from skytether_services.follow_in_front.formation import State
 from skytether_services.follow_in_front.operator import Choice
 
@@ -35,9 +41,44 @@ def test_a_round_is_done_on_the_path_without_a_touch(seed: int, round_trip: floa
     assert max(map(abs, loop.aside)) < REAR.camera_field / 2 - math.radians(8)
 
 
-def test_the_operator_who_is_done_stands_and_so_does_the_robot() -> None:
+def test_a_round_by_what_the_eyes_see_in_rendered_pictures(gl: None) -> None:
+    loop = Loop(6, round_trip=0.05)
+    model = loop.world.model
+    data, sensor = load_mujoco().MjData(model), Sensor(REAR, 6)
+    faces = FaceTracker(REAR.camera_field)
+    errors: list[float] = []
+    unseen = 0
+    with closing(Renderer(model, REAR)) as renderer:
+
+        def eyes() -> float | None:
+            nonlocal unseen
+            state, seen = loop.world.state(), loop.seen
+            data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
+            picture = sensor.jpeg(sensor.noisy(renderer.draw(data)))
+            legs = math.atan2(seen.y, -seen.x) if seen is not None else None
+            face, _ = choose(faces.step(decode(picture)), legs)
+            if face is None:
+                unseen += 1
+                return None
+            errors.append(face.angle - loop.operator.face_angle(loop.robot.pose))
+            return face.angle
+
+        loop.eyes = eyes
+        assert loop.run(90.0)
+    assert not loop.world.contacts
+    assert kinematic_tracking_error(loop.curve.distances(loop.path)) < 0.1
+    assert unseen < 0.02 * len(errors)
+    # In the curve's ends the face points 45 degrees off the line to the camera: the eyes see 6 to 10 degrees less.
+    assert np.mean(np.abs(errors)) < math.radians(5)
+
+
+def test_the_operator_waits_for_a_service_that_begins_late_and_both_stand_when_it_is_done() -> None:
     loop = Loop(1)
+    for _ in range(1000):
+        loop.world.tick()
+    assert math.dist(loop.robot.pose[:2], loop.operator.pose[:2]) == pytest.approx(0.67, abs=0.03)
     assert loop.run(90.0)
+    assert loop.picked == 1
     loop.go_on(4.0)
     assert abs(loop.robot.motion.forward) < 0.02
     away = math.dist(loop.robot.pose[:2], loop.operator.pose[:2])

@@ -58,7 +58,8 @@ class Sensor:
         """The same as the sensor sees it."""
         which, down, right = (int(v) for v in self._random.integers(0, (_NOISES, *picture.shape[:2])))
         noise = np.roll(self._noises[which], (down, right), (0, 1))
-        return np.clip(picture + noise, 0, 255).astype(np.uint8)
+        noisy: Picture = np.clip(picture + noise, 0, 255).astype(np.uint8)
+        return noisy
 
     def jpeg(self, picture: Picture) -> bytes:
         """As a file."""

@@ -7,7 +7,7 @@ with a clock, see `agent`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +142,6 @@ class Simulation:
 
     Attributes:
         stances: Where people are, in the order of `names`.
-        model: The ``MjModel``.
 
     Raises:
         WorldError: MuJoCo is missing, or the plan has no places for so many.
@@ -175,7 +174,7 @@ class Simulation:
         self.ticks = 0
         self._judge = Judge()
         self._mujoco = load_mujoco()
-        self.model = self._model = compile_model(plan, walks, robots, params, OPERATOR if operator else None)
+        self._model = compile_model(plan, walks, robots, params, OPERATOR if operator else None)
         self._data = self._mujoco.MjData(self._model)
         self._kinds = self._geoms()
         self._mocap = [[self._mocap_of(f"{name}-{part}") for part in (*LEGS, "trunk")] for name in self.names]
@@ -186,10 +185,8 @@ class Simulation:
             Robot(
                 index,
                 plan.starts[index],
-                *(
-                    Eyes(self._model, self._data, self._body(f"robot-{index}"), params, streams[stream])
-                    for stream in (2 * index, 2 * MAX_ROBOTS + index)
-                ),
+                self._eyes(index, streams[2 * index]),
+                self._eyes(index, streams[2 * MAX_ROBOTS + index]),
                 params,
                 streams[2 * index + 1],
             )
@@ -199,6 +196,11 @@ class Simulation:
             self._put(robot.index, robot.pose)
         self._walk(0.0)
         self._mujoco.mj_forward(self._model, self._data)
+
+    @property
+    def model(self) -> Any:
+        """The ``MjModel``."""
+        return self._model
 
     @property
     def time(self) -> float:
@@ -251,6 +253,9 @@ class Simulation:
         robot.pose, robot.motion = pose, Motion(0.0, 0.0, 0.0)
         robot.drive.stand()
         self._mujoco.mj_forward(self._model, self._data)
+
+    def _eyes(self, index: int, random: np.random.Generator) -> Eyes:
+        return Eyes(self._model, self._data, self._body(f"robot-{index}"), self.params, random)
 
     def _put(self, index: int, pose: Pose) -> None:
         self._data.qpos[3 * index : 3 * index + 3] = pose
