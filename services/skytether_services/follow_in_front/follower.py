@@ -223,9 +223,9 @@ class Follower:
             return by_choice.get(self._choice.choice, Code.NO_OPERATOR)
         if now - self._operator.seen_at > slow:
             return Code.LATE if self._operator.seen_at >= self._scan_at else Code.OPERATOR_LOST
-        return self._code_of_face(now)
+        return self._code_of_face(state, now)
 
-    def _code_of_face(self, now: float) -> Code:
+    def _code_of_face(self, state: State, now: float) -> Code:
         slow = self._params.slow_after
         if now - self._picture_came > slow:
             return Code.CAMERA_SILENT
@@ -237,4 +237,7 @@ class Follower:
             return Code.SEVERAL_FACES
         if self._face_choice is FaceChoice.NONE:
             return Code.NO_FACE
-        return Code.OPERATOR_ASIDE if self._formation.aside else Code.FOLLOWING
+        if self._formation.aside:
+            return Code.OPERATOR_ASIDE
+        # An operator who was just picked: a picture of them is still to come, or the robot to stand first.
+        return Code.NO_FACE if state is State.STANDING else Code.FOLLOWING

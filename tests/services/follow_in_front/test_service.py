@@ -178,3 +178,13 @@ def test_states_that_last_become_reports(following: Scene) -> None:
 def test_parameters_that_do_not_fit_each_other_are_refused(params: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         Harness(FollowInFront, params)
+
+
+def test_a_robot_that_stands_is_never_said_to_follow(following: Scene) -> None:
+    following.people = []
+    following.run(2.5)
+    following.people = [Walker(x=following.x - 1.6)]
+    for _ in range(210):
+        following.run(1 / 60)
+        assert (following.status["state"] == "standing") <= (following.status["code"] != "following")
+    assert following.status["operators"] == 2
