@@ -9,6 +9,7 @@ import pytest
 from skytether.lab.link_model import LinkConditions, LinkModel
 from skytether.wire.arrivals import COLLECT, NUMBERS, DelayMeter, LossMeter
 from skytether.wire.config import Config
+from skytether.wire.control import MOST_RUN
 from skytether.wire.packet import TICK, TICKS, ticks
 from skytether.wire.path import Path
 
@@ -66,6 +67,37 @@ def test_false_numbers_far_away_change_nothing():
     for n in range(2000):
         numbers += [n] if n % 10 else [n, n + 10_000_000]
     feed(meter, numbers)
+    assert meter.lost == 0
+
+
+@pytest.mark.parametrize("start", [0, 1000, NUMBERS - 2000])
+@pytest.mark.parametrize("every", [1, 7, 200])
+def test_what_was_sent_elsewhere_is_neither_here_nor_lost(start, every):
+    """Of each ten numbers three went elsewhere, in runs; of each hundred that did not, five in a row are lost."""
+    meter, plain = LossMeter(), LossMeter()
+    here = [n for n in range(4000) if n % 10 not in (2, 3, 6)]
+    kept = [n for i, n in enumerate(here) if i % 100 not in range(10, 15)]
+    for at, number in enumerate(kept):
+        meter.add((start + number) % NUMBERS, ticks(number * 0.01))
+        tens = range(number // 10 * 10 - 20, number // 10 * 10 + 10, 10)
+        meter.leave_out([((start + n + at) % NUMBERS, count) for n in tens for at, count in ((2, 2), (6, 1))])
+        if at % every == 0:
+            meter.evaluate()
+    meter.evaluate()
+    meter.evaluate()
+    feed(plain, [start + i for i in range(len(here)) if i % 100 not in range(10, 15)], every)
+    assert (meter.settled, meter.lost) == (plain.settled, plain.lost)
+    assert meter.runs == plain.runs
+
+
+def test_what_was_sent_elsewhere_is_forgotten_in_time_and_bounded():
+    meter = LossMeter()
+    for n in range(5000):
+        meter.add(n, ticks(n * 0.01))
+        meter.leave_out([(n + 2**31, 1), (n * 7, MOST_RUN)])
+        if n % 50 == 0:
+            meter.evaluate()
+    assert len(meter._astray) <= LossMeter.MOST_ASTRAY
     assert meter.lost == 0
 
 

@@ -6,6 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.wire.control import (
+    MOST_ASTRAY,
+    MOST_RUN,
     PING_SIZE,
     Feedback,
     Goodbye,
@@ -26,20 +28,31 @@ amount = st.floats(0, 1e9, width=32)
 sums = st.integers(0, 2**32 - 1)
 feedback = st.builds(Feedback, seconds, amount, amount, sums, sums, sums, amount, amount)
 NOTHING = Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
+runs = st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, MOST_RUN)), max_size=MOST_ASTRAY).map(tuple)
 receivers = st.builds(ReceiverRow, st.integers(0, 65_535), *[counter] * 7, *[seconds] * 8)
 
 
 @given(
     st.builds(
         Ping, st.integers(0, 255), st.integers(0, 255), st.booleans(), st.integers(0, 65_535),
-        st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), feedback,
+        st.none() | st.integers(0, 2**64 - 2), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), feedback, runs,
     ),
     st.integers(0, 1400),
 )  # fmt: skip
 def test_pings_travel(ping, padding):
     data = push_ping(ping, padding)
     assert pull_control(data) == ping
-    assert len(data) == PING_SIZE + padding
+    assert len(data) == PING_SIZE + padding + (1 + 6 * len(ping.astray) if ping.astray else 0)
+    # An end that knows nothing of what follows the fixed part, and one that says nothing there.
+    assert pull_control(data[:PING_SIZE]) == ping._replace(astray=())
+
+
+def test_of_many_runs_the_last_are_told_and_more_than_there_can_be_are_none():
+    ping = Ping(0, 0, True, 0, 1, 0, 0, NOTHING, tuple((number, 1) for number in range(100)))
+    assert pull_control(push_ping(ping)).astray == ping.astray[-MOST_ASTRAY:]
+    fixed = push_ping(ping._replace(astray=()))
+    assert pull_control(fixed + bytes([MOST_ASTRAY + 1]) + bytes(1000)).astray == ()
+    assert pull_control(fixed + bytes([2]) + bytes(11)) is None
 
 
 def test_a_hold_beyond_all_bounds_is_cut():

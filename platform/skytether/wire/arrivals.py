@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +30,11 @@ class LossMeter:
 
     PLAUSIBLE = 65_536
     """Numbers further from the middle of an interval's numbers are ignored."""
+    MOST_ASTRAY = 256
+    """Runs of numbers that were not sent here, kept until they are evaluated."""
 
     __slots__ = (
+        "_astray",
         "_in_run",
         "_numbers",
         "_settled",
@@ -52,6 +56,8 @@ class LossMeter:
         """Numbers above ``_settled`` that had been seen at the last evaluation."""
         self._in_run = False
         """Whether the highest number evaluated was lost."""
+        self._astray: dict[int, int] = {}
+        """By the first number, how many in a row were sent elsewhere."""
         self.settled = 0
         """Packets known to have been sent."""
         self.lost = 0
@@ -74,6 +80,13 @@ class LossMeter:
         self._times.frombytes(times)
         if len(self._numbers) >= COLLECT:
             self._evaluate_early()
+
+    def leave_out(self, runs: Iterable[tuple[int, int]]) -> None:
+        """The peer sent packets elsewhere: first numbers, and how many in a row. Those are neither here nor lost."""
+        for first, count in runs:
+            self._astray[first] = max(count, self._astray.pop(first, 0))
+            if len(self._astray) > self.MOST_ASTRAY:
+                del self._astray[next(iter(self._astray))]
 
     def _evaluate_early(self) -> None:
         self.evaluate()
@@ -105,12 +118,30 @@ class LossMeter:
         self._numbers = array("I", ((offsets + start) % NUMBERS).astype(np.uint32).tobytes())
         self._times = array("H", times.tobytes())
 
+    def _counting(self, span: int) -> npt.NDArray[np.bool_]:
+        """Which of the next numbers were sent here; what is known of numbers before them is forgotten."""
+        counts = np.ones(span, bool)
+        start = 0 if self._settled is None else self._settled
+        for first, count in list(self._astray.items()):
+            begin = (first - start + NUMBERS // 2) % NUMBERS - NUMBERS // 2 - 1  # the first of the next has offset 1
+            counts[max(0, begin) : max(0, begin + count)] = False
+            if begin + count <= 0:
+                del self._astray[first]
+        return counts
+
     def _settle(self, offsets: npt.NDArray[np.int64], times: npt.NDArray[np.uint16]) -> None:
         """Count the next ``_span`` numbers, of which these arrived."""
         span = self._span
-        self.settled += span
         arrived = np.zeros(span, bool)
         arrived[offsets - 1] = True
+        if self._astray:
+            counts = self._counting(span) | arrived
+            offsets = np.cumsum(counts, dtype=np.int64)[offsets - 1]
+            arrived = arrived[counts]
+            span = len(arrived)
+            if not span:
+                return
+        self.settled += span
         lost = span - int(np.count_nonzero(arrived))
         if not lost:
             self._in_run = False

@@ -15,6 +15,7 @@ MISSING = 5
 FORWARD = 6
 
 _PING = struct.Struct(">BBBBHQQIfffIIIff")
+_ASTRAY = struct.Struct(">IH")
 _REPORT = struct.Struct(">BHH")
 _SENDER = struct.Struct(">HIQQQQQQ")
 _RECEIVER = struct.Struct(">HQQQQQQQffffffff")
@@ -25,6 +26,10 @@ NO_ECHO = 2**64 - 1
 ROWS_SIZE = 1000
 """Bytes of rows in one report, so that it is one packet whatever the mtu is."""
 MISSING_ROWS = ROWS_SIZE // _MISSING_ROW.size
+MOST_ASTRAY = 48
+"""Runs in a ping, which then fits the smallest mtu."""
+MOST_RUN = 2**16 - 1
+"""Packets of such a run."""
 
 
 class Feedback(NamedTuple):
@@ -65,6 +70,8 @@ class Ping(NamedTuple):
     hold: int
     """Microseconds since that arrived."""
     feedback: Feedback
+    astray: tuple[tuple[int, int], ...] = ()
+    """Packets of the path that went to other addresses of late, as runs: packet number of the first, and how many."""
 
 
 class SenderRow(NamedTuple):
@@ -149,12 +156,16 @@ PING_SIZE = _PING.size
 
 
 def push_ping(ping: Ping, padding: int = 0) -> bytes:
-    """Encode, with that many zeros more; sums wrap."""
+    """Encode, with that many zeros more; sums wrap, and at most `MOST_ASTRAY` runs, the last, are told."""
     echo = NO_ECHO if ping.echo is None else min(max(ping.echo, 0), NO_ECHO - 1)  # a peer may claim any time
     hold, feedback = min(max(ping.hold, 0), 2**32 - 1), ping.feedback
     sums = (value & 0xFFFFFFFF for value in (feedback.settled, feedback.lost, feedback.runs))
     head = PING, ping.path, ping.cost, ping.ask, ping.size, echo, ping.challenge, hold
-    return _PING.pack(*head, *feedback[:3], *sums, *feedback[6:]) + bytes(padding)
+    fixed = _PING.pack(*head, *feedback[:3], *sums, *feedback[6:])
+    if not ping.astray:
+        return fixed + bytes(padding)  # which is as good as that there are none
+    runs = ping.astray[-MOST_ASTRAY:]
+    return fixed + bytes([len(runs)]) + b"".join(_ASTRAY.pack(*run) for run in runs) + bytes(padding)
 
 
 def push_goodbye() -> bytes:
@@ -190,6 +201,15 @@ def push_reports(senders: list[SenderRow], receivers: list[ReceiverRow]) -> Iter
             return
 
 
+def _pull_astray(data: bytes) -> tuple[tuple[int, int], ...]:
+    """What follows the fixed part of a ping: nothing, or zeros, from an end that has none, or of an earlier version."""
+    count = data[_PING.size] if len(data) > _PING.size else 0
+    if count > MOST_ASTRAY:
+        return ()
+    start = _PING.size + 1
+    return tuple(_ASTRAY.unpack_from(data, start + i * _ASTRAY.size) for i in range(count))
+
+
 def pull_control(data: bytes) -> Control | None:
     """Decode any of them; None if it is none. Longer messages of later versions are cut to what is known."""
     try:
@@ -200,7 +220,8 @@ def pull_control(data: bytes) -> Control | None:
             known = feedback if feedback.capacity != math.inf else feedback[1:]
             if min(feedback) < 0 or not all(map(math.isfinite, known)):
                 return None
-            return Ping(path, cost, bool(ask), size, None if echo == NO_ECHO else echo, challenge, hold, feedback)
+            echo = None if echo == NO_ECHO else echo
+            return Ping(path, cost, bool(ask), size, echo, challenge, hold, feedback, _pull_astray(data))
         if kind == REPORT:
             _, count_s, count_r = _REPORT.unpack_from(data)
             at = _REPORT.size

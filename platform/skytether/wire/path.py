@@ -6,6 +6,7 @@ Which of several paths is used when is decided in `paths`.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from .arrivals import NUMBERS, DelayMeter, LossMeter
 from .claims import Claims
 from .config import Config
 from .congestion import RateControl
-from .control import Feedback
+from .control import MOST_ASTRAY, MOST_RUN, Feedback
 from .liveness import Liveness
 from .loss import LossEstimate, Sums
 from .measure import Histogram
@@ -34,6 +35,8 @@ BURST_TIME = 0.03
 """Seconds in which it arrives, beyond a round trip until the peer has told so."""
 PACE_TIME = 1.0
 """Seconds that the number of packets sent in a second is averaged over."""
+ASTRAY_TIME = 2 * SETTLE
+"""Seconds for which the peer is told of packets that went to other addresses."""
 FAMILIAR = 500
 """Packets from which a path is known well."""
 OWN_DELAY = 0.05
@@ -54,10 +57,10 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "_arrived_at", "_assumed_loss", "_cautious", "_fed_back_at", "_known", "_pace", "_settle_at", "_singles",
-        "address", "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo", "heard_at", "id",
-        "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number", "pacer",
-        "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
+        "_arrived_at", "_assumed_loss", "_astray", "_cautious", "_fed_back_at", "_known", "_pace", "_settle_at",
+        "_singles", "address", "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo",
+        "heard_at", "id", "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number",
+        "pacer", "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -95,6 +98,8 @@ class Path:
         self._singles = 0
         """Packets sent one by one since the last feedback."""
         self._pace = math.inf
+        self._astray: deque[tuple[int, int, float]] = deque(maxlen=MOST_ASTRAY)
+        """Packets that went to other addresses, as runs: the first, how many, when the last was sent."""
         self._measure(now)
 
     def _measure(self, now: float) -> None:
@@ -182,6 +187,26 @@ class Path:
         self.next_number = (first + count) % NUMBERS
         self.packets_sent += count
         return first
+
+    def number_astray(self, now: float) -> int:
+        """The same of one packet that goes to another address than the path's, where the peer need not be.
+
+        It is told not to wait for it: who makes an end try other addresses would make both believe in loss.
+        """
+        number = self.number()
+        if self._astray:
+            first, count, _ = self._astray[-1]
+            if (first + count) % NUMBERS == number and count < MOST_RUN:
+                self._astray[-1] = first, count + 1, now
+                return number
+        self._astray.append((number, 1, now))
+        return number
+
+    def astray(self, now: float) -> tuple[tuple[int, int], ...]:
+        """Those of late, as runs: first number, and how many."""
+        while self._astray and now - self._astray[0][2] > ASTRAY_TIME:
+            self._astray.popleft()
+        return tuple((first, count) for first, count, _ in self._astray)
 
     def start_epoch(self, now: float) -> None:
         """Forget what belongs to a peer that was there before."""

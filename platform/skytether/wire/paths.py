@@ -175,7 +175,10 @@ class Paths:
         ask = size > 0 or len(self._paths) > 1
         if ask and not size:
             path.liveness.ask(now)
-        self._say(path, push_ping(_ping(path, ask, size, now), max(0, size - PADDING)), None, now)
+        said = _ping(path, ask, size, now)
+        if not size:  # a probe has the size that it has
+            said = said._replace(astray=path.astray(now))
+        self._say(path, push_ping(said, max(0, size - PADDING)), None, now)
 
     def ping_to(self, address: Hashable, path: Path, now: float) -> None:
         """Tell somebody who seems to be the peer that we are here."""
@@ -202,6 +205,7 @@ class Paths:
         if path.echo is None or sent_at > path.echo[0]:
             path.echo = sent_at, now
             path.take_feedback(ping.feedback, now)
+        path.losses.leave_out(ping.astray)
         if ping.ask:
             echo = round(sent_at * 1e6)
             answer = Ping(path.id, path.cost, False, ping.size, echo, ping.challenge, 0, path.feedback(now))

@@ -11,7 +11,7 @@ import heapq
 import math
 import struct
 from collections import deque
-from collections.abc import Container, Hashable, Iterable
+from collections.abc import Callable, Container, Hashable, Iterable
 from functools import partial
 
 from .compression import FLAG, Compressed, original_size
@@ -114,13 +114,14 @@ class Sender:
 
     def say(self, path: Path, message: bytes, now: float) -> None:
         """Send a control message of one packet by that path, once and at once, however large the packet."""
-        packet = self._packet(message, path, now)
+        packet = self._packet(message, path, path.number, now)
         if packet is not None:
             self._lane(path).say(packet)
 
     def say_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
         """The same to some address, which need not be the path's; returns its bytes, 0 if it cannot be sent."""
-        packet = self._packet(message, path, now) if len(self.astray) < MAX_ASTRAY else None
+        number = partial(path.number_astray, now)
+        packet = self._packet(message, path, number, now) if len(self.astray) < MAX_ASTRAY else None
         if packet is None:
             return 0
         path.bytes_sent += len(packet)
@@ -132,12 +133,12 @@ class Sender:
         lane = self._lane(path)
         lane.repeat(lane, since, now)
 
-    def _packet(self, message: bytes, path: Path, now: float) -> bytes | None:
-        """Seal a control message of one packet; None if there are no keys."""
+    def _packet(self, message: bytes, path: Path, number: Callable[[], int], now: float) -> bytes | None:
+        """Seal a control message of one packet, which gets that number; None if there are no keys."""
         epoch, topic = self.epoch, self._control
         if epoch is None or epoch.spent:
             return None
-        packet = self._next(epoch, topic, message, now).packet(path.id, path.number(), ticks(now))
+        packet = self._next(epoch, topic, message, now).packet(path.id, number(), ticks(now))
         topic.counters.bytes_sent += len(packet)
         return packet
 
