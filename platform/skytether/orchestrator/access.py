@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import math
 import secrets as random
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -112,7 +113,9 @@ class Access:
         self._secrets = secrets
         self._clock = clock
         self._throttle = throttle
-        self._noted: dict[str, float] = {}
+        self._noted: OrderedDict[str, float] = OrderedDict()
+        """When the use of a token was noted last, by its id; older ones are of no use, and a robot makes any number."""
+        self._noting = threading.Lock()
         self._recent: OrderedDict[str, tuple[Principal, float]] = OrderedDict()
         """Who showed a token, by its SHA-256, and the monotonic time when the database knew it last."""
         self._unknown: OrderedDict[str, tuple[str, float]] = OrderedDict()
@@ -215,9 +218,12 @@ class Access:
         return Principal(robot.name, robot.services, token=row)
 
     def _note_used(self, row: TokenRow, now: float) -> None:
-        at = time.monotonic()
-        if at - self._noted.get(row.id, -_SEEN_EVERY) >= _SEEN_EVERY:
-            self._noted[row.id] = at
+        with self._noting:
+            at = time.monotonic()
+            while self._noted and at - next(iter(self._noted.values())) >= _SEEN_EVERY:
+                self._noted.popitem(last=False)
+            noted = self._noted.setdefault(row.id, at) != at
+        if not noted:
             self._store.change_token(row.id, last_used_at=now)
             if row.robot is not None:
                 self._store.seen(row.robot, now)

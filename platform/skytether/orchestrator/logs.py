@@ -34,12 +34,16 @@ _PATH = 256
 _STRANGERS_PER_S, _STRANGERS_AT_ONCE = 10.0, 100
 """Lines of all who have shown no good token."""
 _REFUSED_PER_S, _REFUSED_AT_ONCE = 0.5, 60
-"""Lines on what one owner of a token was refused."""
+"""Lines on what one owner of a token asked for and did not get."""
 _READS = ("GET", "HEAD", "OPTIONS")
 _REFUSED = (401, 403, 429)
+"""A line of reads too."""
+_FAILED = 400
+"""From this status on whoever asked got nothing, as of what is not there: as many lines as one who is refused."""
 _CREATED = 201
-_OFTEN = re.compile(r"POST /api/v1/instances/[^/]+/renew 200|PUT /api/v1/robots/[^/]+/gate 204")
-"""Every robot, every few seconds, about nothing but itself: the lease and the gate's state in the database say it."""
+_OFTEN = re.compile(r"POST /api/v1/instances/[^/]+/(renew|share) 200|PUT /api/v1/robots/[^/]+/gate 204")
+"""Every robot, every few seconds, about nothing but itself: the lease, what it shares and the gate's state in the
+database say it."""
 
 
 class TextFormatter(logging.Formatter):
@@ -107,7 +111,8 @@ class Audit:
     """ASGI middleware: a line for each request that changes something or was refused. No bodies, no queries.
 
     Whoever has shown no good token could fill any disk with such lines, or hide among them what somebody did: theirs go
-    to another log, few of them. And who is refused again and again is told of a few times a minute.
+    to another log, few of them. And who asks again and again for what he does not get, for whatever reason, is told
+    of a few times a minute.
     """
 
     def __init__(self, app: ASGIApp, clock: Callable[[], float] = time.monotonic) -> None:
@@ -140,7 +145,7 @@ class Audit:
         address = scope["client"][0] if scope.get("client") else ""
         path = scope["path"] if len(scope["path"]) <= _PATH else f"{scope['path'][:_PATH]}..."
         fields = {"who": who, "address": address, "method": scope["method"], "path": path, "status": status}
-        few = self._strangers if who == NOBODY else self._refused if status in _REFUSED else None
+        few = self._strangers if who == NOBODY else self._refused if status >= _FAILED else None
         if few is not None:
             left_out = few.take(who)
             if left_out is None:
