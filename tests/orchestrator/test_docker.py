@@ -119,6 +119,53 @@ def test_a_container_reaches_nobody(
             udp.recv(10)
 
 
+_ASK = """
+import json, socket, struct, time
+def ask(ip, server):
+    labels = [*reversed(ip.split(".")), "in-addr", "arpa"]
+    name = b"".join(bytes([len(label)]) + label.encode() for label in labels)
+    asked = struct.pack(">6H", 7, 0x100, 1, 0, 0, 0) + name + b"\\0" + struct.pack(">2H", 12, 1)
+    with socket.socket(type=socket.SOCK_DGRAM) as sock:
+        sock.settimeout(1)
+        try:
+            sock.sendto(asked, server)
+            return sock.recv(1000)[-60:].decode("latin-1")
+        except OSError:
+            return ""
+rows = [row.split()[1].split(":") for row in open("/proc/net/udp").read().splitlines()[1:]]
+ports = [53] + [int(port, 16) for address, port in rows if address == "0B00007F"]
+told = [answer for port in ports for ip in ASKED if (answer := ask(ip, ("127.0.0.11", port)))]
+before = time.monotonic()
+try:
+    socket.getaddrinfo("nowhere.example", 1)
+except OSError:
+    took = time.monotonic() - before
+with socket.socket(type=socket.SOCK_DGRAM) as sock:
+    for n in range(5000):
+        sock.sendto(b"x", (f"127.1.{n // 250}.{1 + n % 250}", 5000))
+tracked = int(open("/proc/sys/net/netfilter/nf_conntrack_count").read())
+print(json.dumps({"ports": len(ports), "told": told, "took": took, "tracked": tracked}))
+"""
+
+
+def test_a_container_learns_no_names_of_others_and_fills_no_table_of_the_kernel(
+    docker_site: DockerSite, runtime: DockerRuntime
+) -> None:
+    """The engine's own name server told who else is there, and what a service sent to itself was remembered outside."""
+    for instance in ("i1", "i2"):
+        runtime.start(launch(docker_site, instance))
+        until_phase(runtime, Phase.RUNNING, instance)
+    network = json.loads(docker("network", "inspect", docker_site.network))[0]
+    asked = [there["IPv4Address"].partition("/")[0] for there in network["Containers"].values()]
+    assert len(asked) >= 2
+    for container in docker_site.containers():
+        found = inside(container, f"ASKED = {asked!r}\n{_ASK}")
+        assert found["ports"] == 2, "where the name server is can be seen"
+        assert found["told"] == []
+        assert found["took"] < 5, "and is not waited for"
+        assert found["tracked"] < 100
+
+
 def test_what_a_site_opens_is_open_and_no_more_and_no_reload_of_the_machines_firewall_ends_it(
     docker_site: DockerSite, host_ports: dict[str, int], tmp_path: Path
 ) -> None:
@@ -267,6 +314,32 @@ def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room
         runtime._scales.weigh()
         assert runtime.observe()["i1"].exceeds == "has more than 64 MiB in a volume that is not for data"
         runtime.remove("i1")
+
+
+def test_what_hides_from_being_weighed_is_ended(docker_site: DockerSite, tmp_path: Path) -> None:
+    """An engine that comes to a folder too deep for a path says nothing of the volume, however much is beside it."""
+    with closing(docker_site.open(tmp_path, data_mb=1)) as runtime:
+        runtime.start(launch(docker_site))
+        until_phase(runtime, Phase.RUNNING)
+        (container,) = docker_site.containers()
+        inside(container, _HIDE)
+        for _ in range(2):
+            runtime._scales.weigh()
+        assert "the engine cannot tell how much is in there" in runtime.observe()["i1"].exceeds
+        with pytest.raises(RuntimeFailure, match="the engine cannot tell"):
+            runtime.start(launch(docker_site, "i2"))
+        runtime.remove("i1")
+
+
+_HIDE = """
+import os
+os.chdir("/run/skytether/data/i1")
+open("much", "wb").write(bytes(3 << 20))
+for _ in range(30):
+    os.mkdir("d" * 200)
+    os.chdir("d" * 200)
+print(1)
+"""
 
 
 def test_ends_are_told_apart(docker_site: DockerSite, runtime: DockerRuntime) -> None:

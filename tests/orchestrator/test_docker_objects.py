@@ -34,11 +34,13 @@ from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
+    Declared,
     Namespace,
     Seen,
     advised,
     container,
     data_volume,
+    declared,
     free_gpus,
     free_port,
     grant_archive,
@@ -72,8 +74,27 @@ def launch(**given: Any) -> Launch:
 
 
 def body(given: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    asked = {"image": "sha256:1", "port": None, "gpus": (), "cores": 4.0, "hosts": {}} | more
+    asked = {"image": Declared("sha256:1"), "port": None, "gpus": (), "cores": 4.0, "hosts": {}} | more
     return container(launch(**(given or {})), options(), "me", **asked)
+
+
+def test_an_image_has_its_health_checked_no_more_than_once_a_second() -> None:
+    """Every millisecond kept half a processor of the engine's machine busy, which no limit of the container bounds."""
+    often = {"Config": {"Healthcheck": {"Test": ["CMD", "true"], "Interval": 1_000_000, "StartInterval": 1}}}
+    asked = body(image=declared("sha256:1", often))["Healthcheck"]
+    assert asked == {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}, "what is checked stays the image's"
+    for ours in ({"Interval": 5_000_000_000}, {"Interval": 1_000_000_000}, {"Interval": 0}, {}, None):
+        assert "Healthcheck" not in body(image=declared("sha256:1", {"Config": {"Healthcheck": ours}}))
+
+
+def test_an_image_that_declares_thousands_of_volumes_is_not_started() -> None:
+    """An engine took longer for three thousand than any call may, and so was taken to be gone."""
+    paths = {f"/v/{n}": {} for n in range(33)}
+    with pytest.raises(RuntimeFailure, match="its image declares 33 volumes, and may declare 32"):
+        declared("sha256:1", {"Config": {"Volumes": paths}})
+    del paths["/v/0"]
+    mounts = body(image=declared("sha256:1", {"Config": {"Volumes": paths}}))["HostConfig"]["Mounts"]
+    assert len(mounts) == 34
 
 
 def test_a_container_may_do_nothing_that_it_need_not() -> None:
@@ -182,7 +203,7 @@ def test_devices_and_gpus_are_handed_over() -> None:
     assert body()["HostConfig"]["DeviceRequests"] == []
     asked = options(devices=["/dev/video0"], groups=[44])
     for needs, groups in (({"devices": ["/dev/video0"]}, ["44"]), ({}, [])):
-        made = container(launch(needs=needs), asked, "me", "x", None, (), 4.0, {})
+        made = container(launch(needs=needs), asked, "me", Declared("x"), None, (), 4.0, {})
         assert made["HostConfig"]["GroupAdd"] == groups
 
 
@@ -215,7 +236,7 @@ def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
 
 def test_published_and_advertised_addresses_are_two_things() -> None:
     asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
-    bindings = container(launch(), asked, "me", "x", 7700, (), 4.0, {})["HostConfig"]["PortBindings"]
+    bindings = container(launch(), asked, "me", Declared("x"), 7700, (), 4.0, {})["HostConfig"]["PortBindings"]
     assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
     seen = observation(Seen("c", "i1", 1, "running", host_port=7700, ready=True), asked)
     assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)

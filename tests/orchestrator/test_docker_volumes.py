@@ -60,7 +60,7 @@ class FakeEngine:
 
 
 def test_what_the_engine_says_of_its_volumes() -> None:
-    assert sizes(DISK) == {"full": (2 << 20) + 1, "good": 2 << 20}
+    assert sizes(DISK) == {"full": (2 << 20) + 1, "good": 2 << 20, "elsewhere": -1}
     assert sizes({}) == sizes({"Volumes": None}) == sizes({"VolumeUsage": {"TotalCount": 1}}) == {}
     assert sizes({"VolumeUsage": {"Items": DISK["Volumes"]}}) == sizes(DISK), "from version 1.52 on"
 
@@ -87,6 +87,30 @@ def test_a_volume_that_holds_too_much_is_named_until_there_is_room() -> None:
     scales.weigh()
     assert scales.exceeds("full") == ""
     assert scales.exceeds("good", ["", "grant"]) == "has more than 64 MiB in a volume that is not for data"
+
+
+def test_what_the_engine_cannot_weigh_again_and_again_holds_too_much() -> None:
+    """A folder that is too deep to have a path, made by a service, keeps the engine from weighing its volume."""
+    engine = FakeEngine()
+    scales = Scales(engine, "ab", 2)  # type: ignore[arg-type]
+
+    def weigh(size: int) -> None:
+        engine.disk = {"Volumes": [{"Name": "skytether-ab-data-walker-toy", "UsageData": {"Size": size}}]}
+        scales.weigh()
+
+    volume = "skytether-ab-data-walker-toy"
+    weigh((2 << 20) + 1)
+    weigh(-1)
+    assert scales.exceeds(volume).startswith("has more than 2 MiB"), "what was known of it stays known"
+    assert scales.by_robot == {"walker": (2 << 20) + 1}
+    weigh(1)
+    weigh(-1)
+    assert scales.exceeds(volume) == scales.exceeds("good", [volume]) == "", "a file may just have gone"
+    weigh(-1)
+    assert "the engine cannot tell how much is in there" in scales.exceeds(volume)
+    assert "the engine cannot tell how much is in there" in scales.exceeds("good", [volume])
+    weigh(1)
+    assert scales.exceeds(volume) == "", "somebody has tidied up"
 
 
 def test_an_engine_that_takes_its_time_is_asked_once_and_holds_nobody_up() -> None:

@@ -21,7 +21,19 @@ from .follow import Follower
 from .images import ensure_image
 from .namespaces import Namespaces
 from .network import close_off, guard_image, is_ours, resolve
-from .objects import OWNER, Namespace, Seen, advised, container, free_gpus, free_port, grant_archive, name_of, parse
+from .objects import (
+    OWNER,
+    Namespace,
+    Seen,
+    advised,
+    container,
+    declared,
+    free_gpus,
+    free_port,
+    grant_archive,
+    name_of,
+    parse,
+)
 from .options import DockerOptions
 
 log = logging.getLogger(__name__)
@@ -324,9 +336,9 @@ class Job:
         name = name_of(self._owner, self.launch.instance, self.attempt)
         with self._engine.asked():
             api = self._engine.api()
-            volumes = api.inspect_image(image)["Config"].get("Volumes") or ()
-            asked = self.launch, self._options, self._owner, image, port, gpus, cores, hosts, namespace
-            body = container(*asked, epoch=self._epoch, volumes=volumes)
+            told = declared(image, api.inspect_image(image))
+            asked = self.launch, self._options, self._owner, told, port, gpus, cores, hosts, namespace
+            body = container(*asked, epoch=self._epoch)
             try:
                 made = str(api.create_container_from_config(body, name)["Id"])
             except APIError as error:

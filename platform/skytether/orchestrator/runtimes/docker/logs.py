@@ -13,8 +13,9 @@ from .engine import Engine
 _SILENCE_S = 3600.0
 """A connection over which nothing came for so long is given up; whoever looks may look again."""
 _LOOK_S = 1.0
-_WAITING = 1000
-"""Pieces that wait for a slow reader; then the engine waits too."""
+_WAITING = 16
+"""Pieces, of 64 KiB at most, that wait for a slow reader; then the engine waits too. A service may write as fast as it
+can, its robot may follow it dozens of times, and read none of it."""
 
 
 class ContainerLog(LogStream):

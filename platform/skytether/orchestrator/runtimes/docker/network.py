@@ -34,6 +34,8 @@ _FILTERED = "filtered"
 _OLD_GUARD = "skytether.io/guard"
 _GUARD_TIMEOUT_S = 30
 _TABLE = "inet skytether"
+_NAME_SERVER, _NAMES = "127.0.0.11", 53
+"""Where a Docker engine answers for names in each network that is not its own, and the port that is asked."""
 _LOOK_UP_S = 15.0
 """For all names of one start; what is asked for again is in the name server's memory then."""
 
@@ -59,6 +61,11 @@ def rules(openings: Mapping[Opening, Iterable[str]]) -> str:
 
     Answers to whom called first are let through: to robots, and to the engine's own proxy of published ports.
 
+    The engine has a name server of its own within, at `_NAME_SERVER`, which runs outside and knows the names of all
+    others in the network. It is asked through a translated port: what is not tracked is not translated, so that whoever
+    asks is told at once that nobody is there. What a service sends to itself would otherwise also fill the kernel's
+    table of connections, of which no limit of its container knows.
+
     Args:
         openings: What it may begin, with the addresses of each.
     """
@@ -68,10 +75,13 @@ def rules(openings: Mapping[Opening, Iterable[str]]) -> str:
         for address in addresses
     ]
     neighbours = "icmpv6 type { nd-neighbor-solicit, nd-neighbor-advert } accept"
-    always = ['oifname "lo" accept', "ct state established,related accept", neighbours]
+    no_names = f"ip daddr {_NAME_SERVER} meta l4proto {{ tcp, udp }} th dport != {_NAMES} drop"
+    always = [no_names, 'oifname "lo" accept', "ct state established,related accept", neighbours]
     chain = f"add chain {_TABLE} output {{ type filter hook output priority 0; policy drop; }}"
+    early = f"add chain {_TABLE} untracked {{ type filter hook output priority -300; }}"
+    own = f'add rule {_TABLE} untracked oifname "lo" notrack'
     added = "".join(f"add rule {_TABLE} output {rule}; " for rule in (*always, *allowed))
-    return f"add table {_TABLE}; {chain}; {added}"
+    return f"add table {_TABLE}; {chain}; {early}; {own}; {added}"
 
 
 def resolve(openings: Iterable[Opening], within_s: float = _LOOK_UP_S) -> dict[Opening, tuple[str, ...]]:

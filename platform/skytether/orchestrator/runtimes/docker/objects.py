@@ -8,13 +8,13 @@ import tarfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec
 from skytether.api.service_report import FILE_NAME, ServiceReport
 
-from ..base import Launch, Observation, Phase
+from ..base import Launch, Observation, Phase, RuntimeFailure
 from .egress import refusal_of
 from .meter import Usage
 from .options import DockerOptions
@@ -51,6 +51,11 @@ _EXPOSED: dict[str, dict[str, str]] = {_INNER: {}}
 _MANAGED = {"app.kubernetes.io/managed-by": "skytether"}
 _HELPS = {"ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode": "none"}
 """Of whom no service is asked."""
+_MOST_VOLUMES = 32
+"""That an image may declare: an engine makes, mounts and removes each of them, and answers nobody meanwhile."""
+_LEAST_BETWEEN_CHECKS = {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}
+"""Nanoseconds between two checks of an image's health: each costs the engine more than the container, whose limits do
+not hold for that."""
 _LEAST_CORES = 0.01
 """The kernel gives no less."""
 _ADVICE = (
@@ -186,11 +191,42 @@ def advised(refusal: str) -> str:
     return next((f"{refusal}; {what}" for words, what in _ADVICE if words in refusal), refusal)
 
 
+class Declared(NamedTuple):
+    """What an image says of itself, whoever made it."""
+
+    id: str
+    """What a tag means may change between two runs."""
+    volumes: tuple[str, ...] = ()
+    """Paths."""
+    checks: Mapping[str, int] = {}
+    """Of its health check, what would be done too often, as it is done instead [ns]."""
+
+
+def declared(image: str, inspected: Mapping[str, Any]) -> Declared:
+    """What matters of the engine's description of an image.
+
+    Args:
+        image: Its id.
+        inspected: The description.
+
+    Raises:
+        RuntimeFailure: It asks for too much.
+    """
+    config = inspected.get("Config") or {}
+    volumes, health = tuple(config.get("Volumes") or ()), config.get("Healthcheck") or {}
+    if len(volumes) > _MOST_VOLUMES:
+        raise RuntimeFailure(f"its image declares {len(volumes)} volumes, and may declare {_MOST_VOLUMES}")
+    # Where it says 0 the engine's own holds, half a minute.
+    return Declared(
+        image, volumes, {key: least for key, least in _LEAST_BETWEEN_CHECKS.items() if 0 < health.get(key, 0) < least}
+    )
+
+
 def container(
     launch: Launch,
     options: DockerOptions,
     owner: str,
-    image: str,
+    image: Declared,
     port: int | None,
     gpus: tuple[int, ...],
     cores: float,
@@ -198,7 +234,6 @@ def container(
     namespace: Namespace | None = None,
     *,
     epoch: int = 0,
-    volumes: Iterable[str] = (),
 ) -> dict[str, Any]:
     """The body of the engine's call that creates a container.
 
@@ -206,23 +241,24 @@ def container(
         launch: What to start.
         options: The site's.
         owner: Whose containers these are.
-        image: The image's id: what a tag means may change between two runs.
+        image: The image.
         port: UDP port to publish; None: the engine's choice.
         gpus: Numbers of its GPUs.
         cores: Of the engine's machine, which refuses a limit above them.
         hosts: Addresses of the names that it may connect to.
         namespace: The network that it is to join, which says what is published; None: one of its own.
         epoch: Of the leader; 0: there is none.
-        volumes: Paths that the image declares to be volumes.
     """
     spec, grant = launch.spec, launch.grant
     memory = (spec.limits.memory_mb or spec.needs.memory_mb) << 20
     limit = max(_LEAST_CORES, min(spec.limits.cpu or max(1.0, spec.needs.cpu), cores))
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
-    paths = {posixpath.normpath(path) for path in volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
+    paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
     return {
-        "Image": image,
+        "Image": image.id,
+        # The rest of the check stays the image's.
+        **({"Healthcheck": dict(image.checks)} if image.checks else {}),
         "User": f"{USER}:{USER}",
         "Env": [f"{key}={value}" for key, value in environment.items()],
         **({} if namespace else {"ExposedPorts": _EXPOSED}),

@@ -24,17 +24,19 @@ _OWN_MB = 64
 much as in the own folder of a process."""
 _PATIENCE_S = 120.0
 """The engine looks at every file of its volumes."""
+_UNKNOWN = 2
+"""Weighings in a row at which the engine could not look at all of a volume: at one, a folder may just have gone."""
 _TOLERATED = 3
 """Weighings in a row that may come to nothing before it is told: one that somebody else has asked for is refused."""
 
 
 def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
-    """Bytes by volume, out of what the engine says of its disk; those of which it does not know are left out."""
+    """Bytes by volume, out of what the engine says of its disk; negative: it could not look at all that is in there."""
     found = {}
     # The second is where engines from version 1.52 of their interface on say it.
     for volume in answer.get("Volumes") or (answer.get("VolumeUsage") or {}).get("Items") or ():
-        size = (volume.get("UsageData") or {}).get("Size", -1)
-        if size >= 0:
+        size = (volume.get("UsageData") or {}).get("Size")
+        if size is not None:
             found[str(volume["Name"])] = int(size)
     return found
 
@@ -65,6 +67,8 @@ class Scales:
         """Bytes by volume, as weighed last; of the whole engine."""
         self.by_robot: Mapping[str, int] = {}
         """Bytes in this owner's volumes of data: summed up once, for each pass over each site asks."""
+        self._unknown: Mapping[str, int] = {}
+        """By volume, how many weighings in a row could not look at all that is in there."""
         self._failures = 0
         """In a row."""
 
@@ -73,6 +77,10 @@ class Scales:
         if self.sizes.get(data, 0) > self._data_mb << 20:
             most = f"{self._data_mb} MiB in the volume {data} (the site's data_mb)"
             return f"has more than {most}: delete what is not needed"
+        for name in (data, *others):
+            # Folders so deep that they have no path keep the engine from looking; what is beside them weighs nothing.
+            if self._unknown.get(name, 0) >= _UNKNOWN:
+                return f"has made the volume {name} such that the engine cannot tell how much is in there: delete it"
         if any(self.sizes.get(name, 0) > _OWN_MB << 20 for name in others):
             return f"has more than {_OWN_MB} MiB in a volume that is not for data"
         return ""
@@ -113,5 +121,8 @@ class Scales:
             except requests.HTTPError as error:
                 create_api_error_from_http_exception(error)
             answer = said.json()
-        self.sizes = sizes(answer)
+        told = sizes(answer)
+        self._unknown = {name: self._unknown.get(name, 0) + 1 for name, size in told.items() if size < 0}
+        # What was known of these stays known.
+        self.sizes = {name: size if size >= 0 else self.sizes.get(name, 0) for name, size in told.items()}
         self.by_robot = stored_by_robot(self._owner, self.sizes)
