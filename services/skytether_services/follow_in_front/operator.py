@@ -67,6 +67,8 @@ class OperatorParams:
         close: Of somebody who is nearer than this to the operator nobody knows any more which of them is which [m].
         close_hidden: The same while not both legs of the operator are seen [m].
         close_scans: For so many scans in a row.
+        appears: One who appears so near to the operator, and turns out to be a person, came out from behind them, or is
+            the operator, who came out from behind somebody [m].
     """
 
     near: float = 0.4
@@ -81,6 +83,7 @@ class OperatorParams:
     close: float = 0.45
     close_hidden: float = 0.65
     close_scans: int = 2
+    appears: float = 1.2
 
 
 class _Last(NamedTuple):
@@ -124,6 +127,8 @@ class OperatorChoice:
         self._last: _Last | None = None
         self._next: tuple[int, float] | None = None
         self._others: set[int] = set()
+        self._before: set[int] = set()
+        self._appeared: set[int] = set()
         self._close = 0
         self._mixed_at = -math.inf
         self.choice = Choice.NOBODY
@@ -147,6 +152,7 @@ class OperatorChoice:
             Whom to follow; None: `choice` says why.
         """
         kept = self._kept(people, robot, now)
+        self._note_who_appears(kept, people)
         if self._is_mixed_up(kept, people, now):
             self._last, self._mixed_at, self._next = None, now, None
         if 0 <= now - self._mixed_at < self._params.memory:
@@ -167,6 +173,19 @@ class OperatorChoice:
             self._others |= {person.id for person in people if person.known and person.legs and person is not kept}
         return _seen_from(robot, kept)
 
+    def _note_who_appears(self, kept: Person | None, people: Sequence[Person]) -> None:
+        """Remember who was not there before and is near to the operator at once."""
+        there = {person.id for person in people}
+        new = [person for person in people if person.id not in self._before]
+        self._before = there
+        if kept is None:
+            self._appeared.clear()
+        else:
+            near = {
+                one.id for one in new if one is not kept and math.dist(one.place, kept.place) < self._params.appears
+            }
+            self._appeared = (self._appeared | near) & there
+
     def _is_mixed_up(self, kept: Person | None, people: Sequence[Person], now: float) -> bool:
         """Whether somebody came so near to the operator that one could have become the other."""
         p = self._params
@@ -175,6 +194,8 @@ class OperatorChoice:
             return False
         place = kept.place if kept is not None else self._last.expected(now)
         if any(one.mixed_at > self._last.at and math.dist(one.place, place) < p.again for one in people):
+            return True
+        if any(one.known and one.id in self._appeared for one in people):
             return True
         limit = p.close if kept is not None and kept.legs == 2 else p.close_hidden
         close = kept is not None and any(

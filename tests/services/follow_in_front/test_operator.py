@@ -96,12 +96,26 @@ def test_beside_one_who_may_be_about_to_walk_nobody_is_picked() -> None:
 
 def test_the_operator_stays_though_others_come_nearer() -> None:
     choice = OperatorChoice(AT_ONCE)
-    choice.step([person(1, -1.0, 0.2)], ORIGIN, 0.0)
+    choice.step([person(9, 1.5, 0.0), person(1, -1.0, 0.2)], ORIGIN, 0.0)
     for scan in range(1, 20):
         operator = choice.step([person(9, -0.6, -0.2), person(1, -1.0, 0.2 + 0.05 * scan)], ORIGIN, 0.1 * scan)
         assert operator is not None
         assert operator.id == 1
     assert choice.picked == 1
+
+
+def test_one_who_appears_beside_the_operator_may_be_the_operator() -> None:
+    choice = OperatorChoice(AT_ONCE)
+    choice.step([person(1, -1.0, 0.0)], ORIGIN, 0.0)
+    something, other = person(2, -1.4, 0.7, walks=False), person(1, -1.0, 0.0)
+    something.stands = False
+    assert choice.step([something, other], ORIGIN, 0.1) is not None, "it may be a chair"
+    something.walks = True
+    assert choice.step([something, other], ORIGIN, 0.2) is None
+    assert choice.choice == Choice.SEVERAL
+    assert choice.step([other], ORIGIN, 2.1) is None
+    assert choice.step([other], ORIGIN, 2.3) is not None
+    assert choice.picked == 2
 
 
 def test_one_who_is_lost_is_found_again_where_they_would_be() -> None:
