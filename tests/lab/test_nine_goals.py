@@ -10,25 +10,18 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from skytether.cli.app import app
-from skytether.lab.nine_goals import SCENARIOS, Scenario, Trial, TrialSettings
+from skytether.lab.nine_goals import SCENARIOS, NineGoalsSettings, NineGoalsTrial
 from skytether.lab.nine_goals_figures import draw_figures
-from skytether.lab.nine_goals_report import compare_times, devices, summary, topics
-from skytether.lab.nine_goals_result import KeptTrials, TopicRow, Traces, TrialResult
+from skytether.lab.nine_goals_report import compare_times, summary, topics
+from skytether.lab.nine_goals_result import NineGoalsResult, NineGoalsTraces
+from skytether.lab.trial.results import KeptTrials, TopicRow
 from skytether.lab.world.plan import building
 
-RESULT = TrialResult(
+RESULT = NineGoalsResult(
     scenario="edge", seed=1, completed=True, contacts=0, goals=9, start_s=1.0, time_s=100.0, distance_m=41.0,
     first_leg_m=4.0, mean_speed_m_s=0.41, rtt_ms=28.0, robot_cpu=0.1, service_cpu=0.2, service_memory_mb=300.0,
     message="The last goal was reached.", topics=(),
 )  # fmt: skip
-
-
-def test_a_scenario_is_halved_between_both_ways() -> None:
-    up, down = (Scenario("x", rtt_s=0.2, jitter_s=0.02, loss=0.02).link(3, direction) for direction in (0, 1))
-    assert up.delay + down.delay == pytest.approx(0.2)
-    assert math.hypot(up.jitter, down.jitter) == pytest.approx(0.02)
-    assert (1 - up.loss) * (1 - down.loss) == pytest.approx(0.98)
-    assert up.seed != down.seed
 
 
 def test_trials_are_summed_up_by_scenario_over_those_that_were_completed() -> None:
@@ -78,58 +71,49 @@ def test_topics_are_summed_up_over_completed_trials_beside_the_period_that_they_
     assert slow["period_p99_ms"] is None
 
 
-def test_robot_and_service_on_one_computer_are_one_device() -> None:
-    first = replace(RESULT, robot_memory_mb=400.0)
-    (row,) = summary([first, replace(first, seed=2, service_cpu=0.4)])
-    assert devices(row, on_robot=False) == [
-        ("robot", (pytest.approx(10.0), 0.0), (400.0, 0.0)),
-        ("service", (pytest.approx(30.0), pytest.approx(14.1)), (300.0, 0.0)),
-    ]
-    assert devices(row, on_robot=True) == [("robot", (pytest.approx(40.0), pytest.approx(14.1)), (700.0, 0.0))]
-
-
-TRACES = Traces(
+TRACES = NineGoalsTraces(
     way=((1.0, 1.0), (5.0, 1.0), (7.0, 1.4), (8.8, 1.2)), goals=(1, 3), person=((7.3, 3.4), (7.3, 1.1)),
     plans=(((5.0, 1.0), (8.8, 1.2)),), sent_kbit_s=(700.0, 720.0), arrived_kbit_s=(690.0, 710.0),
 )  # fmt: skip
 ROWS = tuple(TopicRow(topic, 900, 0.01, 20.0, 5.0, 100.0, 180.0) for topic in ("tf", "odom", "scan", "cmd_vel"))
 
 
-def test_kept_trials_are_there_when_a_run_goes_on(tmp_path: Path) -> None:
-    file, asked = tmp_path / "trials.jsonl", TrialSettings(SCENARIOS["edge"]).document()
-    result = replace(RESULT, topics=ROWS, traces=TRACES, rtt_ms=math.nan)
-    kept = KeptTrials(file)
-    assert kept.get(asked) is None
-    kept.put(asked, result)
-    again = KeptTrials(file).get(asked)
-    assert again is not None
-    assert math.isnan(again.rtt_ms)
-    assert replace(again, rtt_ms=1.0) == replace(result, rtt_ms=1.0)
-    for other in (TrialSettings(SCENARIOS["edge"], seed=2), TrialSettings(SCENARIOS["edge"], goals=1)):
-        assert KeptTrials(file).get(other.document()) is None
+# As `lab run navigation --keep` has written it since it was there.
+KEPT = """\
+{"asked":{"scenario":"edge","seed":1,"goals":9,"rtt_s":0.0287,"jitter_s":0.0209,"loss":0.005,"cpu":null,\
+"params":{},"image":""},"result":{"scenario":"edge","seed":1,"completed":true,"contacts":0,"goals":9,\
+"start_s":1.0,"time_s":100.0,"distance_m":41.0,"first_leg_m":4.0,"mean_speed_m_s":0.41,"rtt_ms":null,\
+"robot_cpu":0.1,"service_cpu":0.2,"service_memory_mb":300.0,"message":"The last goal was reached.",\
+"topics":[{"topic":"scan","sent":900,"lost":0.01,"delay_ms":20.0,"jitter_ms":5.0,"period_ms":119.0,\
+"period_p99_ms":180.0}],"robot_memory_mb":null,"on_robot":false,"traces":{"way":[[1.0,1.0],[5.0,1.0]],\
+"goals":[1],"person":[[7.3,3.4]],"plans":[[[5.0,1.0],[8.8,1.2]]],"sent_kbit_s":[700.0],\
+"arrived_kbit_s":[690.0]}}}
+"""
 
 
-def test_a_line_that_a_crash_cut_off_is_done_again_and_any_other_refused(tmp_path: Path) -> None:
-    file = tmp_path / "trials.jsonl"
-    one, two = (TrialSettings(SCENARIOS["edge"], seed=seed).document() for seed in (1, 2))
-    KeptTrials(file).put(one, RESULT)
-    KeptTrials(file).put(two, RESULT)
-    file.write_text(file.read_text()[:-20])
-    kept = KeptTrials(file)
-    assert kept.get(one) is not None
-    assert kept.get(two) is None
-    kept.put(two, RESULT)
-    assert KeptTrials(file).get(two) is not None
-    assert len(file.read_text().splitlines()) == 2
-    file.write_text('{"a": 1}\n')
-    with pytest.raises(ValueError, match="line 1 of"):
-        KeptTrials(file)
+def test_trials_that_were_kept_long_ago_can_be_read(tmp_path: Path) -> None:
+    file, asked = tmp_path / "trials.jsonl", NineGoalsSettings(SCENARIOS["edge"]).document()
+    file.write_text(KEPT)
+    found = KeptTrials(file, NineGoalsResult).get(asked)
+    assert found is not None
+    assert (found.goals, found.first_leg_m, found.traces.goals) == (9, 4.0, (1,))
+    assert found.traces.plans == (((5.0, 1.0), (8.8, 1.2)),)
+    assert found.topics == (TopicRow("scan", 900, 0.01, 20.0, 5.0, 119.0, 180.0),)
+    assert math.isnan(found.rtt_ms)
+    assert found.traces.back_sent_kbit_s == ()
+
+
+def test_what_is_asked_makes_another_trial(tmp_path: Path) -> None:
+    file, edge = tmp_path / "trials.jsonl", SCENARIOS["edge"]
+    KeptTrials(file, NineGoalsResult).put(NineGoalsSettings(edge).document(), RESULT)
+    for other in (NineGoalsSettings(edge, seed=2), NineGoalsSettings(edge, goals=1)):
+        assert KeptTrials(file, NineGoalsResult).get(other.document()) is None
 
 
 @pytest.mark.slow
 def test_figures_are_drawn_also_of_trials_that_lack_things(tmp_path: Path) -> None:
     whole = replace(RESULT, topics=ROWS, traces=TRACES)
-    hit = replace(whole, scenario="embedded", completed=False, topics=(), traces=Traces())
+    hit = replace(whole, scenario="embedded", completed=False, topics=(), traces=NineGoalsTraces())
     files = draw_figures([whole, replace(whole, seed=2), hit], building(), tmp_path / "new")
     assert [file.stem for file in files] == ["fig36-paths", "fig37-throughput", "fig38-loss", "fig39-periods", "times"]
     for file in files:
@@ -142,7 +126,7 @@ def test_figures_are_drawn_also_of_trials_that_lack_things(tmp_path: Path) -> No
 def test_a_run_of_kept_trials_only_prints_their_tables(tmp_path: Path) -> None:
     file = tmp_path / "trials.jsonl"
     settings = replace(SCENARIOS["edge"], params={"delay": {"compensation": "measured"}})
-    KeptTrials(file).put(TrialSettings(settings).document(), replace(RESULT, topics=ROWS))
+    KeptTrials(file, NineGoalsResult).put(NineGoalsSettings(settings).document(), replace(RESULT, topics=ROWS))
     line = ["lab", "run", "navigation", "--scenario", "edge", "--trials", "1", "--keep", str(file)]
     done = CliRunner().invoke(app, line, env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output
@@ -161,7 +145,7 @@ def test_an_unknown_scenario_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_robot_is_driven_to_the_first_goal_by_a_service_of_its_own() -> None:
-    with Trial(TrialSettings(SCENARIOS["commercial"], goals=1)) as trial:
+    with NineGoalsTrial(NineGoalsSettings(SCENARIOS["commercial"], goals=1)) as trial:
         result = trial.drive()
     assert result.completed, result
     assert (result.goals, result.contacts) == (1, 0)
@@ -178,13 +162,13 @@ def test_a_robot_is_driven_to_the_first_goal_by_a_service_of_its_own() -> None:
     # what was under way when the counting began arrives in it: little less or more than what was sent
     assert sum(result.traces.sent_kbit_s) > 0
     assert sum(result.traces.arrived_kbit_s) == pytest.approx(sum(result.traces.sent_kbit_s), rel=0.1)
-    assert TrialResult.of(result.document(traces=True)).traces.way == result.traces.way
+    assert NineGoalsResult.of(result.document(traces=True)).traces.way == result.traces.way
 
 
 @pytest.mark.slow
 def test_on_the_robots_own_computer_the_service_gets_no_more_than_that_has() -> None:
     scarce = replace(SCENARIOS["embedded"], cpu=0.03)  # far less than it needs
-    with Trial(TrialSettings(scarce, goals=1, drive_limit_s=6.0)) as trial:
+    with NineGoalsTrial(NineGoalsSettings(scarce, goals=1, drive_limit_s=6.0)) as trial:
         result = trial.drive()
     assert result.service_cpu < 0.06
     assert not result.completed

@@ -17,7 +17,7 @@ from skytether.api.client import Client
 from skytether.api.rest import Instance, InstanceCreate, RobotCreate, SiteCreate, State
 from skytether.lab.bench.start_robots import ROBOTS, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.lab.nine_goals import SCENARIOS, Trial, TrialSettings
+from skytether.lab.nine_goals import SCENARIOS, NineGoalsSettings, NineGoalsTrial
 from skytether.robot.agent import AgentConfig
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
@@ -41,9 +41,9 @@ def test_a_container_of_it_drives_a_robot_and_compiles_nothing(docker_site: Dock
     (made,) = json.loads(docker_site.docker("image", "inspect", navigation_image))
     assert made["Size"] < 900e6
     assert made["Config"]["User"] == "65532:65532"
-    with Trial(
-        TrialSettings(SCENARIOS["edge"], docker=docker_site.options(), image=navigation_image, goals=1)
-    ) as trial:
+    options = docker_site.options()
+    del options["network"]  # the trial makes its own
+    with NineGoalsTrial(NineGoalsSettings(SCENARIOS["edge"], docker=options, image=navigation_image, goals=1)) as trial:
         result = trial.drive()
         (container,) = docker_site.containers()
         brought, kept = (
@@ -54,6 +54,9 @@ def test_a_container_of_it_drives_a_robot_and_compiles_nothing(docker_site: Dock
     assert result.goals == 1
     assert brought
     assert kept == brought
+    left = docker_site.containers(), docker_site.helpers(), docker_site.volumes_with()
+    assert left == ([], [], [])
+    assert docker_site.docker("network", "ls", "-q", "--filter", f"name=skytether-{docker_site.owner}") == ""
 
 
 def use_docker(operator: Client, site: DockerSite, image: str) -> None:

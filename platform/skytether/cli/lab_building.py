@@ -27,7 +27,7 @@ def building(
     from skytether.api.client import ApiError, Unreachable
     from skytether.lab.building_run import ParamsError, drive, read_params
     from skytether.lab.embedded import EmbeddedError
-    from skytether.lab.nine_goals import TrialError
+    from skytether.lab.trial.rig import TrialError
     from skytether.lab.world.model import WorldError
 
     def tell(now: float, status: Mapping[str, Any]) -> None:

@@ -24,7 +24,8 @@ from skytether.messages import String, Twist, decode
 from skytether.robot.agent import Agent, AgentConfig
 
 from .embedded import EmbeddedOrchestrator
-from .nine_goals import LIMITS, ROBOT, SERVICE, TrialError
+from .nine_goals import LIMITS, ROBOT, SERVICE
+from .trial.rig import TrialError
 from .world.agent import Clockwork, WorldBase, WorldGraph
 from .world.contacts import Contact
 from .world.guide import Guide

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from statistics import fmean, stdev
+from statistics import fmean
 from types import MappingProxyType
 from typing import Any
 
-from .nine_goals_result import TrialResult
+from .nine_goals_result import NineGoalsResult
+from .trial import report
+from .trial.report import Pair
 
 FIGURES = (
     "start_s",
@@ -22,9 +23,7 @@ FIGURES = (
     "service_cpu",
     "service_memory_mb",
 )
-"""Of each trial: fields of `TrialResult`."""
-Pair = tuple[float, float]
-"""Mean and standard deviation."""
+"""Of each trial: fields of `NineGoalsResult`."""
 THESIS: Mapping[str, Mapping[str, Pair]] = MappingProxyType(
     {
         "embedded": {
@@ -73,48 +72,14 @@ PERIODS_MS: Mapping[str, float] = MappingProxyType({"tf": 10.0, "odom": 100.0, "
 """Table 4: of the messages as they are sent."""
 
 
-def summary(results: Sequence[TrialResult]) -> list[dict[str, Any]]:
-    """Each scenario in one row, in the order in which they were run.
-
-    Returns:
-        How many trials, how many of them completed, and of each of `FIGURES` mean and standard deviation over the
-        completed ones; None where there are too few for it.
-    """
-    rows = []
-    for name in dict.fromkeys(result.scenario for result in results):
-        mine = [result for result in results if result.scenario == name]
-        good = [result for result in mine if result.completed]
-        row: dict[str, Any] = {"scenario": name, "trials": len(mine), "completed": len(good)}
-        row["contacts"] = sum(result.contacts for result in mine)
-        for figure in FIGURES:
-            values = [value for one in good if not math.isnan(value := getattr(one, figure))]
-            row[figure] = round(fmean(values), 3) if values else None
-            row[f"{figure}_std"] = round(stdev(values), 3) if len(values) > 1 else None
-        rows.append(row)
-    return rows
+def summary(results: Sequence[NineGoalsResult]) -> list[dict[str, Any]]:
+    """Each scenario in one row, with `FIGURES`; see `skytether.lab.trial.report.summary`."""
+    return report.summary(results, FIGURES)
 
 
-def topics(results: Sequence[TrialResult], names: Sequence[str] = DRAWN_TOPICS) -> list[dict[str, Any]]:
-    """Each topic of each scenario in one row: mean and standard deviation over the completed trials.
-
-    Returns:
-        Of ``lost``, ``delay_ms``, ``jitter_ms``, ``period_ms`` and ``period_p99_ms``, as in `TopicRow`
-        and ``ideal_ms``.
-    """
-    rows = []
-    for name in dict.fromkeys(result.scenario for result in results):
-        good = [result for result in results if result.scenario == name and result.completed]
-        for topic in names:
-            mine = [row for result in good for row in result.topics if row.topic == topic]
-            if not mine:
-                continue
-            line: dict[str, Any] = {"scenario": name, "topic": topic, "ideal_ms": ideal_ms(name, topic)}
-            for figure in ("lost", "delay_ms", "jitter_ms", "period_ms", "period_p99_ms"):
-                values = [value for row in mine if not math.isnan(value := getattr(row, figure))]
-                line[figure] = round(fmean(values), 5) if values else None
-                line[f"{figure}_std"] = round(stdev(values), 5) if len(values) > 1 else None
-            rows.append(line)
-    return rows
+def topics(results: Sequence[NineGoalsResult], names: Sequence[str] = DRAWN_TOPICS) -> list[dict[str, Any]]:
+    """Each topic of each scenario in one row; see `skytether.lab.trial.report.topics`."""
+    return report.topics(results, names, ideal_ms)
 
 
 def ideal_ms(scenario: str, topic: str) -> float | None:
@@ -122,28 +87,7 @@ def ideal_ms(scenario: str, topic: str) -> float | None:
     return 1000 / 6 if (scenario, topic) == ("embedded", "cmd_vel") else PERIODS_MS.get(topic)
 
 
-def devices(row: Mapping[str, Any], *, on_robot: bool) -> list[tuple[str, Pair, Pair]]:
-    """Table 7 of one row of `summary`: of each device its processors in use [% of one], and memory [MB].
-
-    Where the service runs on the robot, both are one device. NaN where there are too few trials.
-    """
-    cpu = {side: _pair_of(row, f"{side}_cpu", 100) for side in ("robot", "service")}
-    memory = {side: _pair_of(row, f"{side}_memory_mb") for side in ("robot", "service")}
-    if not on_robot:
-        return [(side, cpu[side], memory[side]) for side in ("robot", "service")]
-    both = [
-        (parts["robot"][0] + parts["service"][0], math.hypot(parts["robot"][1], parts["service"][1]))
-        for parts in (cpu, memory)
-    ]
-    return [("robot", both[0], both[1])]
-
-
-def _pair_of(row: Mapping[str, Any], name: str, factor: float = 1.0) -> Pair:
-    mean, deviation = row[name], row[f"{name}_std"]
-    return tuple(math.nan if value is None else factor * value for value in (mean, deviation))  # type: ignore[return-value]
-
-
-def compare_times(results: Sequence[TrialResult], baseline: str) -> list[dict[str, Any]]:
+def compare_times(results: Sequence[NineGoalsResult], baseline: str) -> list[dict[str, Any]]:
     """Student's t-test of the completion times against those of one scenario (thesis, section 4.3.5).
 
     Returns:
