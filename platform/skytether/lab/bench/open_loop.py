@@ -11,7 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
@@ -46,7 +46,7 @@ class Answered:
 
     @property
     def good(self) -> bool:
-        return 200 <= self.status < 300
+        return is_good(self.status)
 
 
 def ask_openly(
@@ -55,35 +55,53 @@ def ask_openly(
     """Ask at random times, ``rate_hz`` a second on average; gives back when all are answered."""
     address = urlsplit(url)
     idle: queue.SimpleQueue[http.client.HTTPConnection] = queue.SimpleQueue()
+    """Used in turn, so that none is quiet for so long that it is closed."""
     for _ in range(_THREADS):
         idle.put(http.client.HTTPConnection(address.hostname or "", address.port, timeout=_TIMEOUT_S))
-    done: list[Answered] = []
+    due_now: queue.SimpleQueue[tuple[Request, float] | None] = queue.SimpleQueue()
+    # No object for each answer until all are there: of hundreds of thousands Python's collector takes up to a second,
+    # in which this client reads no answer, and would call the others late.
+    kinds: list[str] = []
+    took: list[float] = []
+    statuses: list[int] = []
     lock = threading.Lock()
 
-    def one(request: Request, due: float) -> None:
-        connection = idle.get()
-        status, body = ask(connection, request)
-        answered = Answered(request.kind, time.monotonic() - due, status)
-        idle.put(connection)
-        if answered.good:
-            request.then(body)
-        with lock:
-            done.append(answered)
+    def serve() -> None:
+        while (one := due_now.get()) is not None:
+            request, due = one
+            connection = idle.get()
+            status, body = ask(connection, request)
+            seconds = time.monotonic() - due
+            idle.put(connection)
+            if is_good(status):
+                request.then(body)
+            with lock:
+                kinds.append(request.kind)
+                took.append(seconds)
+                statuses.append(status)
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        due = time.monotonic()
-        under_way = []
-        for gap in rng.exponential(1 / rate_hz, round(rate_hz * seconds)):
-            due += gap
-            request = next_request()
-            time.sleep(max(0.0, due - time.monotonic()))
-            under_way.append(pool.submit(one, request, due))
-        wait(under_way)
+        serving = [pool.submit(serve) for _ in range(_THREADS)]
+        try:
+            due = time.monotonic()
+            for gap in rng.exponential(1 / rate_hz, round(rate_hz * seconds)):
+                due += gap
+                request = next_request()
+                time.sleep(max(0.0, due - time.monotonic()))
+                due_now.put((request, due))
+        finally:
+            for _ in serving:
+                due_now.put(None)
     while not idle.empty():
         idle.get().close()
-    for future in under_way:
-        future.result()
-    return done
+    for one in serving:
+        one.result()
+    return [Answered(*one) for one in zip(kinds, took, statuses, strict=True)]
+
+
+def is_good(status: int) -> bool:
+    """Whether an answer is one."""
+    return 200 <= status < 300
 
 
 def ask(connection: http.client.HTTPConnection, request: Request) -> tuple[int, bytes]:
