@@ -27,7 +27,7 @@ class Background:
         since = self._seen.get(_square(place))
         return since is not None and now - since[0] > stood and now - since[1] <= _FORGOTTEN
 
-    def look(self, points: NDArray[np.float64], now: float) -> None:
+    def add(self, points: NDArray[np.float64], now: float) -> None:
         """Take all points of a scan, n by (x, y) [m, frame that does not move]."""
         if now - self._tidied_at > _FORGOTTEN or now < self._tidied_at or len(self._seen) > _MOST:
             self._tidied_at = now

@@ -154,7 +154,7 @@ class Person:
         self.state = move @ self.state
         self.covariance = move @ self.covariance @ move.T + noise
 
-    def look(self, legs: Floats, full: bool, now: float, laser: tuple[float, float]) -> None:
+    def update(self, legs: Floats, full: bool, now: float, laser: tuple[float, float]) -> None:
         """Take what a scan showed of it.
 
         Args:

@@ -25,7 +25,7 @@ from .follower import Follower, Report, Scan
 from .params import Params
 
 _STEP_HZ = 60.0
-"""How often is looked what came: a picture waits 8 ms on average."""
+"""How often is looked what came."""
 _TOLD_HZ = 2.0
 _EARLY = 0.8
 """A picture that comes after this share of the period of `Params.face_rate` is looked at: pictures come unevenly."""
@@ -64,7 +64,7 @@ class FollowInFront(Service[Params]):
         self._frames = Frames()
         self._odom_frame, self._base_frame = "odom", "base_link"
         self._delay = 0.0
-        self._errors = {"scan": math.inf, "picture": math.inf}
+        self._errors = {"scan": 0.0, "picture": 0.0}
         self._commands, self._tells = Rate(params.rate), Rate(_TOLD_HZ)
         self._looked_at = -math.inf
         self._told = ""
@@ -77,17 +77,17 @@ class FollowInFront(Service[Params]):
             self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
             self._tell(self._follower.report, now)
         # After the command, which is of this moment: a picture takes some milliseconds, or a stalled machine seconds.
-        self._look(now)
+        self._take_picture(now)
 
     def _listen(self, now: float) -> None:
         """Hand what the robot measured on, but for pictures."""
         if tf := self.tf.take():
-            self._note(tf)
+            self._note_delay(tf)
             self._frames.hear(tf.message)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
                 self._follower.odometry(found[1], found[0], _made_at(tf), now)
         if odom := self.odom.take():
-            self._note(odom)
+            self._note_delay(odom)
             message = odom.message
             self._odom_frame = message.header.frame_id or self._odom_frame
             self._base_frame = message.child_frame_id or self._base_frame
@@ -96,16 +96,16 @@ class FollowInFront(Service[Params]):
             self._follower.odometry(message.header.stamp.seconds(), pose, _made_at(odom), now)
         if scan := self.scan.take():
             self._errors["scan"] = scan.sent_at_error
-            self._see(scan, now)
+            self._take_scan(scan, now)
 
-    def _look(self, now: float) -> None:
+    def _take_picture(self, now: float) -> None:
         """Look at a picture, if one came and is due."""
         if (picture := self.picture.take()) and now - self._looked_at >= _EARLY / self.params.face_rate:
             self._looked_at = now
             self._errors["picture"] = picture.sent_at_error
             self._follower.picture(picture.message.data.tobytes(), _made_at(picture), now)
 
-    def _see(self, received: Received[LaserScan], now: float) -> None:
+    def _take_scan(self, received: Received[LaserScan], now: float) -> None:
         scan, laser = received.message, self.params.laser
         found = self._frames.lookup(self._base_frame, scan.header.frame_id) if laser is None else (laser.pose, 0.0)
         self._follower.laser_unknown = found is None
@@ -115,7 +115,7 @@ class FollowInFront(Service[Params]):
         stamp, at = scan.header.stamp.seconds(), _made_at(received)
         self._follower.scan(Scan(stamp, at, scan.ranges, scan.angle_min, scan.angle_increment, limits, found[0]), now)
 
-    def _note(self, message: Received[TFMessage] | Received[Odometry]) -> None:
+    def _note_delay(self, message: Received[TFMessage] | Received[Odometry]) -> None:
         """Learn how long messages take. Those to the robot take as long, as far as a service can know."""
         taken = message.received_at - message.sent_at
         if math.isfinite(message.sent_at_error) and 0 <= taken < _LONGEST_DELAY:

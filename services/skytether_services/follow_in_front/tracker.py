@@ -140,7 +140,7 @@ class PeopleTracker:
         self._tracks = [person for person in self._tracks if not self._is_a_leg_of_another(person, now)]
         new = np.flatnonzero(~both & ~stand).tolist()
         self._find(legs, [leg for leg in new if leg not in taken], now)
-        self._background.look(rays.points @ turn + (x, y), now)
+        self._background.add(rays.points @ turn + (x, y), now)
         return self.people
 
     def _give(
@@ -162,7 +162,7 @@ class PeopleTracker:
         given: set[int] = set()
         for person, mine in zip(tracks, assign(places, spreads, known, legs, both, impossible), strict=True):
             full = len(mine) == 2 or (len(mine) == 1 and bool(both[mine[0]]))
-            person.look(legs[mine], full, now, laser)
+            person.update(legs[mine], full, now, laser)
             given.update(mine)
         return given
 

@@ -24,7 +24,7 @@ def person(
         found.walks = True
     else:
         for scan in range(10):  # both legs, always there
-            found.look(np.array([(x, y - 0.12), (x, y + 0.12)]), True, 0.1 * scan, (0.0, 0.0))
+            found.update(np.array([(x, y - 0.12), (x, y + 0.12)]), True, 0.1 * scan, (0.0, 0.0))
     return found
 
 

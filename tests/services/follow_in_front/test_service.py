@@ -188,3 +188,13 @@ def test_a_robot_that_stands_is_never_said_to_follow(following: Scene) -> None:
         following.run(1 / 60)
         assert (following.status["state"] == "standing") <= (following.status["code"] != "following")
     assert following.status["operators"] == 2
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_camera_that_never_sent_anything_is_silent() -> None:
+    found = scene()
+    found.picture = None
+    found.run(0.8)
+    assert found.status["code"] == "no_operator"
+    found.run(2.5)
+    assert found.status["code"] == "camera_silent"
