@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from skytether.orchestrator.runtimes.docker import follow
 from skytether.orchestrator.runtimes.docker.follow import Follower
 from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER
 
@@ -27,6 +29,9 @@ class Stream:
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return iter(self._queue.get, None)
+
+    def tell(self, action: str, container: str) -> None:
+        self._queue.put({"Action": action, "Actor": {"ID": container}})
 
     def close(self) -> None:
         self._queue.put(None)
@@ -149,3 +154,56 @@ def test_what_a_silent_stream_has_not_told_is_found_by_the_next_list_and_only_th
         assert time.monotonic() < end
         time.sleep(0.005)
     assert looks == ["c1", "c1"]
+
+
+def test_what_a_container_does_all_the_time_keeps_nobody_from_seeing_the_others(
+    engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One whose processes run out of memory all the time: the end of another was not seen in half a minute."""
+    looks = Counter[str]()
+    inspect = engine.inspect_container
+
+    def inspected(container: str) -> dict[str, Any]:
+        looks[container] += 1
+        time.sleep(0.005)
+        found = {**inspect(container), "Id": container}
+        found["State"]["OOMKilled"] = looks[container] > 2
+        return found
+
+    monkeypatch.setattr(engine, "inspect_container", inspected)
+    monkeypatch.setattr(follow, "_AT_WILL_S", 0.2)
+    engine.ready.set()
+    follower.start()
+    follower.seen(PATIENCE)
+    end = time.monotonic() + PATIENCE
+    while not engine.streams:
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    for _ in range(1000):
+        engine.streams[0].tell("oom", "c1")
+        engine.streams[0].tell("health_status: unhealthy", "c1")
+    before = looks["c1"]
+    engine.streams[0].tell("die", "c2")
+    while not looks["c2"]:
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    assert looks["c1"] - before <= 3
+    while not next(seen for seen in follower.seen(PATIENCE) if seen.id == "c1").out_of_memory:
+        assert time.monotonic() < end, "and the last of it is seen, too"
+        time.sleep(0.005)
+
+
+def test_all_are_listed_now_and_then_though_events_never_cease(
+    engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An engine drops events that are not taken soon, and a stream that is never silent was never begun anew."""
+    monkeypatch.setattr(follow, "_LIST_S", 0.1)
+    engine.ready.set()
+    follower.start()
+    follower.seen(PATIENCE)
+    end = time.monotonic() + PATIENCE
+    while len(engine.streams) < 3:
+        assert time.monotonic() < end
+        for stream in engine.streams[-1:]:
+            stream.tell("exec_start", "c1")
+        time.sleep(0.02)

@@ -41,9 +41,15 @@ _REMEMBERED = 256
 """Containers that are gone of which it is known: a look that was begun before need not find them again."""
 _TAIL = 20
 """Lines of a log among which the last one that can be read is looked for."""
-_TOLD = frozenset({"create", "start", "die", "oom", "pause", "unpause", "stop", "restart", "rename", "update"})
-"""Events after which a container is looked at; ``health_status`` comes with a colon and more. Each check of its health
-brings three others, and each file that is handed over one."""
+_TOLD = frozenset({"create", "start", "die", "pause", "unpause", "stop", "restart", "rename", "update"})
+"""Events after which a container is looked at. Each check of its health brings three others, and each file that is
+handed over one."""
+_AT_WILL = ("oom", "health_status")
+"""Events that what runs in a container can bring about as often as it likes; the second comes with a colon and more."""
+_AT_WILL_S = 1.0
+"""Between two looks at a container because of such ones: with all of them nobody would get round to the others."""
+_LIST_S = 30.0
+"""After which all are listed again, though events come all the time: an engine drops those that are not taken soon."""
 
 
 class Follower:
@@ -59,6 +65,8 @@ class Follower:
         self._seen: dict[str, Seen] = {}
         self._helpers: dict[str, Helper] = {}
         self._awaited: set[str] = set()
+        self._at_will: dict[str, bool] = {}
+        """Containers that were looked at a moment ago because of `_AT_WILL`, and whether there was more of it since."""
         self._turns = count()
         self._shown: dict[str, int] = {}
         """By container, the turn of the look that is shown: one that was begun before that is late."""
@@ -275,15 +283,37 @@ class Follower:
         return [container for container in there if listed[container] != seen.get(container)]
 
     def _read_events(self) -> None:
+        until = time.monotonic() + _LIST_S
         with suppress(urllib3.exceptions.HTTPError, OSError, ValueError, AttributeError):  # ended, or silent too long
             for event in self._stream or ():
-                if self._closing.is_set():
+                if self._closing.is_set() or time.monotonic() > until:
                     return
                 action, container = str(event.get("Action", "")), event.get("Actor", {}).get("ID", "")
                 if action == "destroy":
                     self.forget(container)
-                elif action in _TOLD or action.startswith("health_status"):
+                elif action in _TOLD:
                     self.look(container)
+                elif action.startswith(_AT_WILL):
+                    self._look_now_and_then(container)
+
+    def _look_now_and_then(self, container: str) -> None:
+        """At once, unless that was done a moment ago: then in a moment, once, however many events come till then."""
+        with self._lock:
+            if container in self._at_will:
+                self._at_will[container] = True
+                return
+            self._at_will[container] = False
+        again = threading.Timer(_AT_WILL_S, self._look_again, (container,))
+        again.daemon = True
+        again.start()
+        self.look(container)
+
+    def _look_again(self, container: str) -> None:
+        with self._lock:
+            more = self._at_will.pop(container, False)
+        if more and not self._closing.is_set():
+            with suppress(RuntimeFailure):  # the next list says so, too
+                self._look_now_and_then(container)
 
     def _end_stream(self) -> None:
         stream, self._stream = self._stream, None
