@@ -1,14 +1,16 @@
 """A program that is stopped whenever it has had its share of the processor."""
 
+import _thread
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import psutil
 import pytest
 
-from skytether.lab.throttle import Budget, Throttle, children_of, cpu_time
+from skytether.lab.throttle import Budget, Throttle, children_of, cpu_time, native_threads_time
 
 
 def test_a_budget_flows_in_evenly_and_is_spent_in_bursts() -> None:
@@ -62,3 +64,26 @@ def test_a_busy_program_gets_its_share_and_goes_on_afterwards() -> None:
     finally:
         busy.kill()
         busy.wait()
+
+
+def test_only_threads_that_are_not_pythons_count_as_native() -> None:
+    spun, over = threading.Semaphore(0), threading.Event()
+
+    def spin() -> None:
+        end = time.thread_time() + 0.05
+        while time.thread_time() < end:
+            pass
+        spun.release()
+        over.wait()
+
+    before = native_threads_time()
+    thread = threading.Thread(target=spin)
+    thread.start()
+    assert spun.acquire(timeout=10)
+    between = native_threads_time()
+    assert between - before < 0.03
+    _thread.start_new_thread(spin, ())  # none that `threading` knows, as a library's is none
+    assert spun.acquire(timeout=10)
+    assert native_threads_time() - between == pytest.approx(0.05, abs=0.03)
+    over.set()
+    thread.join()

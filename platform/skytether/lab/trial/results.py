@@ -89,6 +89,8 @@ class Measured:
         topics: Of each topic `TopicRow`.
         robot_memory_mb: Of agent and bridge, and of the simulation, which has the most of it, at the end.
         on_robot: The service ran on the robot, too.
+        held_up_s: Time that the world stood still, for the machine was busy with other things [s]. What was measured
+            with much of it says little.
     """
 
     scenario: str
@@ -106,6 +108,7 @@ class Measured:
     topics: tuple[TopicRow, ...]
     robot_memory_mb: float = math.nan
     on_robot: bool = False
+    held_up_s: float = math.nan
 
     def shared(self) -> dict[str, Any]:
         """These fields, for the result of one experiment, which has more of them."""

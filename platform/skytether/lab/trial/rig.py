@@ -198,6 +198,7 @@ class Drive:
         self._robot = rig.world.robots[0]
         self.tracker = Tracker(self._robot, rig.network.counters)
         self._begun, self._from_m = time.monotonic(), self._robot.distance
+        self._world_s = rig.world.time
         self._spent, self._used = rig.spent(), self._cpu_of_service()
 
     def passes(self) -> Iterator[float]:
@@ -230,6 +231,7 @@ class Drive:
             topics=tuple(TopicRow.of(topic) for topic in topics if topic.sent),
             robot_memory_mb=psutil.Process().memory_info().rss / 1e6,
             on_robot=settings.scenario.cpu is not None,
+            held_up_s=max(0.0, took - (rig.world.time - self._world_s)),
         )
 
     def _cpu_of_service(self) -> float:
