@@ -94,12 +94,13 @@ def test_figures_are_drawn_also_of_trials_that_lack_things(tmp_path: Path) -> No
         draw_figures([], tmp_path)
 
 
-def test_a_run_of_kept_trials_only_prints_their_tables(tmp_path: Path) -> None:
+def test_a_run_of_kept_trials_only_prints_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "_width", 200)  # whatever the environment said when it was made
     file = tmp_path / "trials.jsonl"
     settings = replace(SCENARIOS["edge"], params={"predict": True})
     KeptTrials(file, FollowResult).put(FollowSettings(settings).document(), RESULT)
     line = ["lab", "run", "follow-in-front", "--scenario", "edge", "--trials", "1", "--keep", str(file)]
-    done = CliRunner().invoke(app, line, env={"COLUMNS": "200"})
+    done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, done.output
     assert "edge, seed 1: completed, KTE 0.110 m, 50.0 s (kept)" in done.output
     for words in ("0.154 ± 0.0029", "Table 3", "Figs. 32 and 33", "usb_cam/image_raw/compressed", "4.54"):
