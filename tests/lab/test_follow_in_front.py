@@ -10,6 +10,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from skytether.cli.app import app
+from skytether.cli.output import console
 from skytether.lab.follow_in_front import NAMES, SCENARIOS, FollowSettings, FollowTrial, sonar_cloud
 from skytether.lab.follow_in_front_figures import draw_figures
 from skytether.lab.follow_in_front_report import DRAWN_TOPICS, PERIODS_MS, SONAR, THESIS, summary, topics
