@@ -63,6 +63,7 @@ TOGETHER = (
     "orchestrator/test_docker_orchestrated.py",
     "orchestrator/test_faults.py",
     "orchestrator/test_faults_engine.py",
+    "orchestrator/test_follow_image.py",
     "orchestrator/test_images.py",
     "orchestrator/test_left_behind.py",
     "orchestrator/test_migrations.py",
