@@ -17,7 +17,7 @@ from skytether.messages import (
     yaw_of,
 )
 from skytether.service import ConfigError, Input, Output, Rate, Received, Service
-from skytether_services.planar.frames import Frames
+from skytether_services.planar.frames import MOST_BYTES, Frames
 from skytether_services.planar.geometry import Pose
 
 from .face_tracker import FaceTracker
@@ -33,8 +33,6 @@ _SMOOTH = 0.1
 """Weight of a new delay in the mean of those before."""
 _LASTS = 0.5
 """What lasts for so long [s] is reported."""
-_MOST_TF = 200_000
-"""Bytes of a message of `tf`: 2,000 frames, which take 30 ms to read."""
 _LONGEST_DELAY = 10.0
 """A message that seems to have been on its way for longer was of another clock, s."""
 
@@ -44,7 +42,7 @@ class FollowInFront(Service[Params]):
 
     rate_hz = _STEP_HZ
 
-    tf = Input(TFMessage, max_bytes=_MOST_TF)
+    tf = Input(TFMessage, max_bytes=MOST_BYTES)
     picture = Input(CompressedImage, "usb_cam/image_raw/compressed")
     scan = Input(LaserScan)
     odom = Input(Odometry, "RosAria/pose")

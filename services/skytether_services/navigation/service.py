@@ -34,7 +34,7 @@ from skytether.messages import (
 )
 from skytether.messages import Path as PathMessage
 from skytether.service import Action, ConfigError, Input, Output, Rate, Received, Service, answers
-from skytether_services.planar.frames import Frames
+from skytether_services.planar.frames import MOST_BYTES, Frames
 
 from . import conversions as convert
 from .action_goals import ActionGoals
@@ -64,7 +64,7 @@ PARTICLES = 200
 class Navigation(Service[Params]):
     """Drives a robot to goals on a map."""
 
-    tf = Input(TFMessage)
+    tf = Input(TFMessage, max_bytes=MOST_BYTES)
     odom = Input(Odometry)
     scan = Input(LaserScan)
     map = Input(OccupancyGrid)

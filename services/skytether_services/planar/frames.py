@@ -12,6 +12,8 @@ from .transforms import compose
 
 MAX_FRAMES = 500
 """Of one robot; what comes beyond is left out."""
+MOST_BYTES = 200_000
+"""Of a message of `tf`: 2,000 frames, which take 30 ms to read. A service takes no larger ones."""
 _DEEPEST = 20
 """Frames between two that are asked for; more, or a circle, is no answer."""
 

@@ -158,6 +158,15 @@ def test_what_is_missing_is_told_one_after_the_other(tmp_path: FilePath) -> None
     assert harness.newest("cmd_vel") == Twist()
 
 
+def test_a_tf_message_of_a_hundred_thousand_frames_is_not_read(tmp_path: FilePath) -> None:
+    """It would take seconds, in which no velocity comes."""
+    harness = served(tmp_path)
+    one = TransformStamped(Header(Time(), "odom"), "base_link", Transform())
+    harness.send("tf", TFMessage((one,) * 3000))
+    harness.step()
+    assert harness.service.tf.undecodable == 1
+
+
 def sense_odometry_only(harness: Harness[Navigation]) -> None:
     harness.send("odom", Odometry(Header(Time.from_seconds(harness.now), "odom"), "base_link"))
 
