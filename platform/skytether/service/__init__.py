@@ -5,12 +5,13 @@ Everything that knows of sockets, sessions or the orchestrator is behind it; a s
 """
 
 from .calls import Caller
+from .delay import MeanDelay
 from .errors import CallError, ConfigError, ServiceError
 from .goals import ActionServer, Goal, GoalError
-from .mailbox import Arrived, RawReceived, Received
+from .mailbox import RawReceived, Received
 from .main import run
 from .params import NoParams, param
-from .rate import Rate
+from .rate import Lasting, Rate
 from .service import Context, Service, params_schema
 from .topics import Action, AnyInput, Call, Input, Output, answers
 
@@ -18,7 +19,6 @@ __all__ = [
     "Action",
     "ActionServer",
     "AnyInput",
-    "Arrived",
     "Call",
     "CallError",
     "Caller",
@@ -27,6 +27,8 @@ __all__ = [
     "Goal",
     "GoalError",
     "Input",
+    "Lasting",
+    "MeanDelay",
     "NoParams",
     "Output",
     "Rate",

@@ -32,6 +32,15 @@ class Arrived:
     sent_at_error: float
     received_at: float
 
+    @property
+    def made_at(self) -> float:
+        """When it was published, or arrived as long as the robot's clock is not known; never later than it arrived.
+
+        What pretends to be of the future would be new for ever.
+        """
+        known = math.isfinite(self.sent_at_error)
+        return min(self.sent_at, self.received_at) if known else self.received_at
+
     def age(self, now: float) -> float:
         """Seconds since it was published; since it arrived as long as the robot's clock is not known."""
         return now - (self.sent_at if math.isfinite(self.sent_at_error) else self.received_at)

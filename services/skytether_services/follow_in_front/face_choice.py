@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from enum import StrEnum
 
 from .face_tracker import Face
+from .operator import OVER_LEGS
 
-_BESIDE = math.radians(14)
-"""A face is this near to the direction of its legs: 0.2 m at 0.8 m, as far as one leans."""
 _NEXT = math.radians(25)
 """A second face that is not further from it than this may be theirs as well: legs are seen less exactly when one
 hides the other."""
@@ -39,15 +38,13 @@ def choose(faces: Sequence[Face], legs: float | None) -> tuple[Face | None, Face
         legs: Where the operator's legs are off straight back, positive to the robot's left [rad]; None: not known.
     """
     if legs is None:
-        return (faces[0], FaceChoice.SEEN) if len(faces) == 1 else (None, _none(faces))
+        if len(faces) == 1:
+            return faces[0], FaceChoice.SEEN
+        return None, FaceChoice.SEVERAL if faces else FaceChoice.NONE
     near = [face for face in faces if abs(face.bearing - legs) <= _NEXT]
     near.sort(key=lambda face: -face.size)
     if len(near) > 1 and near[1].size > _BEHIND * near[0].size:
         return None, FaceChoice.SEVERAL
-    if not near or abs(near[0].bearing - legs) > _BESIDE:
+    if not near or abs(near[0].bearing - legs) > OVER_LEGS:
         return None, FaceChoice.NONE
     return near[0], FaceChoice.SEEN
-
-
-def _none(faces: Sequence[Face]) -> FaceChoice:
-    return FaceChoice.SEVERAL if faces else FaceChoice.NONE

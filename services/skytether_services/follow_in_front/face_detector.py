@@ -22,7 +22,7 @@ _LEAST_SCORE = 0.5
 _SAME = 0.3
 """Boxes that overlap by more than this (intersection over union) are of one face."""
 _STEEPEST = 80.0
-"""Of a score before the logistic function; more overflows."""
+"""Of a network's answer before the logistic function; more overflows."""
 
 
 class Box(NamedTuple):
@@ -44,6 +44,12 @@ def load_network(name: str) -> Any:
     network = Interpreter(model_content=model.read_bytes(), num_threads=1)
     network.allocate_tensors()
     return network
+
+
+def sureness(answers: Floats) -> NDArray[np.floating]:
+    """Of a network's answers to "is it a face", 0 to 1."""
+    sure: NDArray[np.floating] = 1 / (1 + np.exp(-np.clip(answers, -_STEEPEST, _STEEPEST)))
+    return sure
 
 
 class FaceDetector:
@@ -75,7 +81,7 @@ class FaceDetector:
         self._network.set_tensor(self._input, seen[None])
         self._network.invoke()
         boxes, scores = (self._network.get_tensor(output)[0] for output in self._outputs)
-        scores = 1 / (1 + np.exp(-np.clip(scores[:, 0], -_STEEPEST, _STEEPEST)))
+        scores = sureness(scores[:, 0])
         likely = scores >= _LEAST_SCORE
         values = boxes[likely].reshape(-1, 8, 2) / _SIDE
         values[:, 0] += self._anchors[likely]
@@ -90,7 +96,7 @@ def _grid(side: int, boxes: int) -> Floats:
     return np.repeat(middles, boxes, axis=0)
 
 
-def _merged(values: Floats, scores: Floats) -> list[tuple[Floats, float]]:
+def _merged(values: Floats, scores: NDArray[np.floating]) -> list[tuple[Floats, float]]:
     """One of each heap of boxes that overlap: their mean, weighted by their scores."""
     found: list[tuple[Floats, float]] = []
     left = np.argsort(-scores)

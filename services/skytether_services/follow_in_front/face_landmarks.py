@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .face_detector import Box, load_network
+from .face_detector import Box, load_network, sureness
 
 Floats = NDArray[np.float64]
 
 _SIDE = 192
 _ROOM = 1.5
 """What the network sees is a square of so many times the longer side of the face."""
-_STEEPEST = 80.0
-"""Of a score before the logistic function; more overflows."""
 _EYES = (33, 263)
 """Outer corners of the person's right and left eye."""
 
@@ -69,9 +67,9 @@ class FaceMesh:
         self._network.set_tensor(self._input, (np.asarray(seen, np.float32) / 255)[None])
         self._network.invoke()
         points = self._network.get_tensor(self._points).reshape(-1, 3).astype(np.float64)
-        logit = float(self._network.get_tensor(self._score).ravel()[0])
+        score = float(sureness(self._network.get_tensor(self._score)).ravel()[0])
         place = np.empty_like(points)
         place[:, 0] = x0 + along * points[:, 0] - across * points[:, 1]
         place[:, 1] = y0 + across * points[:, 0] + along * points[:, 1]
         place[:, 2] = scale * points[:, 2]
-        return Landmarks(place, 1 / (1 + math.exp(-min(max(logit, -_STEEPEST), _STEEPEST))))
+        return Landmarks(place, score)

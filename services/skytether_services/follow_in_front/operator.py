@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from .person import Person
 
+OVER_LEGS = math.radians(14)
+"""A face is this near to the direction of its legs: 0.2 m at 0.8 m, as far as one leans."""
+
 
 class Choice(StrEnum):
     """How it stands with the operator.
@@ -79,7 +82,7 @@ class OperatorParams:
     gone: float = 3.5
     again: float = 0.6
     memory: float = 2.0
-    under: float = math.radians(14)
+    under: float = OVER_LEGS
     close: float = 0.45
     close_hidden: float = 0.65
     close_scans: int = 2

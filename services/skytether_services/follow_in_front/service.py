@@ -16,7 +16,7 @@ from skytether.messages import (
     Vector3,
     yaw_of,
 )
-from skytether.service import ConfigError, Input, Output, Rate, Received, Service
+from skytether.service import ConfigError, Input, Lasting, MeanDelay, Output, Rate, Received, Service
 from skytether_services.planar.frames import MOST_BYTES, Frames
 from skytether_services.planar.geometry import Pose
 
@@ -29,12 +29,8 @@ _STEP_HZ = 60.0
 _TOLD_HZ = 2.0
 _EARLY = 0.8
 """A picture that comes after this share of the period of `Params.face_rate` is looked at: pictures come unevenly."""
-_SMOOTH = 0.1
-"""Weight of a new delay in the mean of those before."""
 _LASTS = 0.5
 """What lasts for so long [s] is reported."""
-_LONGEST_DELAY = 10.0
-"""A message that seems to have been on its way for longer was of another clock, s."""
 
 
 class FollowInFront(Service[Params]):
@@ -61,17 +57,17 @@ class FollowInFront(Service[Params]):
             raise ConfigError(str(error)) from error
         self._frames = Frames()
         self._odom_frame, self._base_frame = "odom", "base_link"
-        self._delay = 0.0
+        self._delay = MeanDelay()
         self._errors = {"scan": 0.0, "picture": 0.0}
         self._commands, self._tells = Rate(params.rate), Rate(_TOLD_HZ)
         self._looked_at = -math.inf
         self._told = ""
-        self._new, self._new_at = "", math.inf
+        self._lasting = Lasting()
 
     def step(self, now: float) -> None:
         self._listen(now)
         if self._commands.due(now):
-            velocity = self._follower.step(now, self._delay, max(self._errors.values()))
+            velocity = self._follower.step(now, self._delay.seconds, max(self._errors.values()))
             self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
             self._tell(self._follower.report, now)
         # After the command, which is of this moment: a picture takes some milliseconds, or a stalled machine seconds.
@@ -80,18 +76,18 @@ class FollowInFront(Service[Params]):
     def _listen(self, now: float) -> None:
         """Hand what the robot measured on, but for pictures."""
         if tf := self.tf.take():
-            self._note_delay(tf)
+            self._delay.note(tf)
             self._frames.hear(tf.message)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
-                self._follower.odometry(found[1], found[0], _made_at(tf), now)
+                self._follower.odometry(found[1], found[0], tf.made_at, now)
         if odom := self.odom.take():
-            self._note_delay(odom)
+            self._delay.note(odom)
             message = odom.message
             self._odom_frame = message.header.frame_id or self._odom_frame
             self._base_frame = message.child_frame_id or self._base_frame
             at = message.pose.pose
             pose = Pose(at.position.x, at.position.y, yaw_of(at.orientation))
-            self._follower.odometry(message.header.stamp.seconds(), pose, _made_at(odom), now)
+            self._follower.odometry(message.header.stamp.seconds(), pose, odom.made_at, now)
         if scan := self.scan.take():
             self._errors["scan"] = scan.sent_at_error
             self._take_scan(scan, now)
@@ -101,7 +97,7 @@ class FollowInFront(Service[Params]):
         if (picture := self.picture.take()) and now - self._looked_at >= _EARLY / self.params.face_rate:
             self._looked_at = now
             self._errors["picture"] = picture.sent_at_error
-            self._follower.picture(picture.message.data.tobytes(), _made_at(picture), now)
+            self._follower.picture(picture.message.data.tobytes(), picture.made_at, now)
 
     def _take_scan(self, received: Received[LaserScan], now: float) -> None:
         scan, laser = received.message, self.params.laser
@@ -110,35 +106,15 @@ class FollowInFront(Service[Params]):
         if found is None:
             return
         limits = (scan.range_min, scan.range_max)
-        stamp, at = scan.header.stamp.seconds(), _made_at(received)
+        stamp, at = scan.header.stamp.seconds(), received.made_at
         self._follower.scan(Scan(stamp, at, scan.ranges, scan.angle_min, scan.angle_increment, limits, found[0]), now)
 
-    def _note_delay(self, message: Received[TFMessage] | Received[Odometry]) -> None:
-        """Learn how long messages take. Those to the robot take as long, as far as a service can know."""
-        taken = message.received_at - message.sent_at
-        if math.isfinite(message.sent_at_error) and 0 <= taken < _LONGEST_DELAY:
-            self._delay += _SMOOTH * (taken - self._delay)
-
     def _tell(self, report: Report, now: float) -> None:
-        if report.code != self._new:
-            self._new, self._new_at = report.code, now
-        if now - self._new_at >= _LASTS:
-            self._new_at = math.inf
+        if self._lasting.due(report.code, now, _LASTS):
             self.report(report.code, report.message)
         if report.code != self._told or self._tells.due(now):
             self._told = report.code
             self.status.publish(String(json.dumps(_document(report))))
-
-
-def _made_at(
-    received: Received[TFMessage] | Received[Odometry] | Received[LaserScan] | Received[CompressedImage],
-) -> float:
-    """When something was measured, by this machine's clock [s]; when it came, as long as the robot's is not known.
-
-    Never later than it came: what pretends to be of the future would be new for ever.
-    """
-    known = math.isfinite(received.sent_at_error)
-    return min(received.sent_at, received.received_at) if known else received.received_at
 
 
 def _document(report: Report) -> dict[str, object]:

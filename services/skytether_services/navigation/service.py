@@ -33,7 +33,7 @@ from skytether.messages import (
     Vector3,
 )
 from skytether.messages import Path as PathMessage
-from skytether.service import Action, ConfigError, Input, Output, Rate, Received, Service, answers
+from skytether.service import Action, ConfigError, Input, Lasting, MeanDelay, Output, Rate, Received, Service, answers
 from skytether_services.planar.frames import MOST_BYTES, Frames
 
 from . import conversions as convert
@@ -51,8 +51,6 @@ from .zones import Mask
 if TYPE_CHECKING:
     from .mapping_mode import MappingMode
 
-_SMOOTH = 0.1
-"""Weight of a new delay in the mean of those before."""
 _LASTS = 1.0
 """What lasts for so long [s] is reported; an end is at once."""
 _TELLS = 1.0
@@ -106,11 +104,10 @@ class Navigation(Service[Params]):
         }
         self._frames = Frames()
         self._odom_frame, self._base_frame = "odom", "base_link"
-        self._delay = 0.0
+        self._delay = MeanDelay()
         self._stamp = 0.0
         self._told: tuple[object, ...] = ()
-        self._new: tuple[object, ...] = (State.WAITING, str(Code.OK), None)
-        self._new_at = math.inf
+        self._lasting = Lasting((State.WAITING, str(Code.OK), None))
         self._shown_path: object = None
         self._shown_estimate: object = None
         self._shown_map: object = None
@@ -149,7 +146,7 @@ class Navigation(Service[Params]):
             said = [replace(one, age=one.age + late) for one in read_said(heard.message.data)]
             self.navigator.hear(now, said)
         self._clients.listen(self.navigator, now)
-        velocity = self.navigator.step(now, self._delay)
+        velocity = self.navigator.step(now, self._delay.seconds)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
         self._tell(now)
         self._clients.tell(self.navigator, now, self._stamp)
@@ -193,13 +190,13 @@ class Navigation(Service[Params]):
         """Hand what the robot measured on."""
         if tf := self.tf.take():
             self._frames.hear(tf.message)
-            self._note(tf)
+            self._delay.note(tf)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
                 senses.odometry(found[1], found[0], tf.sent_at)
                 self._stamp = found[1]
         if odom := self.odom.take():
             message = odom.message
-            self._note(odom)
+            self._delay.note(odom)
             self._odom_frame = message.header.frame_id or self._odom_frame
             self._base_frame = message.child_frame_id or self._base_frame
             twist = message.twist.twist
@@ -207,7 +204,7 @@ class Navigation(Service[Params]):
             stamp = message.header.stamp.seconds()
             senses.odometry(stamp, convert.pose_of(message.pose.pose), odom.sent_at, velocity)
         if scan := self.scan.take():
-            self._note(scan)
+            self._delay.note(scan)
             self._see(scan, senses)
 
     def _listen(self) -> None:
@@ -225,12 +222,6 @@ class Navigation(Service[Params]):
             if all(self._is_on_map(frame) for frame in frames):
                 poses = [convert.pose_of(pose.pose) for pose in goals.message.poses]
                 navigator.go(poses, rounds=self.params.rounds, stop_at_each=self.params.stop_at_each)
-
-    def _note(self, message: Received[TFMessage] | Received[Odometry] | Received[LaserScan]) -> None:
-        """Learn how long messages take. Those to the robot take as long, as far as a service can know."""
-        taken = message.received_at - message.sent_at
-        if math.isfinite(message.sent_at_error) and 0 <= taken < 10:
-            self._delay += _SMOOTH * (taken - self._delay)
 
     def _see(self, received: Received[LaserScan], senses: Senses) -> None:
         scan = received.message
@@ -280,10 +271,7 @@ class Navigation(Service[Params]):
         """Make an event of what lasts, or is an end. That there is no goal yet is none."""
         is_end = report.doing in (State.SUCCEEDED, State.FAILED, State.CANCELED)
         new = (report.doing, report.code, report.task, *([report.message] if is_end else []))
-        if new != self._new:
-            self._new, self._new_at = new, now
-        if now - self._new_at >= (0.0 if is_end else _LASTS):
-            self._new_at = math.inf
+        if self._lasting.due(new, now, 0.0 if is_end else _LASTS):
             self.report(report.code if report.trouble is not None else str(report.doing), report.message)
 
     def _tell(self, now: float) -> None:
