@@ -10,12 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .lab_trials import (
+    Keep,
+    OnDocker,
+    Prefix,
+    RobotCpu,
+    Trials,
+    beside_thesis,
     devices_table,
     fail_unless_completed,
     kept_trials,
     named_scenarios,
     on_docker,
-    pair,
     run_trials,
     topics_table,
     write_figures,
@@ -35,23 +40,17 @@ def follow_in_front(
         list[str] | None,
         typer.Option(help="embedded, edge or commercial (section 5.5.2); may be repeated. Default: all three."),
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, max=1000, help="Of each.")] = 5,
+    trials: Trials = 5,
     seed: Annotated[
         int, typer.Option(min=0, help="Of the first trial: noise, network and operator. The others count on.")
     ] = 1,
     predict: Annotated[
         bool, typer.Option("--predict/--no-predict", help="Whether the service counts on for the round trip's length.")
     ] = True,
-    docker: Annotated[bool, typer.Option("--docker", help="On this machine's engine, with the image present.")] = False,
-    prefix: Annotated[str, typer.Option(help="With --docker: of the images' names.")] = "skytether/",
-    robot_cpu: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=64, help="In `embedded`: processors that the service gets at most. Default: 0.25."),
-    ] = None,
-    keep: Annotated[
-        Path | None,
-        typer.Option(help="File of JSON lines: trials that are in it are not done again, new ones are added."),
-    ] = None,
+    docker: OnDocker = False,
+    prefix: Prefix = "skytether/",
+    robot_cpu: RobotCpu = None,
+    keep: Keep = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for PNGs: ways, and Figs. 31 to 33.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print `trials`, `summary`, `topics` as one object.")] = False,
 ) -> None:
@@ -118,7 +117,7 @@ def _draw(results: Sequence[FollowResult], folder: Path, *, json: bool) -> None:
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
-    from skytether.lab.follow_in_front_report import THESIS_TRIALS
+    from skytether.lab.follow_in_front_report import THESIS, THESIS_TRIALS
 
     shown = {
         "time_s": "time [s]",
@@ -127,12 +126,14 @@ def _table(rows: list[dict[str, Any]]) -> Table:
         "deviation_max_m": "farthest off [m]",
         "following": "share following",
     }
-    made = _beside_thesis(rows, shown, ("completed", "contacts"), "One round: mean and standard deviation")
+    made = beside_thesis(rows, shown, THESIS, "One round: mean and standard deviation", thesis_trials=THESIS_TRIALS)
     made.caption = f"Thesis: section 5.5.3, {THESIS_TRIALS} trials each; its speeds' deviations are as printed there."
     return made
 
 
 def _network_table(rows: list[dict[str, Any]]) -> Table:
+    from skytether.lab.follow_in_front_report import THESIS
+
     shown = {
         "rtt_ms": "round trip [ms]",
         "up_mbit_s": "robot sent [Mbit/s]",
@@ -140,30 +141,4 @@ def _network_table(rows: list[dict[str, Any]]) -> Table:
         "down_mbit_s": "service sent",
         "down_arrived_mbit_s": "arrived",
     }
-    return _beside_thesis(rows, shown, (), "Network, medians over the seconds, beside section 5.5.3")
-
-
-def _beside_thesis(rows: list[dict[str, Any]], shown: dict[str, str], counted: tuple[str, ...], title: str) -> Table:
-    """Figures of each scenario above those of the thesis.
-
-    Args:
-        rows: Of the summary.
-        shown: Figures with their headings.
-        counted: Before them, which have no mean.
-        title: Above.
-    """
-    from rich.table import Table
-
-    from skytether.lab.follow_in_front_report import THESIS, THESIS_TRIALS
-
-    made = Table("", *counted, *shown.values(), title=title)
-    for row in rows:
-        of = {"completed": f"{row['completed']} of {row['trials']}", "contacts": str(row["contacts"])}
-        figures = [pair(row[name], row[f"{name}_std"]) for name in shown]
-        made.add_row(row["scenario"], *(of[name] for name in counted), *figures)
-        thesis = THESIS.get(row["scenario"])
-        if thesis:
-            of = {"completed": f"{THESIS_TRIALS} of {THESIS_TRIALS}", "contacts": ""}
-            told = [pair(*thesis[name]) if name in thesis else "" for name in shown]
-            made.add_row("  thesis", *(of[name] for name in counted), *told, style="dim")
-    return made
+    return beside_thesis(rows, shown, THESIS, "Network, medians over the seconds, beside section 5.5.3")

@@ -10,12 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .lab_trials import (
+    Keep,
+    OnDocker,
+    Prefix,
+    RobotCpu,
+    Trials,
+    beside_thesis,
     devices_table,
     fail_unless_completed,
     kept_trials,
     named_scenarios,
     on_docker,
-    pair,
     run_trials,
     topics_table,
     write_figures,
@@ -44,19 +49,13 @@ def navigation(
     compensation: Annotated[
         str, typer.Option(help="Of the delay: measured, off, or fixed (at the round trip).")
     ] = "measured",
-    trials: Annotated[int, typer.Option(min=1, max=1000, help="Of each.")] = 5,
+    trials: Trials = 5,
     seed: Annotated[int, typer.Option(min=0, help="Of the first trial: noise and network. The others count on.")] = 1,
     goals: Annotated[int, typer.Option(min=1, max=9, help="Drive to the first so many.")] = 9,
-    docker: Annotated[bool, typer.Option("--docker", help="On this machine's engine, with the image present.")] = False,
-    prefix: Annotated[str, typer.Option(help="With --docker: of the images' names.")] = "skytether/",
-    robot_cpu: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=64, help="In `embedded`: processors that the service gets at most. Default: 0.25."),
-    ] = None,
-    keep: Annotated[
-        Path | None,
-        typer.Option(help="File of JSON lines: trials that are in it are not done again, new ones are added."),
-    ] = None,
+    docker: OnDocker = False,
+    prefix: Prefix = "skytether/",
+    robot_cpu: RobotCpu = None,
+    keep: Keep = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for PNGs, drawn like Figs. 36 to 39.")] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print `trials`, `summary`, `topics`, `times` as one object.")
@@ -145,20 +144,14 @@ def _settings(scenario: Scenario, compensation: str, seed: int, goals: int, pref
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
-    from rich.table import Table
-
     from skytether.lab.nine_goals_report import THESIS, THESIS_TRIALS
 
-    table = Table(
-        "", "completed", "contacts", "time [s]", "distance [m]", "goal 1 to 2 [m]", "speed [m/s]", "round trip [ms]",
-        title="Nine goals: mean and standard deviation, beside section 5.6.3 and Table 6",
-    )  # fmt: skip
-    shown = ("time_s", "distance_m", "first_leg_m", "mean_speed_m_s", "rtt_ms")
-    for row in rows:
-        figures = [pair(row[name], row[f"{name}_std"]) for name in shown]
-        table.add_row(row["scenario"], f"{row['completed']} of {row['trials']}", str(row["contacts"]), *figures)
-        thesis = THESIS.get(row["scenario"])
-        if thesis:
-            told = [pair(*thesis[name]) if name in thesis else "" for name in shown]
-            table.add_row("  thesis", f"{THESIS_TRIALS} of {THESIS_TRIALS}", "", *told, style="dim")
-    return table
+    shown = {
+        "time_s": "time [s]",
+        "distance_m": "distance [m]",
+        "first_leg_m": "goal 1 to 2 [m]",
+        "mean_speed_m_s": "speed [m/s]",
+        "rtt_ms": "round trip [ms]",
+    }
+    title = "Nine goals: mean and standard deviation, beside section 5.6.3 and Table 6"
+    return beside_thesis(rows, shown, THESIS, title, thesis_trials=THESIS_TRIALS)

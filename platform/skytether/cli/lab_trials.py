@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
 
 from .output import console, fail
 
@@ -19,6 +21,19 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", bound="TrialResult")
 S = TypeVar("S", bound="TrialSettings")
+
+Trials = Annotated[int, typer.Option(min=1, max=1000, help="Of each.")]
+OnDocker = Annotated[bool, typer.Option("--docker", help="On this machine's engine, with the image present.")]
+Prefix = Annotated[str, typer.Option(help="With --docker: of the images' names.")]
+RobotCpu = Annotated[
+    float | None,
+    typer.Option(min=0.01, max=64, help="In `embedded`: processors that the service gets at most. Default: 0.25."),
+]
+Keep = Annotated[
+    Path | None,
+    typer.Option(help="File of JSON lines: trials that are in it are not done again, new ones are added."),
+]
+"""Options of any experiment."""
 
 
 def kept_trials(file: Path | None, kind: type[R]) -> KeptTrials[R] | None:
@@ -103,6 +118,36 @@ def fail_unless_completed(results: Sequence[R], said: Callable[[R], str]) -> Non
     if failed:
         text = f"{len(failed)} of {len(results)} trials were not completed, first {failed[0].scenario} with seed"
         fail(f"{text} {failed[0].seed}: {said(failed[0])}")
+
+
+def beside_thesis(
+    rows: Sequence[Mapping[str, Any]],
+    shown: Mapping[str, str],
+    thesis: Mapping[str, Mapping[str, Pair]],
+    title: str,
+    *,
+    thesis_trials: int = 0,
+) -> Table:
+    """Figures of each scenario above those of the thesis.
+
+    Args:
+        rows: Of the summary.
+        shown: Figures with their headings.
+        thesis: Its figures, by scenario.
+        title: Above.
+        thesis_trials: It did so many of each, all completed: shown with ours, and our contacts; 0: neither is shown.
+    """
+    from rich.table import Table
+
+    made = Table("", *(("completed", "contacts") if thesis_trials else ()), *shown.values(), title=title)
+    for row in rows:
+        counted = (f"{row['completed']} of {row['trials']}", str(row["contacts"])) if thesis_trials else ()
+        made.add_row(row["scenario"], *counted, *(pair(row[name], row[f"{name}_std"]) for name in shown))
+        if told := thesis.get(row["scenario"]):
+            counted = (f"{thesis_trials} of {thesis_trials}", "") if thesis_trials else ()
+            figures = (pair(*told[name]) if name in told else "" for name in shown)
+            made.add_row("  thesis", *counted, *figures, style="dim")
+    return made
 
 
 def devices_table(
