@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes.util
-import json
 import os
 import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -342,17 +340,12 @@ def compose_programs() -> None:
 @pytest.fixture(scope="session")
 def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Images]:
     """The base image, the network's guard, one service and the toy, built from this very code."""
-    from docker_site import TOY, Images
+    from docker_site import TOY, Images, build
 
     prefix = f"skytether-test-{secrets.token_hex(4)}/"
-    build = Path(__file__).parent.parent / "images" / "build.py"
     names = ["base", "guard", "virtual-trail"]
     try:
-        done = subprocess.run(
-            [sys.executable, str(build), "--prefix", prefix, "--json", *names], capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        images = Images(prefix, json.loads(done.stdout))
+        images = Images(prefix, build(prefix, *names))
         folder = tmp_path_factory.mktemp("toy")
         (folder / "Dockerfile").write_text(TOY)
         command = ["docker", "build", "-q", "-t", images.toy, "--build-arg", f"BASE={images.name('base')}", str(folder)]

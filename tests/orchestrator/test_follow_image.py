@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from docker_site import DockerSite, Images
@@ -20,13 +17,8 @@ LIBRARIES_OF_X = "find / -xdev -name 'libX11*' -o -xdev -name 'libGL*' -o -xdev 
 
 @pytest.fixture(scope="module")
 def follow_image(docker_images: Images) -> Iterator[str]:
-    build = Path(__file__).parents[2] / "images" / "build.py"
-    image = docker_images.name("follow-in-front")
-    command = [sys.executable, str(build), "--prefix", docker_images.prefix, "--json", "follow-in-front"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    yield image
-    subprocess.run(["docker", "image", "rm", "-f", image], capture_output=True)
+    with docker_images.another("follow-in-front") as image:
+        yield image
 
 
 def test_a_container_of_it_drives_a_robot_ahead_of_a_person(
@@ -37,7 +29,9 @@ def test_a_container_of_it_drives_a_robot_ahead_of_a_person(
     (made,) = json.loads(docker_site.docker("image", "inspect", follow_image))
     assert made["Size"] < 600e6
     assert made["Config"]["User"] == "65532:65532"
-    settings = FollowSettings(SCENARIOS["edge"], docker=docker_site.options(), image=follow_image, share=0.1)
+    options = docker_site.options()
+    del options["network"]  # the trial makes its own
+    settings = FollowSettings(SCENARIOS["edge"], docker=options, image=follow_image, share=0.1)
     with FollowTrial(settings) as trial:
         result = trial.drive()
         (container,) = docker_site.containers()

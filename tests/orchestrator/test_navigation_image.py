@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from docker_site import DockerSite, Images
@@ -28,13 +25,8 @@ COMPILED = "cd {} && find . -type f | sort | xargs sha256sum"
 
 @pytest.fixture(scope="module")
 def navigation_image(docker_images: Images) -> Iterator[str]:
-    build = Path(__file__).parents[2] / "images" / "build.py"
-    image = docker_images.name("navigation")
-    command = [sys.executable, str(build), "--prefix", docker_images.prefix, "--json", "navigation"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    yield image
-    subprocess.run(["docker", "image", "rm", "-f", image], capture_output=True)
+    with docker_images.another("navigation") as image:
+        yield image
 
 
 def test_a_container_of_it_drives_a_robot_and_compiles_nothing(docker_site: DockerSite, navigation_image: str) -> None:

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
 from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
+
+_BUILD = Path(__file__).parents[2] / "images" / "build.py"
+
+
+def build(prefix: str, *names: str) -> list[dict[str, object]]:
+    """Build images from this very code; what ``--json`` tells of them."""
+    command = [sys.executable, str(_BUILD), "--prefix", prefix, "--json", *names]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    rows: list[dict[str, object]] = json.loads(done.stdout)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -26,6 +41,13 @@ class Images:
 
     def name(self, image: str) -> str:
         return f"{self.prefix}{image}:1"
+
+    @contextmanager
+    def another(self, image: str) -> Iterator[str]:
+        """The name of one that few tests need, as long as it is there."""
+        build(self.prefix, image)
+        yield self.name(image)
+        subprocess.run(["docker", "image", "rm", "-f", self.name(image)], capture_output=True)
 
 
 TOY = """\
