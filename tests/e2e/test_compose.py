@@ -219,10 +219,11 @@ def test_an_instance_runs_and_prometheus_knows_all_that_the_dashboard_asks(
         client.create_site(SiteCreate(name="edge", tier="edge", runtime="docker", options=options))
         document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "virtual-trail"}}
         topics = [{"name": n, "type": "a/msg/B", "direction": d} for n, d in (("force", "in"), ("cmd_vel", "out"))]
-        manifest = Manifest.model_validate({**document, "spec": {"image": images.toy, "topics": topics}})
-        client.put_service("virtual-trail", manifest)
+        spec = {"image": images.toy, "topics": topics, "states": ["said"], "params": {"additionalProperties": True}}
+        client.put_service("virtual-trail", Manifest.model_validate({**document, "spec": spec}))
         client.create_robot(RobotCreate(name="walker"))  # of a robot that nobody registered no gate is kept
-        made = client.create_instance(InstanceCreate(robot="walker", service="virtual-trail", lease_s=600))
+        asked_for = {"robot": "walker", "service": "virtual-trail", "lease_s": 600, "params": {"report": "at work"}}
+        made = client.create_instance(InstanceCreate.model_validate(asked_for))
         assert client.wait_running(made.id, timeout=PATIENCE).placement.site == "edge"
         until(lambda: len(stack.query("up == 1")) == 2)
         assert [row["metric"]["instance"] for row in stack.query('up{job="skytether"}')] == ["orchestrator:8600"]

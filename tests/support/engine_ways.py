@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import os
+import selectors
 import socket
 import ssl
 import struct
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 ENGINE = "/var/run/docker.sock"
+_PIECE = 65_536
 
 
 class EngineProxy:
@@ -83,12 +85,11 @@ class EngineProxy:
 
     def _close(self, whose: Callable[[int], bool]) -> None:
         for one, program in list(self._open):
-            if whose(program):
-                with contextlib.suppress(OSError):
-                    one.shutdown(socket.SHUT_RDWR)
-                one.close()
             if one.fileno() < 0:
                 self._open.remove((one, program))
+            elif whose(program):
+                with contextlib.suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)  # its own thread closes it: else its number is another file's soon
 
     def _accept(self, listener: socket.socket) -> None:
         while True:
@@ -100,27 +101,39 @@ class EngineProxy:
 
     def _serve(self, client: socket.socket) -> None:
         program = _program(client)
-        self._open.append((client, program))
-        if self._shuts_out(program):
-            if self._answers_all:
-                client.close()
-            return
-        engine = socket.socket(socket.AF_UNIX)
-        try:
-            if self._context is not None:
-                client = self._context.wrap_socket(client, server_side=True)
+        with client, socket.socket(socket.AF_UNIX) as engine, contextlib.suppress(OSError, ValueError):
+            self._open.append((client, program))
+            if self._shuts_out(program):
+                while not self._answers_all and client.recv(_PIECE):
+                    pass
+                return
+            self._open.append((engine, program))
             engine.connect(self._target)
-        except OSError:
-            engine.close()
-            client.close()
-            return
-        self._open.append((engine, program))
-        both = [
-            threading.Thread(target=_pump, args=(client, engine, self._loses), daemon=True),
-            threading.Thread(target=_pump, args=(engine, client, lambda _: False), daemon=True),
-        ]
-        for one in both:
-            one.start()
+            if self._context is None:
+                self._pass_on(client, engine)
+            else:
+                with self._context.wrap_socket(client, server_side=True) as inner:
+                    self._pass_on(inner, engine)
+
+    def _pass_on(self, client: socket.socket, engine: socket.socket) -> None:
+        """Both ways in one thread, until one of them ends: a TLS connection is not for two."""
+        with selectors.DefaultSelector() as selector:
+            selector.register(client, selectors.EVENT_READ)
+            selector.register(engine, selectors.EVENT_READ)
+            while True:
+                pending = isinstance(client, ssl.SSLSocket) and client.pending()
+                ready = [client] if pending else [key.fileobj for key, _ in selector.select()]
+                if client in ready:
+                    data = client.recv(_PIECE)
+                    if not data:
+                        return
+                    if not self._loses(data):
+                        engine.sendall(data)
+                if engine in ready:
+                    data = engine.recv(_PIECE)
+                    if not data:
+                        return
+                    client.sendall(data)
 
     def _loses(self, data: bytes) -> bool:
         lost = self.swallow is not None and self.swallow in data
@@ -135,17 +148,6 @@ def _program(client: socket.socket) -> int:
         return 0
     told = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     return int(struct.unpack("3i", told)[0])
-
-
-def _pump(source: socket.socket, sink: socket.socket, loses: Callable[[bytes], bool]) -> None:
-    with contextlib.suppress(OSError, ValueError):
-        while data := source.recv(65_536):
-            if not loses(data):
-                sink.sendall(data)
-    for one in (source, sink):
-        with contextlib.suppress(OSError):
-            one.shutdown(socket.SHUT_RDWR)
-        one.close()
 
 
 @contextmanager
