@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
-from skytether_services.navigation.likelihood_field import Explained, LikelihoodField, explain, to_cell_poses
+from skytether_services.navigation.likelihood_field import Explained, LikelihoodField, explain, score_beams, to_cell_poses
 from skytether_services.navigation.poses import wrap
 from skytether_services.navigation.scan_align import align
 
@@ -31,7 +31,10 @@ class SearchParams:
         turn: Of the headings [rad].
         sigma: Standard deviation of a point in the coarse comparison: covers the spacing [m].
         points: So many points are compared coarsely.
-        seeds: So many of the best places are looked at finely.
+        sifted: So many of the best places by their points alone are compared by beams, which pass no wall.
+        beams: So many beams of each.
+        seeds: So many of the best by beams are looked at finely.
+        judged: By so many beams of each; the hypotheses by all.
         hypotheses: So many different ones are returned at most.
         apart: Nearer ones are the same place [m].
         apart_turn: And the same heading [rad].
@@ -42,7 +45,10 @@ class SearchParams:
     turn: float = math.radians(4)
     sigma: float = 0.25
     points: int = 150
+    sifted: int = 4000
+    beams: int = 60
     seeds: int = 100
+    judged: int = 600
     hypotheses: int = 12
     apart: float = 0.6
     apart_turn: float = math.radians(20)
@@ -94,7 +100,7 @@ def search(
         field: Of the map.
         starts: m by 2: where each beam starts, in the robot's frame [m].
         ends: m by 2: where it ends [m].
-        random: Which points are compared coarsely.
+        random: Which points and beams are compared.
         params: How to search.
         also: Poses that are looked at in any case.
     """
@@ -103,10 +109,18 @@ def search(
         return []
     squares = np.floor(ends / params.thinned).astype(np.int64)
     _, kept = np.unique(squares[:, 0] * 2_000_003 + squares[:, 1], return_index=True)
-    shuffled = random.permutation(kept)
-    seeds = _coarse(field, ends[shuffled[: params.points]], params)
-    fine = shuffled[: 4 * params.points]
-    return _refine(field, starts[fine], ends[fine], np.array([*also, *seeds]), params)
+    spread, beams = random.permutation(kept), random.permutation(len(ends))
+    places = _coarse(field, ends[spread[: params.points]], params)
+    few, more = beams[: params.beams], beams[: params.judged]
+    seeds = _sift(field, starts[few], ends[few], places, params)
+    found = [
+        judge(field, pose, starts[more], ends[more])
+        for pose in _aligned(field, ends[spread[: 4 * params.points]], np.array([*also, *seeds]), params)
+    ]
+    found.sort(key=lambda hypothesis: -hypothesis.score)
+    poses = np.array([hypothesis.pose for hypothesis in found])
+    best = poses[distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
+    return sorted((judge(field, pose, starts, ends) for pose in best), key=lambda hypothesis: -hypothesis.score)
 
 
 def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Array:
@@ -129,17 +143,22 @@ def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Arra
     # The best of its neighbourhood in heading alone; the fine step makes one of neighbours in place.
     peak = (best >= np.roll(best, 1, axis=1)) & (best >= np.roll(best, -1, axis=1))
     flat = np.where(peak, best, -(2**40)).ravel()
-    count = min(4 * params.seeds, flat.size)
-    order = np.argpartition(-flat, count - 1)[:count]
-    order = order[np.argsort(-flat[order], kind="stable")]
-    place, turn = np.divmod(order, turns)
-    poses = np.column_stack(
+    count = min(params.sifted, flat.size)
+    place, turn = np.divmod(np.argpartition(-flat, count - 1)[:count], turns)
+    return np.column_stack(
         (field.grid.to_points(places[place].astype(np.float64) + 0.5), headings[turn] + field.grid.origin[2])
     )
+
+
+def _sift(field: LikelihoodField, starts: Array, ends: Array, poses: Array, params: SearchParams) -> Array:
+    """The best of the poses, by beams: points alone fit through walls, and where the map knows little."""
+    scores = score_beams(field, poses, starts, ends, params.sigma)
+    poses = poses[np.argsort(-scores, kind="stable")]
     return poses[distinct(poses, 1.5 * params.spacing, 1.5 * params.turn, params.seeds)]
 
 
-def _refine(field: LikelihoodField, starts: Array, ends: Array, seeds: Array, params: SearchParams) -> list[Hypothesis]:
+def _aligned(field: LikelihoodField, points: Array, seeds: Array, params: SearchParams) -> list[Array]:
+    """Each of the poses, where the points fit best near it."""
     resolution = field.grid.resolution
     distance = field.distance / np.float32(resolution)
     information = np.diag([1 / (params.spacing / resolution) ** 2] * 2 + [1 / params.turn**2])
@@ -147,13 +166,10 @@ def _refine(field: LikelihoodField, starts: Array, ends: Array, seeds: Array, pa
     for at in to_cell_poses(field.grid, seeds):
         pose = at
         for sigma in (params.sigma, field.model.sigma):
-            pose, _, _ = align(distance, ends / resolution, pose, information, sigma / resolution, 0.2, 10)
+            pose, _, _ = align(distance, points / resolution, pose, information, sigma / resolution, 0.2, 10)
         place = field.grid.to_points(pose[None, :2])[0]
-        moved = np.array([place[0], place[1], float(wrap(pose[2] + field.grid.origin[2]))])
-        found.append(judge(field, moved, starts, ends))
-    found.sort(key=lambda hypothesis: -hypothesis.score)
-    poses = np.array([hypothesis.pose for hypothesis in found])
-    return [found[index] for index in distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
+        found.append(np.array([place[0], place[1], float(wrap(pose[2] + field.grid.origin[2]))]))
+    return found
 
 
 def judge(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> Hypothesis:

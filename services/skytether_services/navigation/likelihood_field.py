@@ -110,6 +110,77 @@ def score_poses(field: LikelihoodField, poses: Array, points: Array) -> Array:
     return total
 
 
+@compiled
+def _score_beams(
+    log_likelihood: NDArray[np.float32],
+    cells: NDArray[np.int8],
+    limits: tuple[float, float],
+    poses: Array,
+    starts: Array,
+    ends: Array,
+    short_of_end: float,
+    total: Array,
+) -> None:
+    """``limits``: log-likelihood of a beam through a wall, and of one that ends off the map."""
+    rows, columns = log_likelihood.shape
+    for index in range(poses.shape[0]):
+        cos, sin = math.cos(poses[index, 2]), math.sin(poses[index, 2])
+        x, y = poses[index, 0], poses[index, 1]
+        sum_all = 0.0
+        for beam in range(ends.shape[0]):
+            ax = x + cos * starts[beam, 0] - sin * starts[beam, 1]
+            ay = y + sin * starts[beam, 0] + cos * starts[beam, 1]
+            bx = x + cos * ends[beam, 0] - sin * ends[beam, 1]
+            by = y + sin * ends[beam, 0] + cos * ends[beam, 1]
+            length = math.hypot(bx - ax, by - ay)
+            passed = False
+            for step in range(int(length - short_of_end)):
+                column = math.floor(ax + step / length * (bx - ax))
+                row = math.floor(ay + step / length * (by - ay))
+                if 0 <= row < rows and 0 <= column < columns and cells[row, column] >= 50:
+                    passed = True
+                    break
+            column, row = math.floor(bx), math.floor(by)
+            if passed:
+                sum_all += limits[0]
+            elif 0 <= row < rows and 0 <= column < columns:
+                sum_all += log_likelihood[row, column]
+            else:
+                sum_all += limits[1]
+        total[index] = sum_all
+
+
+def score_beams(field: LikelihoodField, poses: Array, starts: Array, ends: Array, sigma: float) -> Array:
+    """How well beams fit the map from each of many poses that are some way off; one through a wall is an outlier.
+
+    Args:
+        field: Of the map.
+        poses: n by 3: x [m], y [m], heading [rad], map frame.
+        starts: m by 2: where each beam starts, in the robot's frame [m].
+        ends: m by 2: where it ends [m].
+        sigma: Standard deviation of an end from its obstacle, the error of the poses included [m].
+
+    Returns:
+        For each pose the sum of the beams' log-likelihoods.
+    """
+    model, resolution = field.model, field.grid.resolution
+    hit = np.exp(-(field.distance**2) / (2 * sigma**2))
+    known = (field.grid.cells >= 0) | (field.distance <= sigma)
+    likelihood = np.where(known, model.outlier + (1 - model.outlier) * hit, model.unknown)
+    total = np.empty(len(poses))
+    _score_beams(
+        np.log(likelihood).astype(np.float32),
+        field.grid.cells,
+        (math.log(model.outlier), math.log(model.unknown)),
+        to_cell_poses(field.grid, poses),
+        starts / resolution,
+        ends / resolution,
+        2 * sigma / resolution,
+        total,
+    )
+    return total
+
+
 def to_cell_poses(grid: GridMap, poses: Array) -> Array:
     """Poses of the map frame as column, row [cells] and heading from the map's own x axis [rad]."""
     return np.column_stack((grid.to_cells(poses[:, :2]), poses[:, 2] - grid.origin[2]))

@@ -9,7 +9,7 @@ import pytest
 
 from skytether_services.navigation.global_search import search
 from skytether_services.navigation.grid_map import GridMap
-from skytether_services.navigation.likelihood_field import likelihood_field
+from skytether_services.navigation.likelihood_field import likelihood_field, score_beams, score_poses
 from skytether_services.navigation.localisation import Localisation
 from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.poses import between, compose
@@ -33,6 +33,20 @@ def test_the_place_of_a_scan_is_found_in_the_whole_map() -> None:
     # Half a step of the grid and of the headings is what the search itself is wrong by; then it is made fine.
     np.testing.assert_allclose(found[0].pose, truth, atol=0.05)
     assert found[0].explained.share > 0.9
+
+
+def test_a_beam_through_a_wall_is_an_outlier_and_one_to_where_the_map_knows_nothing_says_little() -> None:
+    cells = np.zeros((20, 90), np.int8)
+    cells[:, 20] = cells[:, 40] = 100  # walls at 2 m and 4 m
+    cells[:, 50:] = -1
+    field = likelihood_field(GridMap(cells, 0.1, (0.0, 0.0, 0.0)))
+    starts, ends = np.zeros((3, 2)), np.array([[3.0, 0.0], [3.0, 0.01], [3.0, -0.01]])
+    poses = np.array([[1.05, 1.05, 0.0], [4.35, 1.05, 0.0], [1.05, 1.05, math.pi]])
+    through, unknown, off_the_map = score_beams(field, poses, starts, ends, 0.25) / 3
+    assert score_poses(field, poses[:1], ends)[0] == pytest.approx(0.0, abs=0.1)  # its ends alone fit
+    assert through == pytest.approx(math.log(field.model.outlier))
+    assert unknown == pytest.approx(math.log(field.model.unknown))
+    assert off_the_map == pytest.approx(math.log(field.model.unknown))
 
 
 def test_a_pose_that_the_map_contradicts_gives_way_to_one_that_it_explains() -> None:
