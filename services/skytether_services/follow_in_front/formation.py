@@ -18,8 +18,13 @@ on; that is how a wavering head, and the error of the pose, do not become turns.
 **Prediction** (``predict``). Since the robot knows its own commands, it counts on from the moment of measurement to the
 moment at which the new command acts: the distance by what it has commanded less the way of the operator, the face's
 angle by the turns commanded. That is Smith's predictor (1957), for a plant that is an integrator: the delay leaves the
-loop, and what remains is what the operator does meanwhile. For that the speed of walking is taken to go on changing as
-it does. Where the time is wrong by dT, the loop is one with the delay dT.
+loop, and what remains is what the operator does meanwhile. They are taken to walk on as fast as they do: how that
+changes is mostly the swing of their steps, and counting on with it made the robot jerk and drive slower. Where the time
+is wrong by dT, the loop is one with the delay dT.
+Who leads the robot round a curve goes on looking aside, and ``psi`` does not fall by what the robot turns: counting on
+alone would make the answer smaller, ``k_psi / (1 + k_psi T)``, and smaller still over a slower link. So the gain is
+raised to ``k_psi / (1 - k_psi T)``, T being the time that is usually counted on: a face that stays aside is answered
+alike over any link. It is doubled at the most.
 
 Speed and acceleration are limited; the robot never drives back, towards the operator. Saturation slows both laws down
 and adds no energy: each error's sign gives the command's sign, whatever its size.
@@ -42,10 +47,8 @@ _MEMORY = 3.0
 """Commands are remembered for this long, s: longer than anything is predicted."""
 _MOST = 1000
 """And so many of them at the most: 3 s at 100 Hz, with room."""
-_CHANGE = 0.5
-"""People change their speed by no more than this for longer than a step, m/s^2; what seems more is noise."""
-_CHANGE_TIME = 0.25
-"""Time constant of that change's filter, s."""
+_MOST_RAISED = 0.5
+"""What is counted on doubles the gain of steering at the most: noise and errors of time are raised with it."""
 _LONGEST_GAP = 1.0
 """Samples further apart than this say nothing of how something changes, s."""
 
@@ -158,9 +161,12 @@ class Formation:
         self.doubt = 0.0
         """What was measured may be older by so much than is told [s]; inf: nobody knows how old it is."""
         self._legs: _Legs | None = None
-        self._change = 0.0
         self._face: tuple[float, float] | None = None
         self._interval = 0.0
+        self._ahead = 0.0
+        """From a face to what the command that it leads to does [s], as a mean."""
+        self._counted_at: float | None = None
+        """When the face was made that this was last noted of."""
         self._velocity = STANDSTILL
         self._stands_first = False
         self._stepped_at: float | None = None
@@ -193,12 +199,8 @@ class Formation:
         speed = -(x * vx + y * vy) / distance if distance > 1e-6 else vx
         before = self._legs
         gap = at - before.at if before is not None else math.inf
-        if before is None or gap > _LONGEST_GAP:
-            self._change = 0.0
-        else:
+        if before is not None and gap <= _LONGEST_GAP:
             speed = before.speed + (speed - before.speed) * -math.expm1(-gap / self._params.speed_time)
-            change = min(max((speed - before.speed) / gap, -_CHANGE), _CHANGE)
-            self._change += (change - self._change) * -math.expm1(-gap / _CHANGE_TIME)
         self._legs = _Legs(at, distance, math.atan2(y, -x), speed)
 
     def face(self, angle: float, at: float) -> None:
@@ -224,7 +226,7 @@ class Formation:
 
     def lose(self) -> None:
         """Forget the operator: another one begins anew, and from a stand."""
-        self._legs, self._face, self._change, self._interval = None, None, 0.0, 0.0
+        self._legs, self._face, self._interval = None, None, 0.0
         self._stands_first = True
 
     def step(self, now: float) -> Command:
@@ -279,16 +281,23 @@ class Formation:
         if p.predict:
             ahead = now - legs.at + self.lead
             way = sum(part * velocity.linear for part, velocity in self._acting(legs.at - self.lead, now))
-            distance += way * math.cos(legs.off) - (speed + self._change * ahead / 2) * ahead
-            speed += self._change * ahead
+            distance += way * math.cos(legs.off) - speed * ahead
         return (max(speed, 0.0) + p.distance_gain * (p.distance - distance)) * math.cos(legs.off)
 
     def _angular(self, face: tuple[float, float], now: float) -> float:
         p = self._params
         angle, at = face
+        gain = p.steering_gain
         if p.predict:
             angle -= self._turned(at, now + self.lead)
-        return p.steering_gain * math.copysign(max(abs(angle) - p.dead_band, 0.0), angle)
+            if at != self._counted_at:
+                ahead = now + self.lead - at
+                self._ahead = ahead if self._counted_at is None else self._ahead + 0.1 * (ahead - self._ahead)
+                self._counted_at = at
+            # As usual, not since this face: of one that is late nobody knows whether it stays aside. The filter counts
+            # on, too.
+            gain /= 1 - min(gain * (self._ahead + p.filter_time), _MOST_RAISED)
+        return gain * math.copysign(max(abs(angle) - p.dead_band, 0.0), angle)
 
     def _turned(self, since: float, until: float) -> float:
         """What the robot turned between two times by its commands, which act `lead` after they are given [rad]."""
