@@ -242,6 +242,38 @@ def test_a_target_cannot_take_another_sessions_packets():
     assert relay.up(packet(7), ROBOT, 1.0) is leg
 
 
+def test_a_flood_of_made_up_handshakes_holds_up_no_robot_that_moves():
+    relay = table(newcomers=8)
+    admit(relay)
+    for number in range(100):
+        relay.up(packet(1000 + number), ("198.51.100.1", number), 1.0)
+    assert relay.rejected["newcomers"]
+    moved = relay.up(data(7), ("192.0.2.2", 5000), 1.0)
+    assert relay.down(moved, data(7), SERVICE, 1.0)
+    assert moved.session is relay.sessions[7]
+
+
+def test_who_overheard_a_session_opens_no_more_addresses_than_it_may_have():
+    relay = table(newcomers=1, addresses=4)
+    admit(relay)
+    opened = [relay.up(data(7), ("198.51.100.1", number), 0.0) for number in range(100)]
+    assert sum(leg is not None for leg in opened) == 4
+
+
+def test_made_up_ids_as_if_from_the_target_push_out_none_that_is_in_use():
+    relay = table()
+    leg = admit(relay)
+    assert relay.up(data(7), ROBOT, 0.0) is leg
+    for number in range(100):
+        relay.down(leg, data(number, handshake=50), SERVICE, 1.0)
+    assert relay.up(data(7), ROBOT, 1.0) is leg
+    assert len(leg.ids) == 4
+    assert relay.down(leg, data(7, handshake=1), SERVICE, 2.0)
+    assert relay.up(data(7, handshake=1), ROBOT, 2.0) is leg  # new keys take its place
+    relay.close(leg)
+    assert not relay._ids
+
+
 def test_ids_are_few_and_end_with_their_addresses():
     relay = table()
     leg = admit(relay)

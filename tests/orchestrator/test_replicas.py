@@ -22,7 +22,10 @@ from sqlalchemy.exc import OperationalError
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
 from skytether.orchestrator.db import make_engine
+from skytether.orchestrator.errors import QuotaError
 from skytether.orchestrator.postgres import Connection
+from skytether.orchestrator.quotas import Quotas
+from skytether.orchestrator.settings import Quotas as Settings
 from skytether.orchestrator.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]
@@ -286,6 +289,34 @@ def test_a_database_without_an_encoding_can_be_used(postgres: str) -> None:
         store.close()
         connection.exec_driver_sql(f"DROP DATABASE {plain.rpartition('/')[2]} WITH (FORCE)")
     engine.dispose()
+
+
+def test_two_orchestrators_do_not_both_give_a_robot_its_last_place(postgres: str, new_record: Any) -> None:
+    stores = [Store(postgres), Store(postgres)]
+    stores[0].migrate()
+    one, two = (Quotas(store, Settings(robot_instances=1)) for store in stores)
+    answers: Queue[str] = Queue()
+
+    def ask() -> None:
+        try:
+            with two.admitting(new_record("i2")):
+                answers.put("admitted")
+        except QuotaError as error:
+            answers.put(str(error))
+
+    other = threading.Thread(target=ask)
+    with one.admitting(new_record("i1")):
+        other.start()
+        waiting = "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"
+        engine = make_engine(postgres)
+        with engine.connect() as connection:
+            until(lambda: not answers.empty() or connection.exec_driver_sql(waiting).scalar_one())
+        engine.dispose()
+        stores[0].add(new_record("i1"), "robot:walker", None, "")
+    other.join(PATIENCE)
+    assert "would have 2 instances" in answers.get_nowait()
+    for store in stores:
+        store.close()
 
 
 def test_two_that_migrate_at_once_do_not_collide(postgres: str) -> None:

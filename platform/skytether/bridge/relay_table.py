@@ -141,11 +141,13 @@ class Route:
 class SessionFlow(Flow):
     """A session whose robot was answered."""
 
-    __slots__ = ("legs",)
+    __slots__ = ("legs", "moves")
 
     def __init__(self, limits: RelayLimits, now: float) -> None:
         super().__init__(limits, now)
         self.legs: dict[Address, Leg] = {}
+        self.moves = Bucket(limits.addresses, limits.addresses, now)
+        """Addresses from which its packets may begin to come in a second, whatever strangers do meanwhile."""
 
 
 class Leg:
@@ -162,6 +164,7 @@ class Leg:
         "session",
         "session_id",
         "source",
+        "spoken",
     )
 
     def __init__(self, session_id: int, source: Address, route: Route) -> None:
@@ -176,6 +179,8 @@ class Leg:
         self.answered_at: float | None = None
         self.ids: deque[int] = deque()
         """That the target's packets had, newest last."""
+        self.spoken: int | None = None
+        """The one of them that the robot's newest packet had."""
         self.port: Any = None
         """Whatever its owner keeps with it; nothing here looks at it."""
 
@@ -236,9 +241,10 @@ class RelayTable:
         if peeked is None:
             self.rejected["short"] += packets
             return None
-        hello, session_id = peeked
+        hello, packet_id = peeked
+        session_id = packet_id
         if not hello:
-            known = self._ids.get(session_id)
+            known = self._ids.get(packet_id)
             if known is None:
                 self.rejected["unknown"] += packets
                 return None
@@ -249,7 +255,7 @@ class RelayTable:
             self.rejected["unknown"] += packets
             return None
         flow = route.flow if leg is None or leg.session is None else leg.session
-        if leg is None and not route.openings.take(1, now):
+        if leg is None and not self._may_open(route, None if hello else session_id, now):
             self.rejected["newcomers"] += packets
             return None
         if not flow.up.take(len(data), now):
@@ -258,6 +264,8 @@ class RelayTable:
             return None
         if leg is None:
             leg = self._open(session_id, source, route)
+        elif not hello and packet_id in leg.ids:
+            leg.spoken = packet_id
         leg.heard_at = now
         leg.bytes_up += len(data)
         flow.packets_up += packets
@@ -327,8 +335,9 @@ class RelayTable:
         return True
 
     def _unlearn(self, leg: Leg) -> None:
-        """Forget the oldest id of a leg."""
-        packet_id = leg.ids.popleft()
+        """Forget the oldest id of a leg, but that in use: whoever sends as if from the target makes up any number."""
+        packet_id = next((one for one in leg.ids if one != leg.spoken), leg.ids[0])
+        leg.ids.remove(packet_id)
         legs = self._ids[packet_id]
         legs.remove(leg)
         if not legs:
@@ -346,6 +355,14 @@ class RelayTable:
         for leg in list(self._legs.values()):
             if self._find(leg.session_id) is not leg.route:
                 self.close(leg)
+
+    def _may_open(self, route: Route, known: int | None, now: float) -> bool:
+        """Whether a new address may have a leg; ``known``: the session that its packet is of, by the target's word.
+
+        Only who saw a packet of that session can have sent it, so no flood of made-up HELLOs holds up a robot that moves.
+        """
+        session = None if known is None else self.sessions.get(known)
+        return (session is not None and session.moves.take(1, now)) or route.openings.take(1, now)
 
     def _open(self, session_id: int, source: Address, route: Route) -> Leg:
         if len(route.newcomers) >= self._limits.newcomers:

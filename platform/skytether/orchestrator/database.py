@@ -13,7 +13,7 @@ from sqlalchemy.exc import IntegrityError
 
 from skytether.api.rest import GateReport, Scope, SiteCreate
 
-from .db import SQLITE_PATIENCE, make_engine, migrate, reading
+from .db import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
 from .models import facts, gates, robots, services, shared, sites, stops, tokens
@@ -156,6 +156,16 @@ class Database:
     def lock(self) -> Lock:
         """The lock of whoever leads over this database."""
         return lock_of(self._apart if self.served else self._engine)
+
+    @contextmanager
+    def admitting(self) -> Iterator[None]:
+        """Around counting and adding: other orchestrators over this database wait. With SQLite there are none."""
+        if not self.served:
+            yield
+            return
+        with self._engine.begin() as connection:
+            connection.execute(text(f"SELECT pg_advisory_xact_lock({ADMITTING})"))
+            yield
 
     @property
     def served(self) -> bool:

@@ -23,6 +23,8 @@ _LOCK_MS = 120_000
 """How long a migration waits for a table, or for another migration."""
 MIGRATING = 0x736B7901
 """Key of PostgreSQL's advisory lock of who migrates."""
+ADMITTING = 0x736B7902
+"""Of who counts what there is, to add to it."""
 STATEMENT_S = 10
 """Seconds that PostgreSQL gives a statement before it ends it."""
 _POSTGRES = {

@@ -74,12 +74,13 @@ class Quotas:
 
     @contextmanager
     def admitting(self, record: Record) -> Iterator[None]:
-        """Around the storing of a new instance: two that come at once are not both the last one.
+        """Around the storing of a new instance: two that come at once are not both the last one, whichever orchestrators
+        they come to.
 
         Raises:
             QuotaError: It would be too much.
         """
-        with self._admitting:
+        with self._admitting, self._store.admitting():
             for bound in self._bounds(record):
                 if bound.wanted > bound.most + 1e-9:
                     self._refuse(bound.key)
