@@ -359,7 +359,7 @@ class RelayTable:
     def _may_open(self, route: Route, known: int | None, now: float) -> bool:
         """Whether a new address may have a leg; ``known``: the session that its packet is of, by the target's word.
 
-        Only who saw a packet of that session can have sent it, so no flood of made-up HELLOs holds up a robot that moves.
+        Only who saw a packet of that session can have sent it: no flood of made-up HELLOs holds up a robot that moves.
         """
         session = None if known is None else self.sessions.get(known)
         return (session is not None and session.moves.take(1, now)) or route.openings.take(1, now)

@@ -74,8 +74,7 @@ class Quotas:
 
     @contextmanager
     def admitting(self, record: Record) -> Iterator[None]:
-        """Around the storing of a new instance: two that come at once are not both the last one, whichever orchestrators
-        they come to.
+        """Around the storing of a new instance: two that come at once, at any orchestrators, are not both the last one.
 
         Raises:
             QuotaError: It would be too much.

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
-from skytether_services.navigation.likelihood_field import Explained, LikelihoodField, explain, score_beams, to_cell_poses
+from skytether_services.navigation.likelihood_field import (
+    Explained,
+    LikelihoodField,
+    explain,
+    score_beams,
+    to_cell_poses,
+)
 from skytether_services.navigation.poses import wrap
 from skytether_services.navigation.scan_align import align
 
