@@ -3,6 +3,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from skytether.cli import gate
 from skytether.cli.app import app
 
 STATUS = {
@@ -57,3 +58,10 @@ def test_the_guards_part_is_shown(monkeypatch, changes, says):
     shown = CliRunner().invoke(app, ["robot", "gate-status"])
     assert shown.exit_code == 0
     assert says in shown.stdout.splitlines()
+
+
+def test_a_terminal_gets_no_codes_of_who_gave_the_reason_of_a_stop(monkeypatch, capsys):
+    monkeypatch.setattr(gate, "_ask", lambda *_: {**STATUS, "stopped": "from afar: \x1b[2J"})
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    gate.gate_status()
+    assert "stopped   from afar: \\x1b[2J\n" in capsys.readouterr().out

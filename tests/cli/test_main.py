@@ -83,3 +83,8 @@ def test_a_terminal_gets_no_codes_of_a_service(
     monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
     print_foreign("a\t\x1b[2Jb\r\x00\n")
     assert capsys.readouterr().out == shown
+
+
+def test_a_table_gets_no_codes_and_no_markup_of_who_filled_it(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(("service", "version"), [("toy", "1\x1b]0;title\x07 [red][/x]")])
+    assert "1\\x1b]0;title\\x07 [red][/x]" in capsys.readouterr().out

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import httpx
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from skytether.api.rest import Placement
@@ -93,6 +94,16 @@ def test_the_command_prints_tables_or_json(served):
     assert json.loads(result.stdout)["service"] == "guide"
     result = CliRunner().invoke(app, ["robot", "status", "--port", port])
     assert result.exit_code == 0
+
+
+def test_what_a_service_said_last_is_shown_as_it_is_and_obeyed_by_nobody(served, monkeypatch):
+    said = 'its last line: "[/x] [red]\x1b]0;title\x07"'
+    monkeypatch.setattr(served, "_instance", served._instance.model_copy(update={"reason": said}))
+    monkeypatch.setattr("skytether.cli.robot_status.console", Console(stderr=True, width=200))
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    assert result.exit_code == 0
+    assert "[/x] [red]\\x1b]0;title\\x07" in result.output
+    assert "\x1b]" not in result.output
 
 
 def test_a_web_page_whose_name_was_made_this_address_reads_nothing():

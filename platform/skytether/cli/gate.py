@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .output import console, fail, print_json
+from .output import console, fail, print_foreign, print_json
 
 Folder = Annotated[
     Path | None, typer.Option(help="The gate's folder (safety.folder in robot.yaml), if it is not the usual one.")
@@ -83,32 +83,32 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
         return
     nothing = "not all of it is seen" if answer["zone"] == "unknown" else "nothing near"
     way = nothing if answer["way_m"] is None else f"{answer['way_m']:.2f} m to the stop zone"
-    print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
-    print(f"ahead     {answer['zone']}: {way}")
-    print(f"stopped   {answer['stopped'] or 'no'}")
+    _say(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
+    _say(f"ahead     {answer['zone']}: {way}")
+    _say(f"stopped   {answer['stopped'] or 'no'}")
     enabled = (answer.get("guard") or {}).get("enabled")
     if enabled is not None:
-        print(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
+        _say(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
     if answer.get("modes"):
-        print(f"modes     {', '.join(answer['modes'])}")
+        _say(f"modes     {', '.join(answer['modes'])}")
     for source, why in answer["waiting"].items():
-        print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
+        _say(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["beyond"]:
-        print(f"beyond    {sentence}")
+        _say(f"beyond    {sentence}")
     guard = answer["guard"]
     if guard is None:
-        print("guard     does not answer; the gate stops the wheels itself")
+        _say("guard     does not answer; the gate stops the wheels itself")
     else:
         restarts = f", after {guard['gate_restarts']} deaths of the gate" if guard["gate_restarts"] else ""
-        print(f"guard     process {guard['pid']}, gate {answer['pid']}{restarts}")
+        _say(f"guard     process {guard['pid']}, gate {answer['pid']}{restarts}")
     if answer["stopped"] and answer["kept"] is False:
-        print("trouble   the emergency stop is not on disk: it would not outlive the guard")
+        _say("trouble   the emergency stop is not on disk: it would not outlive the guard")
     troubles = [*answer["troubles"], *(guard["troubles"] if guard else [])]
     for sentence in dict.fromkeys(troubles):
-        print(f"trouble   {sentence}")
+        _say(f"trouble   {sentence}")
     notes = [*answer["not_permitted"], *(guard["not_permitted"] + guard["notes"] if guard else [])]
     for sentence in dict.fromkeys(notes):
-        print(f"note      {sentence}")
+        _say(f"note      {sentence}")
 
 
 def safety_log(
@@ -141,11 +141,11 @@ def safety_log(
         return
     for event in events:
         when = datetime.fromtimestamp(float(str(event.get("wall", 0))), UTC).astimezone()
-        print(
+        _say(
             f"{when:%Y-%m-%d %H:%M:%S}  {event.get('who', ''):<7} {event.get('what', ''):<8} {event.get('detail', '')}"
         )
         if lost := event.get("lost_before"):
-            print(f"{'':21}before this, {lost} events were lost")
+            _say(f"{'':21}before this, {lost} events were lost")
 
 
 def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:
@@ -156,3 +156,8 @@ def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:
         return ask(folder or default_folder(), request)
     except GateError as error:
         fail(str(error))
+
+
+def _say(line: str) -> None:
+    """A line, some of which others may have written: the reason of a stop, say."""
+    print_foreign(f"{line}\n")

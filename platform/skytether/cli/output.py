@@ -18,6 +18,7 @@ from skytether.api.printable import printable
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
+    from rich.text import Text
 
 _WIDE = 10_000
 """Columns of a table that goes to a pipe or a file: more than any row has."""
@@ -87,16 +88,22 @@ def or_dash(value: Any) -> Any:
     return "-" if value is None else value
 
 
+def cell(value: Any) -> Text:
+    """What a table shows of a value, which others may have written: no code for the terminal, and no markup of ours."""
+    from rich.text import Text
+
+    return Text(printable(str(value)))
+
+
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """A table for people, on standard output."""
     from rich.table import Table
-    from rich.text import Text
 
     table = Table(box=None, pad_edge=False)
     for i, name in enumerate(head):
         table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
     for row in rows:
-        table.add_row(*(Text(str(cell)) for cell in row))
+        table.add_row(*(cell(value) for value in row))
     out = Console(highlight=False)
     # A program that reads lines must not find one row on two of them.
     out.print(table) if out.is_terminal else Console(highlight=False, width=_WIDE).print(table)

@@ -284,9 +284,8 @@ def watch_events(
                 print_json(plain(event))
             else:
                 code = f"{event.code}: " if event.code else ""
-                typer.echo(
-                    f"{event.at.isoformat(timespec='milliseconds')}  {event.state}  {code}{event.reason}".rstrip()
-                )
+                line = f"{event.at.isoformat(timespec='milliseconds')}  {event.state}  {code}{event.reason}"
+                print_foreign(f"{line.rstrip()}\n")
 
 
 @instance_app.command("delete")

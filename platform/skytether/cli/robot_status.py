@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .connection import Json
-from .output import console, fail, print_json
+from .output import cell, console, fail, print_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -46,7 +46,7 @@ def _tables(found: dict[str, Any]) -> list[Table]:
     from rich.table import Table
 
     link, task, instance = found["link"], found["task"], found["instance"]
-    about = Table(title=f"{found['robot']}: {found['service']}", show_header=False, title_justify="left")
+    about = Table(title=cell(f"{found['robot']}: {found['service']}"), show_header=False, title_justify="left")
     rows = [
         ("driven by", f"{found['source']} ({found['why']})"),
         ("velocity", _velocity(found["velocity"])),
@@ -62,18 +62,18 @@ def _tables(found: dict[str, Any]) -> list[Table]:
     if others:
         rows.append(("wheels", f"others publish their topic too: {', '.join(others)}"))
     for name, value in rows:
-        about.add_row(name, value)
+        about.add_row(name, cell(value))
     tables = [about]
     if task and task["options"]:
         options = Table("where", "cost", "of which", title="Where it could be done", title_justify="left")
         for option in task["options"]:
             parts = ", ".join(f"{name} {value:.2f}" for name, value in option["parts"].items())
             cost = "-" if option["cost"] is None else f"{option['cost']:.2f}"
-            options.add_row(option["name"], cost, option["refused"] or parts)
+            options.add_row(cell(option["name"]), cost, cell(option["refused"] or parts))
         tables.append(options)
     changes = Table("ago [s]", "driven by", "because", title="Hand-overs", title_justify="left")
     for change in reversed(found["transitions"]):
-        changes.add_row(f"{change['ago_s']:.1f}", change["source"], change["reason"])
+        changes.add_row(f"{change['ago_s']:.1f}", cell(change["source"]), cell(change["reason"]))
     tables.append(changes)
     return tables
 
