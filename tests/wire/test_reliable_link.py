@@ -1,11 +1,14 @@
 """Reliable topics between two sessions over made-up links: everything once, in order, whatever the link does."""
 
+import tracemalloc
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Role, Topic
+from skytether.wire.events import MessageReceived
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 TOPICS = (
@@ -210,6 +213,32 @@ def test_what_expands_beyond_the_largest_message_is_refused(world):
     link.run(1)
     assert received(link, SERVICE, "a") == [bytes(50_000)]
     assert link.sessions[SERVICE].stats(link.now).rejected == {"compressed": 1}
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_messages_that_grow_are_in_memory_one_at_a_time(world, reliable):
+    options = {"lifespan": 5.0, "depth": 99, "reliable": reliable, "compression": "zstd"}
+    topics = (Topic("a", "a/b", Direction.IN, **options),)
+    link = make(world, ends={"topics": topics})
+    link.run(1)
+    robot, service = link.sessions[ROBOT], link.sessions[SERVICE]
+    for _ in range(50):
+        robot.publish("a", bytes(1_000_000), link.now)
+    packets = []
+    while batches := robot.transmit(link.now):
+        for batch in batches:
+            step = batch.segment or len(batch.data)
+            packets += [bytes(batch.data[at : at + step]) for at in range(0, len(batch.data), step)]
+    tracemalloc.start()
+    for packet in reversed(packets):  # what is reliable waits for the first, and comes at once with it
+        service.receive(packet, link.addresses[ROBOT], link.time_of(SERVICE))
+    count = 0
+    while (event := service.next_event()) is not None:
+        count += isinstance(event, MessageReceived) and len(event.payload) == 1_000_000
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert count > 20
+    assert peak < 5_000_000
 
 
 def test_a_goodbye_that_leaves_an_acknowledgement_owed_leaves_nothing_due(world):

@@ -29,6 +29,10 @@ class Compressed(bytes):
     original: int
 
 
+class Packed(bytes):
+    """A payload as it came, compressed: small, whatever it grows to until it is taken."""
+
+
 def compress(payload: bytes) -> bytes:
     """`Compressed` if that is smaller, else the same."""
     if len(payload) < LEAST:
@@ -50,6 +54,15 @@ def decompress(data: bytes | memoryview, limit: int) -> bytes | None:
     except zstd.ZstdError:
         return None
     return payload if reader.eof else None
+
+
+def unpacked_size(data: bytes | memoryview, limit: int) -> int | None:
+    """Bytes that it says to grow to; None if it says nothing of the kind, or more than ``limit`` bytes."""
+    try:
+        size = zstd.get_frame_info(data).decompressed_size
+    except zstd.ZstdError:
+        return None
+    return size if size is not None and size <= limit else None
 
 
 def original_size(payload: bytes) -> int:

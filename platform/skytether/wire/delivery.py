@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from dataclasses import replace
 
 from .clock import ClockOffset
-from .compression import FLAG, decompress
+from .compression import FLAG, Packed, decompress, unpacked_size
 from .control import Forward
 from .epoch import Epoch, ReceiveTopic
 from .events import Event, MessageReceived
@@ -87,12 +88,13 @@ class Delivery:
     def _deliver(
         self, epoch: Epoch, topic: ReceiveTopic, sequence: int, stamp: int, payload: bytes | memoryview, now: float
     ) -> None:
+        size = len(payload)
         if stamp & FLAG:
-            whole = decompress(payload, self._max_message)
-            if whole is None:
+            grown = unpacked_size(payload, self._max_message)
+            if grown is None:
                 self._rejected["compressed"] += 1
                 return
-            payload = whole
+            payload, size = Packed(payload), grown
         micros, clock = stamp & ~FLAG, self.clock
         if epoch.belongs_with(self._epoch) and clock.known:
             sent_at = micros / 1e6 - clock.offset
@@ -101,10 +103,24 @@ class Delivery:
             sent_at, error = now, math.inf
         if topic.topic.reliable:
             # How long ago a latched message was published tells nothing of the link.
-            topic.delivered(len(payload), now - sent_at, math.inf if topic.topic.latched else error, now)
-        elif not topic.arrived(sequence, len(payload), now - sent_at, error, self._outdated(epoch, topic.index), now):
+            topic.delivered(size, now - sent_at, math.inf if topic.topic.latched else error, now)
+        elif not topic.arrived(sequence, size, now - sent_at, error, self._outdated(epoch, topic.index), now):
             return
         self._events.append(MessageReceived(topic.name, payload, sequence, sent_at, error, now))
+
+    def unpack(self, message: MessageReceived) -> MessageReceived | None:
+        """The message as it was published; None (counted) if that cannot be had.
+
+        Done when it is taken: of a thousand that a peer lets arrive at once, each of which grows to the largest that
+        there is, one at a time is in memory.
+        """
+        if not isinstance(message.payload, Packed):
+            return message
+        whole = decompress(message.payload, self._max_message)
+        if whole is None:
+            self._rejected["compressed"] += 1
+            return None
+        return replace(message, payload=whole)
 
     def _outdated(self, epoch: Epoch, index: int) -> bool:
         """Whether a message of the keys before comes after a newer one under the present keys."""

@@ -14,7 +14,7 @@ from .control import Forward, Goodbye, Ping, Report
 from .crypto import KEY_SIZE, TAG_SIZE
 from .delivery import Delivery
 from .epoch import Epoch
-from .events import Connected, Disconnected, Event
+from .events import Connected, Disconnected, Event, MessageReceived
 from .greeter import Greeter, Times
 from .handshake import Doorkeeper
 from .ledger import Ledger
@@ -266,7 +266,12 @@ class Session:
 
     def next_event(self) -> Event | None:
         """The oldest event not yet taken."""
-        return self._events.popleft() if self._events else None
+        while self._events:
+            event = self._events.popleft()
+            taken = self._delivery.unpack(event) if isinstance(event, MessageReceived) else event
+            if taken is not None:
+                return taken
+        return None
 
     def next_timer(self, full: Container[int] = ()) -> float | None:
         """When to call `handle_timer` and `transmit`, if nothing happens before; None: not by itself.
