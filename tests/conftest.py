@@ -20,6 +20,7 @@ from postgres_server import PostgresServer, own_server
 
 if TYPE_CHECKING:
     from docker_site import DockerSite, Images
+    from kubernetes_site import KubernetesSite
 
 # How long an example takes says nothing on a machine that others use too. `make fuzz` is where to look for more.
 # The same examples each time: a test that fails for somebody fails for everybody. SKYTETHER_RANDOM=1 draws others.
@@ -371,3 +372,43 @@ def docker_site(_docker_network: DockerSite) -> Iterator[DockerSite]:
     """A site on the real engine; its containers and volumes are removed after each test."""
     yield _docker_network
     _docker_network.clean()
+
+
+@pytest.fixture(scope="session")
+def kubeconfig(docker_engine: str) -> Iterator[str]:
+    """The administrator's, of a real cluster whose pods run in the Docker engine, so that it has the same images.
+
+    ``SKYTETHER_CLUSTER`` names the program that starts it (``up``, which prints the path) and stops it (``down``): it
+    takes a part of a processor, which other tests need.
+    """
+    program = os.environ.get("SKYTETHER_CLUSTER", "")
+    if not program:
+        require("kubernetes", "SKYTETHER_CLUSTER does not name the program that starts a cluster for tests")
+    # Its proxy lets packets of loopback leave the machine, from then on; other tests count on the kernel's refusal.
+    refusal = Path("/proc/sys/net/ipv4/conf/all/route_localnet")
+    before = refusal.read_text()
+    begun = subprocess.run([program, "up"], capture_output=True, text=True)
+    if begun.returncode:  # it fetches packages
+        begun = subprocess.run([program, "up"], capture_output=True, text=True)
+    if begun.returncode:
+        require("kubernetes", f"{program} up failed: {begun.stderr.strip()}")
+    yield begun.stdout.split()[-1]
+    subprocess.run([program, "down"], capture_output=True)
+    refusal.write_text(before)
+
+
+@pytest.fixture(scope="session")
+def _kubernetes_namespace(docker_images: Images, kubeconfig: str) -> Iterator[KubernetesSite]:
+    from kubernetes_site import KubernetesSite
+
+    site = KubernetesSite(docker_images, kubeconfig)
+    yield site
+    site.close()
+
+
+@pytest.fixture
+def kubernetes_site(_kubernetes_namespace: KubernetesSite) -> Iterator[KubernetesSite]:
+    """A site on the real cluster; what it has made is removed after each test."""
+    _kubernetes_namespace.begin()
+    yield _kubernetes_namespace
+    _kubernetes_namespace.clean()

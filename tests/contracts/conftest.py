@@ -117,6 +117,25 @@ class DockerKit(Kit):
         return len(self.site.labelled(f"skytether.io/instance={instance}", "status=running"))
 
 
+class KubernetesKit(Kit):
+    patience = 90.0
+
+    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
+        super().__init__(folder, request)
+        self.site: Any = request.getfixturevalue("kubernetes_site")
+        self.image = self.site.images.toy
+
+    def open(self, behaviour: str = "good") -> Runtime:
+        runtime = self.site.open(self.folder)
+        self.runtimes.append(runtime)
+        return runtime
+
+    def running(self, instance: str = "i1") -> int:
+        pods = self.site.there("pods", f"skytether.io/instance={instance}")
+        states = [one["state"] for pod in pods for one in pod["status"].get("containerStatuses", ())]
+        return sum("running" in state for state in states)
+
+
 class FakeKit(Kit):
     kind: type[FakeRuntime] = FakeRuntime
 
@@ -142,6 +161,9 @@ class SlowKit(FakeKit):
     params=[
         pytest.param(ProcessKit, id="process", marks=pytest.mark.slow),
         pytest.param(DockerKit, id="docker", marks=[pytest.mark.slow, pytest.mark.docker]),
+        pytest.param(
+            KubernetesKit, id="kubernetes", marks=[pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
+        ),
         pytest.param(FakeKit, id="fake"),
         pytest.param(SlowKit, id="slow"),
     ]

@@ -11,9 +11,10 @@ from pydantic import ValidationError
 
 from skytether.api.manifest import Opening, ServiceSpec
 from skytether.orchestrator.runtimes.base import RuntimeFailure
-from skytether.orchestrator.runtimes.docker.network import resolve, rules
+from skytether.orchestrator.runtimes.docker.network import rules
 from skytether.orchestrator.runtimes.docker.objects import refusal
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.egress import resolve
 
 
 def options(**given: Any) -> DockerOptions:

@@ -37,6 +37,9 @@ class Grant(Strict):
     """0: any free port; the one taken is told in ``ready_file``."""
     ready_file: str | None = None
     """Written (atomically) once the bridge listens: ``{"port": 40123, "pid": 4711}``."""
+    health_port: Annotated[int, Field(ge=0, le=65_535)] = 0
+    """TCP port of ``bind_host`` on which the service answers of its health over HTTP, see `skytether.service`; 0: its
+    runtime looks at the files."""
     data_dir: str = "."
     """Where the instance may write what it produces (recordings)."""
     idle_exit_s: float = 120

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 from .beat import beating
 from .clock import SystemClock
 from .errors import ConfigError, ServiceError
+from .health_port import answering
 from .loop import Loop
 from .params import read_params
 from .port import ServicePort, classes_of
@@ -108,7 +109,7 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
         port = ServicePort(service, clock.wake)
         loop = Loop(service, port, clock, grant.idle_exit_s)
         bridge = Bridge(spec, port, bind=(grant.bind_host, grant.bind_port))
-        with _ending_on_signals(loop):
+        with _ending_on_signals(loop), answering(grant):
             try:
                 bridge.start()
                 return _work(service, loop, bridge, grant)

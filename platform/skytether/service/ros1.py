@@ -38,6 +38,7 @@ from skytether.wire.topic import Role
 
 from .beat import touch
 from .errors import ConfigError, ServiceError
+from .health_port import answering
 from .main import read_grant, write_ready_file
 from .ros_guard import CORE, Guard
 
@@ -103,6 +104,7 @@ def _serve(grant: Grant, launch: str, environ: Mapping[str, str]) -> int:
         stack.callback(joined.port.close)
         stack.callback(bridge.stop)
         write_ready_file(grant, bridge.address[1])
+        stack.enter_context(answering(grant))
         return _work(grant, guard, node, joined, [*prefix, "roslaunch", *arguments])
 
 

@@ -1,7 +1,8 @@
 """The smallest thing that a runtime can run: ``python -m skytether.testing.toy_service``.
 
 It takes a UDP port, says that it is ready, and waits to be ended; its parameters (:class:`Behaviour`) make it fail in a
-chosen way. It speaks no protocol and imports the standard library only, so it is up in some tens of milliseconds.
+chosen way. It speaks no protocol and imports the standard library only (but in a pod), so it is up in some tens of
+milliseconds.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 _BEAT_S = 1.0
 """Between two touches of its ready file, as services show that they do not hang: their health check looks for that."""
@@ -63,9 +65,11 @@ def main() -> int:
     hoard = b"x" * (wanted.hog_mb << 20)
     for number in range(wanted.flood):
         print(f"line {number}")  # noqa: T201
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+    with ExitStack() as stack, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind((grant["bind_host"], grant["bind_port"]))
         ready = Path(grant["ready_file"])
+        if grant.get("health_port"):
+            stack.enter_context(_answering(grant))
         if wanted.report:
             told = {"reports": [{"number": 1, "code": "said", "message": wanted.report}]}
             ready.with_name("reports.json").write_text(json.dumps(told))
@@ -78,6 +82,14 @@ def main() -> int:
                 os.utime(ready)
     del hoard
     return 0
+
+
+def _answering(grant: dict[str, Any]) -> AbstractContextManager[None]:
+    """As services do in a pod."""
+    from skytether.api.grant import Grant
+    from skytether.service.health_port import answering
+
+    return answering(Grant.model_validate(grant))
 
 
 if __name__ == "__main__":

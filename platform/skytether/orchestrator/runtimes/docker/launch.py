@@ -15,12 +15,13 @@ from docker.errors import APIError, NotFound
 from skytether.api.manifest import Opening
 
 from ..base import Launch, OvertakenError, RuntimeFailure
+from ..egress import resolve
 from .engine import Engine, EngineGoneError, explain
 from .fence import Fence
 from .follow import Follower
 from .images import ensure_image
 from .namespaces import Namespaces
-from .network import close_off, guard_image, is_ours, resolve
+from .network import close_off, guard_image, is_ours
 from .objects import (
     OWNER,
     Namespace,

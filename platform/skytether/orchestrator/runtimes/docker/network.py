@@ -10,9 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import socket
-import threading
-import time
 from collections.abc import Iterable, Mapping
 
 from docker.errors import APIError, NotFound
@@ -20,7 +17,6 @@ from docker.errors import APIError, NotFound
 from skytether.api.manifest import Opening
 
 from ..base import RuntimeFailure
-from .egress import network_of
 from .engine import Engine, explain, status_of
 from .images import ensure_image
 from .objects import guard
@@ -36,8 +32,6 @@ _GUARD_TIMEOUT_S = 30
 _TABLE = "inet skytether"
 _NAME_SERVER, _NAMES = "127.0.0.11", 53
 """Where a Docker engine answers for names in each network that is not its own, and the port that is asked."""
-_LOOK_UP_S = 15.0
-"""For all names of one start; what is asked for again is in the name server's memory then."""
 
 
 def remove_old_guards(engine: Engine) -> None:
@@ -82,67 +76,6 @@ def rules(openings: Mapping[Opening, Iterable[str]]) -> str:
     own = f'add rule {_TABLE} untracked oifname "lo" notrack'
     added = "".join(f"add rule {_TABLE} output {rule}; " for rule in (*always, *allowed))
     return f"add table {_TABLE}; {chain}; {early}; {own}; {added}"
-
-
-def resolve(openings: Iterable[Opening], within_s: float = _LOOK_UP_S) -> dict[Opening, tuple[str, ...]]:
-    """The addresses of what is opened, as they are now: an instance keeps these, and has nobody to ask for others.
-
-    Those of a network, or of an address, are written with their prefix; those of a name are not.
-
-    Args:
-        openings: What is opened.
-        within_s: How long the names in it may take, all together [s].
-
-    Raises:
-        RuntimeFailure: A name has none, or nobody said so in time, or it is neither name nor address.
-    """
-    found: dict[Opening, tuple[str, ...]] = {}
-    names: list[Opening] = []
-    for opening in openings:
-        try:
-            network = network_of(opening)
-        except ValueError as error:
-            raise RuntimeFailure(f"needs.egress: {opening}: {error}") from error
-        if network is not None:
-            found[opening] = (str(network),)
-            continue
-        names.append(opening)
-    known = _look_up(dict.fromkeys(opening.host for opening in names), within_s) if names else {}
-    return found | {opening: known[opening.host] for opening in names}
-
-
-def _look_up(names: Iterable[str], within_s: float) -> dict[str, tuple[str, ...]]:
-    """The addresses of names, in a thread: a name server that is silent takes half a minute for each.
-
-    Each is asked for once: of many addresses a server may give others each time, and there is one file of hosts within.
-    """
-    deadline = time.monotonic() + within_s
-    found: dict[str, tuple[str, ...]] = {}
-    trouble: list[str] = []
-
-    def ask() -> None:
-        for name in names:
-            if time.monotonic() > deadline:
-                return
-            try:
-                rows = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
-            except (OSError, UnicodeError) as error:
-                trouble.append(f"{name} has no address: {error}")
-                return
-            # fe80::1%eth0 is of an interface of this machine, which means nothing within.
-            addresses = dict.fromkeys(str(row[4][0]) for row in rows if "%" not in str(row[4][0]))
-            if not addresses:
-                trouble.append(f"{name} has no address but of this machine's own links")
-                return
-            found[name] = tuple(addresses)
-
-    thread = threading.Thread(target=ask, name="docker-names", daemon=True)
-    thread.start()
-    thread.join(within_s)
-    late = thread.is_alive() or time.monotonic() > deadline
-    if trouble or late:
-        raise RuntimeFailure(f"needs.egress: {trouble[0] if trouble else 'the name server does not answer in time'}")
-    return found
 
 
 def ensure_network(engine: Engine, options: DockerOptions) -> None:

@@ -15,7 +15,7 @@ from skytether.api.manifest import ServiceSpec
 from skytether.api.service_report import FILE_NAME, ServiceReport
 
 from ..base import Launch, Observation, Phase, RuntimeFailure
-from .egress import refusal_of
+from ..egress import refusal_of
 from .meter import Usage
 from .options import DockerOptions
 

@@ -8,16 +8,23 @@ from __future__ import annotations
 
 import ipaddress
 import re
+import socket
+import threading
+import time
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from skytether.api.manifest import Opening
 
+from .base import RuntimeFailure
+
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 _NUMBER = re.compile(r"([0-9]+|0x[0-9a-f]*)")
 """The last label of what a resolver takes for an address, however it is written: 127.1, 0x7f000001."""
 _BYTES, _BITS = 4, 8
+_LOOK_UP_S = 15.0
+"""For all names of one start; what is asked for again is in the name server's memory then."""
 
 
 class _Pattern(NamedTuple):
@@ -101,3 +108,64 @@ def refusal_of(openings: Iterable[Opening], patterns: Iterable[str]) -> str | No
     if closed:
         return f"the site lets nobody connect to {', '.join(closed)}: add it to the site's option 'egress'"
     return None
+
+
+def resolve(openings: Iterable[Opening], within_s: float = _LOOK_UP_S) -> dict[Opening, tuple[str, ...]]:
+    """The addresses of what is opened, as they are now: an instance keeps these, and has nobody to ask for others.
+
+    Those of a network, or of an address, are written with their prefix; those of a name are not.
+
+    Args:
+        openings: What is opened.
+        within_s: How long the names in it may take, all together [s].
+
+    Raises:
+        RuntimeFailure: A name has none, or nobody said so in time, or it is neither name nor address.
+    """
+    found: dict[Opening, tuple[str, ...]] = {}
+    names: list[Opening] = []
+    for opening in openings:
+        try:
+            network = network_of(opening)
+        except ValueError as error:
+            raise RuntimeFailure(f"needs.egress: {opening}: {error}") from error
+        if network is not None:
+            found[opening] = (str(network),)
+            continue
+        names.append(opening)
+    known = _look_up(dict.fromkeys(opening.host for opening in names), within_s) if names else {}
+    return found | {opening: known[opening.host] for opening in names}
+
+
+def _look_up(names: Iterable[str], within_s: float) -> dict[str, tuple[str, ...]]:
+    """The addresses of names, in a thread: a name server that is silent takes half a minute for each.
+
+    Each is asked for once: of many addresses a server may give others each time, and there is one file of hosts within.
+    """
+    deadline = time.monotonic() + within_s
+    found: dict[str, tuple[str, ...]] = {}
+    trouble: list[str] = []
+
+    def ask() -> None:
+        for name in names:
+            if time.monotonic() > deadline:
+                return
+            try:
+                rows = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
+            except (OSError, UnicodeError) as error:
+                trouble.append(f"{name} has no address: {error}")
+                return
+            # fe80::1%eth0 is of an interface of this machine, which means nothing within.
+            addresses = dict.fromkeys(str(row[4][0]) for row in rows if "%" not in str(row[4][0]))
+            if not addresses:
+                trouble.append(f"{name} has no address but of this machine's own links")
+                return
+            found[name] = tuple(addresses)
+
+    thread = threading.Thread(target=ask, name="egress-names", daemon=True)
+    thread.start()
+    thread.join(within_s)
+    late = thread.is_alive() or time.monotonic() > deadline
+    if trouble or late:
+        raise RuntimeFailure(f"needs.egress: {trouble[0] if trouble else 'the name server does not answer in time'}")
+    return found

@@ -1,0 +1,370 @@
+"""What is asked of an API server, and what its answers mean: pure, data in and data out.
+
+A run is a pod that is never restarted. It waits for a Secret of its own name, with the grant: it is made by that, and
+begun when the Secret is there. All else that belongs to a run is owned by its pod, and goes with it.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from skytether.api.grant import GRANT_VARIABLE
+from skytether.api.manifest import Opening, ServiceSpec
+
+from ..base import Capacity, Launch
+from ..egress import refusal_of
+from .options import KubernetesOptions
+
+Document = Mapping[str, Any]
+USER = 65_532
+"""Who every service is."""
+PORT, HEALTH_PORT = 7600, 7601
+"""Of the bridge (UDP), and of what the SDK answers of its health (TCP), in the pod."""
+GRACE_S = 5
+"""Seconds between SIGTERM and SIGKILL."""
+_ROOT = "/run/skytether"
+_GRANT = f"{_ROOT}/grant"
+_OWN = f"{_ROOT}/instance"
+_DATA = f"{_ROOT}/data"
+_PREFIX = "skytether.io"
+OWNER, INSTANCE, ATTEMPT = f"{_PREFIX}/owner", f"{_PREFIX}/instance", f"{_PREFIX}/attempt"
+EPOCH = f"{_PREFIX}/epoch"
+"""Annotation: of the leader."""
+NODE_PORT = f"{_PREFIX}/port"
+"""Annotation of a pod: the port of its nodes at which a Service of its instance is reached."""
+FAILURE = f"{_PREFIX}/failure"
+"""Annotation of a pod that was given up: why."""
+MANAGED = {"app.kubernetes.io/managed-by": "skytether", "app.kubernetes.io/part-of": "skytether"}
+_GPU = "nvidia.com/gpu"
+_PULL = {"missing": "IfNotPresent", "always": "Always", "never": "Never"}
+
+
+def name_of(owner: str, instance: str, attempt: int) -> str:
+    """Of a run's pod, and of its Secret."""
+    return f"skytether-{owner}-{instance}-{attempt}"
+
+
+def refusal(spec: ServiceSpec, options: KubernetesOptions) -> str | None:
+    """Why a site with these options can never run the service; None: it can."""
+    if not spec.image:
+        return "the service has no image, only an entrypoint: it needs a process site"
+    if options.pinned and "@sha256:" not in spec.image:
+        return f"image '{spec.image}' is named without its digest, and the site takes pinned images only"
+    if spec.needs.devices:
+        return f"a cluster gives no device files, and the service needs {', '.join(spec.needs.devices)}"
+    return refusal_of(spec.needs.openings, options.egress)
+
+
+def free_port(ports: tuple[int, int], preferred: int, taken: Iterable[int]) -> int | None:
+    """The preferred one, or the next that nobody has, round and round; None: all are taken."""
+    used, (first, last) = set(taken), ports
+    size = last - first + 1
+    begin = (preferred - first) % size
+    return next((port for n in range(size) if (port := first + (begin + n) % size) not in used), None)
+
+
+def usual_port(ports: tuple[int, int], owner: str, instance: str) -> int:
+    """Where the search for an instance's port begins: elsewhere for each.
+
+    Other sites may choose of the same range, and none knows of the ports that others have.
+    """
+    return ports[0] + zlib.crc32(f"{owner}/{instance}".encode()) % (ports[1] - ports[0] + 1)
+
+
+Openings = Mapping[Opening, Iterable[str]]
+"""What a run may connect to, with the addresses of each."""
+
+
+def pod(
+    launch: Launch,
+    options: KubernetesOptions,
+    owner: str,
+    port: int | None,
+    openings: Openings,
+    *,
+    node_port: int | None = None,
+    epoch: int = 0,
+) -> dict[str, Any]:
+    """The pod of a run.
+
+    Args:
+        launch: What to start.
+        options: The site's.
+        owner: Whose pods these are.
+        port: UDP port of its node; None: it has none.
+        openings: What it may connect to: it knows the names of these.
+        node_port: Of the Service by which it is reached; None: there is none.
+        epoch: Of the leader; 0: there is none.
+    """
+    spec, grant = launch.spec, launch.grant
+    name = name_of(owner, grant.instance, launch.attempt)
+    environment = {**options.environment, GRANT_VARIABLE: f"{_GRANT}/grant.json"}
+    reached = {"containerPort": PORT, "protocol": "UDP", **({"hostPort": port} if port is not None else {})}
+    aliases = [
+        {"ip": address, "hostnames": [opening.host]}
+        for opening, addresses in openings.items()
+        for address in addresses
+        if "/" not in address
+    ]
+    health = {"httpGet": {"path": "/healthz", "port": HEALTH_PORT}, "periodSeconds": 1, "timeoutSeconds": 2}
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": {
+            "name": name,
+            "labels": {
+                **options.labels,
+                **MANAGED,
+                "app.kubernetes.io/name": grant.service,
+                "app.kubernetes.io/instance": grant.instance,
+                f"{_PREFIX}/robot": grant.robot,
+                f"{_PREFIX}/service": grant.service,
+                OWNER: owner,
+                INSTANCE: grant.instance,
+                ATTEMPT: str(launch.attempt),
+            },
+            "annotations": {EPOCH: str(epoch), **({NODE_PORT: str(node_port)} if node_port else {})},
+        },
+        "spec": {
+            "restartPolicy": "Never",
+            "terminationGracePeriodSeconds": GRACE_S,
+            "automountServiceAccountToken": False,
+            "enableServiceLinks": False,
+            "shareProcessNamespace": True,  # as process 1, a service that has no handler yet could not be ended
+            "securityContext": {
+                "runAsNonRoot": True,
+                "runAsUser": USER,
+                "runAsGroup": USER,
+                "fsGroup": USER,
+                "seccompProfile": {"type": "RuntimeDefault"},
+            },
+            "dnsPolicy": "None",  # nobody to ask: names would be a way out
+            "dnsConfig": {"nameservers": ["127.0.0.1"]},
+            **({"hostAliases": aliases} if aliases else {}),
+            **({"nodeSelector": options.node_selector} if options.node_selector else {}),
+            **({"tolerations": list(options.tolerations)} if options.tolerations else {}),
+            **({"priorityClassName": options.priority_class} if options.priority_class else {}),
+            **(
+                {"imagePullSecrets": [{"name": secret} for secret in options.image_pull_secrets]}
+                if options.image_pull_secrets
+                else {}
+            ),
+            "topologySpreadConstraints": [
+                {
+                    "maxSkew": 1,
+                    "topologyKey": "kubernetes.io/hostname",
+                    "whenUnsatisfiable": "ScheduleAnyway",
+                    "labelSelector": {"matchLabels": {OWNER: owner}},
+                }
+            ],
+            "containers": [
+                {
+                    "name": "service",
+                    "image": spec.image,
+                    "imagePullPolicy": _PULL[options.pull],
+                    "env": [{"name": key, "value": value} for key, value in environment.items()],
+                    "ports": [reached],
+                    "resources": _resources(spec),
+                    "securityContext": {
+                        "allowPrivilegeEscalation": False,
+                        "readOnlyRootFilesystem": True,
+                        "capabilities": {"drop": ["ALL"]},
+                    },
+                    # Until its service is ready; how long that may take the orchestrator knows.
+                    "startupProbe": {**health, "failureThreshold": 1_000_000},
+                    "readinessProbe": {**health, "failureThreshold": 2},
+                    "terminationMessagePolicy": "FallbackToLogsOnError",
+                    "volumeMounts": [
+                        {"name": "grant", "mountPath": _GRANT, "readOnly": True},
+                        {"name": "own", "mountPath": _OWN},
+                        {"name": "data", "mountPath": _DATA},
+                        {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108 (the container's own)
+                    ],
+                }
+            ],
+            "volumes": [
+                {"name": "grant", "secret": {"secretName": name, "defaultMode": 0o440}},
+                {"name": "own", "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
+                {"name": "data", "emptyDir": {"sizeLimit": f"{options.data_mb}Mi"}},
+                {"name": "tmp", "emptyDir": {"medium": "Memory", "sizeLimit": "64Mi"}},
+            ],
+        },
+    }
+
+
+def _resources(spec: ServiceSpec) -> dict[str, Any]:
+    needs, limits = spec.needs, spec.limits
+    memory = limits.memory_mb or needs.memory_mb
+    gpus = {_GPU: str(needs.gpu)} if needs.gpu else {}
+    return {
+        "requests": {"cpu": _cores(needs.cpu), "memory": f"{needs.memory_mb}Mi", **gpus},
+        "limits": {"cpu": _cores(limits.cpu or max(1.0, needs.cpu)), "memory": f"{memory}Mi", **gpus},
+    }
+
+
+def _cores(cores: float) -> str:
+    return f"{max(1, round(1000 * cores))}m"
+
+
+def owned_by(made: Document) -> list[dict[str, Any]]:
+    """``ownerReferences`` of what belongs to a pod."""
+    meta = made["metadata"]
+    return [{"apiVersion": "v1", "kind": "Pod", "name": meta["name"], "uid": meta["uid"], "controller": True}]
+
+
+def secret(launch: Launch, owner: str, made: Document) -> dict[str, Any]:
+    """With the grant, for the pod that was made."""
+    told = {
+        "bind_host": "0.0.0.0",  # noqa: S104 (in its own network)
+        "bind_port": PORT,
+        "health_port": HEALTH_PORT,
+        "ready_file": f"{_OWN}/ready.json",
+        "data_dir": _DATA,
+    }
+    grant = launch.grant.model_copy(update=told).model_dump_json().encode()
+    return {
+        "apiVersion": "v1",
+        "kind": "Secret",
+        "type": "Opaque",
+        "immutable": True,
+        "metadata": {
+            "name": made["metadata"]["name"],
+            "labels": {**MANAGED, OWNER: owner, INSTANCE: launch.instance},
+            "ownerReferences": owned_by(made),
+        },
+        "data": {"grant.json": base64.b64encode(grant).decode()},
+    }
+
+
+def service(instance: str, owner: str) -> dict[str, Any]:
+    """The Service of an instance, by which each of its runs is reached at the same port of the nodes."""
+    return {
+        "apiVersion": "v1",
+        "kind": "Service",
+        "metadata": {
+            "name": f"skytether-{owner}-{instance}",
+            "labels": {**MANAGED, OWNER: owner, INSTANCE: instance},
+        },
+        "spec": {
+            "type": "NodePort",
+            "externalTrafficPolicy": "Local",  # robots are told the pod's own node, and the service sees who they are
+            "selector": {OWNER: owner, INSTANCE: instance},
+            "ports": [{"port": PORT, "protocol": "UDP"}],
+        },
+    }
+
+
+def site_policy(owner: str) -> dict[str, Any]:
+    """The NetworkPolicy of a site's pods: robots reach their services, and these reach nobody."""
+    return {
+        "apiVersion": "networking.k8s.io/v1",
+        "kind": "NetworkPolicy",
+        "metadata": {"name": f"skytether-{owner}", "labels": {**MANAGED, OWNER: owner}},
+        "spec": {
+            "podSelector": {"matchLabels": {OWNER: owner}},
+            "policyTypes": ["Ingress", "Egress"],
+            "ingress": [{"ports": [{"port": PORT, "protocol": "UDP"}, {"port": HEALTH_PORT, "protocol": "TCP"}]}],
+            "egress": [],
+        },
+    }
+
+
+def openings_policy(openings: Openings, made: Document, owner: str) -> dict[str, Any]:
+    """The NetworkPolicy of one run that may connect to some addresses."""
+    meta = made["metadata"]
+    return {
+        "apiVersion": "networking.k8s.io/v1",
+        "kind": "NetworkPolicy",
+        "metadata": {
+            "name": meta["name"],
+            "labels": {**MANAGED, OWNER: owner, INSTANCE: meta["labels"][INSTANCE]},
+            "ownerReferences": owned_by(made),
+        },
+        "spec": {
+            "podSelector": {"matchLabels": {key: meta["labels"][key] for key in (OWNER, INSTANCE, ATTEMPT)}},
+            "policyTypes": ["Egress"],
+            "egress": [
+                {
+                    "to": [{"ipBlock": {"cidr": _network(address)}} for address in addresses],
+                    "ports": [{"port": opening.port, "protocol": opening.protocol.upper()}],
+                }
+                for opening, addresses in openings.items()
+            ],
+        },
+    }
+
+
+def _network(address: str) -> str:
+    return address if "/" in address else f"{address}/{128 if ':' in address else 32}"
+
+
+def leader(owner: str, epoch: int) -> dict[str, Any]:
+    """The ConfigMap that says who leads."""
+    return {
+        "apiVersion": "v1",
+        "kind": "ConfigMap",
+        "metadata": {"name": f"skytether-{owner}-leader", "labels": {**MANAGED, OWNER: owner}},
+        "data": {"epoch": str(epoch)},
+    }
+
+
+def capacity(nodes: Iterable[Document], options: KubernetesOptions) -> Capacity:
+    """What nodes give that may have pods of the site."""
+    cpu = memory = 0.0
+    gpu = 0
+    architectures = set()
+    for node in nodes:
+        labels = node["metadata"].get("labels") or {}
+        if node["spec"].get("unschedulable") or any(labels.get(k) != v for k, v in options.node_selector.items()):
+            continue
+        if not all(_tolerated(taint, options) for taint in node["spec"].get("taints") or ()):
+            continue
+        gives = node["status"]["allocatable"]
+        cpu += quantity(gives["cpu"])
+        memory += quantity(gives["memory"])
+        gpu += int(quantity(gives.get(_GPU, "0")))
+        architectures.add(node["status"]["nodeInfo"]["architecture"])
+    return Capacity(
+        cpu=options.cpu if options.cpu is not None else cpu,
+        memory_mb=options.memory_mb if options.memory_mb is not None else int(memory) >> 20,
+        gpu=options.gpu if options.gpu is not None else gpu,
+        architecture=architectures.pop() if len(architectures) == 1 else "",
+    )
+
+
+def _tolerated(taint: Document, options: KubernetesOptions) -> bool:
+    if taint["effect"] == "PreferNoSchedule":
+        return True
+    for toleration in options.tolerations:
+        key, effect = toleration.get("key"), toleration.get("effect")
+        if key not in (None, "", taint["key"]) or effect not in (None, "", taint["effect"]):
+            continue
+        if toleration.get("operator", "Equal") == "Exists" or toleration.get("value", "") == taint.get("value", ""):
+            return True
+    return False
+
+
+_UNITS = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "P": 1e15, "E": 1e18} | {
+    f"{unit}i": 1024.0**power for power, unit in enumerate("KMGTPE", start=1)
+}
+
+
+def quantity(text: str) -> float:
+    """Of a resource: ``500m``, ``16Gi``.
+
+    Raises:
+        ValueError: It is none.
+    """
+    for unit in (text[-2:], text[-1:]):
+        if unit in _UNITS:
+            return float(text[: -len(unit)]) * _UNITS[unit]
+    return float(text)
+
+
+def external_address(node: Document) -> str:
+    """At which others reach a node; empty: it says nothing of that."""
+    by_kind = {one["type"]: one["address"] for one in (node.get("status") or {}).get("addresses") or ()}
+    return str(by_kind.get("ExternalIP") or by_kind.get("InternalIP") or "")

@@ -1,0 +1,76 @@
+"""What services in pods report: their pods are asked for it by way of the API server, now and then and in a thread."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+
+from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
+
+from ..base import RuntimeFailure
+from .cluster import Cluster
+from .objects import HEALTH_PORT
+
+log = logging.getLogger(__name__)
+
+_EVERY_S = 3.0
+"""Seconds between two looks at all of them."""
+
+
+class ReportReader:
+    """Knows the newest reports of a site's pods. Safe from any thread."""
+
+    def __init__(
+        self, cluster: Cluster, running: Callable[[], Iterable[str]], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """``running`` tells the pods to look at; it may raise what the cluster's failure is."""
+        self._cluster = cluster
+        self._running = running
+        self._clock = clock
+        self._looked_at = -_EVERY_S
+        self._thread: threading.Thread | None = None
+        self._closing = False
+        self._known: Mapping[str, tuple[ServiceReport, ...]] = {}
+
+    def of(self, pod: str) -> tuple[ServiceReport, ...]:
+        """What it reported, as read last."""
+        return self._known.get(pod, ())
+
+    def begin(self) -> None:
+        """Look at them, unless that is under way or was done a moment ago. Does not wait."""
+        if self._clock() - self._looked_at < _EVERY_S or (self._thread is not None and self._thread.is_alive()):
+            return
+        self._looked_at = self._clock()
+        self._thread = threading.Thread(target=self._look, name="kubernetes-reports", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing = True
+
+    def _look(self) -> None:
+        found: dict[str, tuple[ServiceReport, ...]] = {}
+        try:
+            for pod in self._running():
+                if self._closing:
+                    return
+                told = self._ask(pod)
+                if told:
+                    found[pod] = told
+        except RuntimeFailure as error:
+            log.debug("reports of services are not read: %s", error)
+            return
+        self._known = found
+
+    def _ask(self, pod: str) -> tuple[ServiceReport, ...]:
+        path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")
+        try:
+            text = self._cluster.text(path)
+            return pull_reports(json.loads(text)) if len(text) <= MOST_BYTES else ()
+        except (ValueError, RecursionError):
+            return ()
+        except RuntimeFailure as error:  # this one alone: it has just ended, or speaks no HTTP
+            log.debug("reports of pod %s are not read: %s", pod, error)
+            return self._known.get(pod, ())

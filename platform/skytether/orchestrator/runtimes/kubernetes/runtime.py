@@ -1,0 +1,445 @@
+"""A Kubernetes cluster as a site: the calls of the contract."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import override
+
+from skytether.api.manifest import ServiceSpec, Strict
+
+from ..base import (
+    Capacity,
+    Launch,
+    LogStream,
+    Observation,
+    OvertakenError,
+    Phase,
+    Runtime,
+    RuntimeFailure,
+    SiteSilentError,
+)
+from ..egress import resolve
+from .cluster import Cluster, RefusedError
+from .fence import Fence
+from .logs import PodLog
+from .objects import (
+    FAILURE,
+    GRACE_S,
+    INSTANCE,
+    OWNER,
+    USER,
+    capacity,
+    external_address,
+    free_port,
+    openings_policy,
+    pod,
+    refusal,
+    secret,
+    service,
+    site_policy,
+    usual_port,
+)
+from .options import KubernetesOptions
+from .reports import ReportReader
+from .seen import Seen, observation
+from .watch import Watch
+
+log = logging.getLogger(__name__)
+
+_KEPT = 2
+"""Earlier runs whose pods stay, for their logs."""
+_NODES_S = 30.0
+"""Seconds between two looks at the nodes."""
+_NETWORKING = "networking.k8s.io/v1"
+_SWEEP_S = 60.0
+"""Seconds between two looks for Services whose instances are gone."""
+_LINGERS_S = GRACE_S + 1.0
+"""After so many seconds nothing of a pod that lingers runs any more."""
+_UNBEGUN_S = 30.0
+"""A pod that has no Secret after so many seconds was made by an orchestrator that was killed then."""
+
+
+class KubernetesRuntime(Runtime):
+    """Runs services as pods of one namespace. What is seen comes from a watch; a start is some calls, and no wait."""
+
+    Options = KubernetesOptions
+    unique = "owner"
+    runs_as_us = False
+    owner_options = frozenset(
+        {"kubeconfig", "context", "namespace", "egress", "tolerations", "priority_class", "image_pull_secrets"}
+    )
+
+    @override
+    def __init__(self, site: str, folder: Path, options: Strict) -> None:
+        if not isinstance(options, KubernetesOptions):
+            raise TypeError("options must be KubernetesOptions")
+        self._site = site
+        self._options = options
+        self._owner = options.owner or _kept_owner(folder)
+        self._cluster = Cluster(options)
+        self._fence = Fence(self._cluster, self._owner)
+        self._watch = Watch(self._cluster, self._owner)
+        self._reports = ReportReader(self._cluster, self._ready)
+        self._lock = threading.Lock()
+        self._unrun: dict[str, Observation] = {}
+        """Of instances whose pod no node has taken when it was removed: nothing of it is left to be seen."""
+        self._begun: set[str] = set()
+        """Uids of pods whose Secret is known to be there."""
+        self._waiting: dict[str, Launch] = {}
+        """Of pods that we made and no node has taken yet, by uid."""
+        self._refused: set[int] = set()
+        """Ports that others have."""
+        self._policy_there = False
+        self._swept_at = time.monotonic()
+        self._capacity: tuple[float, Capacity] | None = None
+        self._nodes: Mapping[str, str] = {}
+        """External addresses, by their names."""
+        self._blocked = ""
+        self._watch.start()
+
+    @override
+    @classmethod
+    def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return {"owner": secrets.token_hex(6), **options}
+
+    def _ready(self) -> list[str]:
+        return [seen.name for seen in self._watch.seen(0) if seen.running]
+
+    @override
+    def blocked(self) -> str:
+        return self._blocked
+
+    @override
+    def isolation(self) -> tuple[str, ...]:
+        return (f"user {USER}", "no capabilities", "seccomp", "network policy")
+
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return refusal(spec, self._options)
+
+    def capacity(self) -> Capacity:
+        self._watch.seen(self._options.timeout_s)
+        if self._capacity is None or time.monotonic() - self._capacity[0] >= _NODES_S:
+            self._capacity = time.monotonic(), self._look_at_nodes()
+        return self._capacity[1]
+
+    def _look_at_nodes(self) -> Capacity:
+        options = self._options
+        try:
+            nodes = self._cluster.get("/api/v1/nodes")["items"]
+        except RefusedError as error:
+            if options.cpu is None or options.memory_mb is None:
+                raise RuntimeFailure(
+                    f"{error}: give the site's account that right, or the site the options cpu and memory_mb"
+                ) from error
+            nodes = []
+        self._nodes = {node["metadata"]["name"]: external_address(node) for node in nodes}
+        return capacity(nodes, options)
+
+    @override
+    def lead(self, epoch: int) -> None:
+        self._fence.lead(epoch)
+        self._watch.catch_up()  # after that: what the leader before has begun is in it
+        self._remove_unbegun(0.0)
+
+    def _must_lead(self) -> None:
+        self._fence.must_lead()
+
+    def start(self, launch: Launch) -> None:
+        there = self._watch.of(launch.instance, self._options.timeout_s)
+        self._must_lead()
+        newest = there[-1] if there else None
+        if newest is not None and newest.attempt > launch.attempt and not newest.ended:
+            raise OvertakenError(
+                f"attempt {newest.attempt} of {launch.instance} runs, which another orchestrator has begun"
+            )
+        if newest is not None and newest.attempt == launch.attempt:
+            if newest.removed:
+                raise SiteSilentError("somebody has deleted its pod, which is not gone yet")
+            return
+        with self._lock:
+            told = self._unrun.get(launch.instance)
+            if told is not None and told.attempt >= launch.attempt:
+                return
+        self._must_hold_policy()
+        for seen in there:
+            if not seen.ended or seen.attempt < launch.attempt - _KEPT:
+                self._delete(seen)
+        with self._lock:
+            self._unrun.pop(launch.instance, None)
+        self._create(launch, newest.host_port if newest is not None else None)
+
+    def _create(self, launch: Launch, preferred: int | None) -> None:
+        """Have the pod made, and begun unless somebody else leads by now; ``preferred``: the UDP port."""
+        openings = resolve(launch.spec.needs.openings)
+        port = self._port(launch.instance, preferred) if self._options.reach == "hostport" else None
+        node_port = self._node_port(launch.instance) if self._options.reach == "nodeport" else None
+        asked = launch, self._options, self._owner, port, openings
+        body = pod(*asked, node_port=node_port, epoch=self._fence.epoch)
+        try:
+            made = self._cluster.create(self._cluster.path("pods"), body)
+        except RefusedError as error:
+            if error.reason == "AlreadyExists":
+                self._watch.catch_up()  # another orchestrator has begun this very run
+                return
+            raise RuntimeFailure(f"the cluster refuses it: {error}") from error
+        try:
+            self._must_lead()  # now that it is there for a later leader to see
+            if openings:
+                self._put("networkpolicies", openings_policy(openings, made, self._owner), _NETWORKING)
+            self._put("secrets", secret(launch, self._owner, made))
+        except BaseException:
+            with suppress(RuntimeFailure):
+                self._remove_pod(made["metadata"]["name"], made["metadata"]["uid"], grace_s=0)
+            raise
+        self._begun.add(made["metadata"]["uid"])
+        self._waiting[made["metadata"]["uid"]] = launch
+        self._watch.take(made)
+
+    def _put(self, kind: str, body: dict[str, Any], group: str = "") -> None:
+        """Create what belongs to a pod, in the place of what an earlier pod of its name has left."""
+        try:
+            self._cluster.create(self._cluster.path(kind, group=group), body)
+        except RefusedError as error:
+            if error.reason != "AlreadyExists":
+                raise
+            self._cluster.delete(self._cluster.path(kind, body["metadata"]["name"], group=group))
+            self._cluster.create(self._cluster.path(kind, group=group), body)
+
+    def _port(self, instance: str, preferred: int | None) -> int:
+        ports = self._options.ports
+        there = self._watch.seen(self._options.timeout_s)
+        # Its own of the run before is free: that run is ended.
+        taken = {seen.host_port for seen in there if not seen.ended and seen.instance != instance} | self._refused
+        if preferred is None or not ports[0] <= preferred <= ports[1]:
+            preferred = usual_port(ports, self._owner, instance)
+        port = free_port(ports, preferred, [port for port in taken if port is not None])
+        if port is None:
+            self._refused.clear()  # whoever had them may be gone
+            raise RuntimeFailure(f"every UDP port from {ports[0]} to {ports[1]} is taken (option 'ports')")
+        return port
+
+    def _give_other_ports(self, there: Iterable[Seen]) -> None:
+        """To pods of ours that no node takes, for others have their ports."""
+        for seen in there:
+            if seen.node or seen.ended:
+                self._waiting.pop(seen.uid, None)
+            elif seen.port_taken and seen.host_port is not None and (launch := self._waiting.pop(seen.uid, None)):
+                log.info("site %s: UDP port %d of every node is taken by others", self._site, seen.host_port)
+                self._must_lead()
+                self._refused.add(seen.host_port)
+                self._delete(seen)
+                try:
+                    self._create(launch, seen.host_port + 1)
+                except SiteSilentError:
+                    raise
+                except RuntimeFailure as error:
+                    self._leave(seen, f"could not be started: {error}", unstarted=True)
+
+    def _node_port(self, instance: str) -> int:
+        """Of the instance's Service, which is made if it is not there."""
+        body = service(instance, self._owner)
+        try:
+            there = self._cluster.create(self._cluster.path("services"), body)
+        except RefusedError as error:
+            if error.reason != "AlreadyExists":
+                raise RuntimeFailure(f"the cluster refuses it: {error}") from error
+            there = self._cluster.get(self._cluster.path("services", body["metadata"]["name"]))
+        return int(there["spec"]["ports"][0]["nodePort"])
+
+    def _remove_services(self, kept: Collection[str]) -> None:
+        """Of instances that are not among these."""
+        for one in self._labelled("services"):
+            if one["metadata"]["labels"].get(INSTANCE) not in kept:
+                self._must_lead()
+                self._cluster.delete(self._cluster.path("services", one["metadata"]["name"]))
+
+    def _labelled(self, kind: str, group: str = "") -> list[Any]:
+        """Objects of a kind that are this site's."""
+        path = self._cluster.path(kind, group=group)
+        found: list[Any] = self._cluster.get(path, labelSelector=f"{OWNER}={self._owner}")["items"]
+        return found
+
+    def _must_hold_policy(self) -> None:
+        """The NetworkPolicy of all pods is there; made again should somebody have removed it."""
+        if self._policy_there:
+            return
+        body = site_policy(self._owner)
+        try:
+            self._cluster.create(self._cluster.path("networkpolicies", group=_NETWORKING), body)
+        except RefusedError as error:
+            if error.reason != "AlreadyExists":
+                self._blocked = str(error)
+                raise
+        self._policy_there, self._blocked = True, ""
+
+    def observe(self) -> Mapping[str, Observation]:
+        newest: dict[str, Seen] = {}
+        for seen in self._watch.seen(self._options.timeout_s):
+            if seen.removed:
+                continue
+            if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
+                newest[seen.instance] = seen
+        found = {
+            instance: observation(
+                seen,
+                self._options,
+                self._nodes.get(seen.node, ""),
+                self._reports.of(seen.name),
+                over=self._watch.lingered_s(seen) > _LINGERS_S,
+                ill=self._watch.ill(seen),
+            )
+            for instance, seen in newest.items()
+        }
+        with self._lock:
+            for instance, told in self._unrun.items():
+                if instance not in found or found[instance].attempt <= told.attempt:
+                    found[instance] = told
+        return found
+
+    def stop(self, instance: str, *, force: bool) -> None:
+        there = self._watch.of(instance, self._options.timeout_s)
+        self._must_lead()  # after the look: nothing of it was begun by a later leader
+        for seen in there:
+            if seen.ended or (seen.stops and not force):
+                continue
+            if not seen.running:
+                self._delete(seen)
+                self._leave(seen, "was stopped before it ran")
+            elif not seen.stops:
+                self._end(seen)
+
+    def _leave(self, seen: Seen, detail: str, *, unstarted: bool = False) -> None:
+        """Remember how a run ended of which nothing is left."""
+        with self._lock:
+            self._unrun[seen.instance] = Observation(seen.attempt, Phase.EXITED, detail=detail, unstarted=unstarted)
+
+    def _end(self, seen: Seen, failure: str = "") -> None:
+        """SIGTERM, and after `GRACE_S` SIGKILL; the pod and its log stay."""
+        notes = {"annotations": {FAILURE: failure}} if failure else {}
+        body = {"metadata": {"uid": seen.uid, **notes}, "spec": {"activeDeadlineSeconds": 1}}
+        try:
+            self._watch.take(self._cluster.merge(self._cluster.path("pods", seen.name), body))
+        except RefusedError as error:
+            if error.status not in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT):
+                raise
+
+    def _delete(self, seen: Seen) -> None:
+        self._remove_pod(seen.name, seen.uid, grace_s=1 if seen.node else 0)
+        self._watch.forget(seen)
+
+    def _remove_pod(self, name: str, uid: str, *, grace_s: int) -> None:
+        try:
+            self._cluster.delete(
+                self._cluster.path("pods", name), gracePeriodSeconds=grace_s, preconditions={"uid": uid}
+            )
+        except RefusedError as error:
+            if error.status != HTTPStatus.CONFLICT:  # another one has its name by now
+                raise
+
+    def remove(self, instance: str) -> None:
+        there = self._watch.of(instance, self._options.timeout_s)
+        self._must_lead()
+        for seen in there:
+            self._delete(seen)
+        if self._options.reach == "nodeport":
+            self._cluster.delete(self._cluster.path("services", service(instance, self._owner)["metadata"]["name"]))
+        with self._lock:
+            self._unrun.pop(instance, None)
+
+    def logs(self, instance: str, lines: int) -> str:
+        texts: list[str] = []
+        left = lines
+        for seen in reversed(self._watch.of(instance, self._options.timeout_s)):
+            path = self._cluster.path("pods", f"{seen.name}/log")
+            try:
+                text = self._cluster.text(path, tailLines=left, limitBytes=4 << 20)
+            except RefusedError as error:
+                if error.status not in (HTTPStatus.NOT_FOUND, HTTPStatus.BAD_REQUEST):
+                    raise
+                continue  # it was never begun, or is gone
+            texts.append(text)
+            left -= text.count("\n")
+            if left <= 0:
+                break
+        return "".join(reversed(texts))
+
+    @override
+    def follow(self, instance: str, lines: int) -> LogStream | None:
+        there = self._watch.of(instance, self._options.timeout_s)
+        return PodLog(self._cluster, there[-1].name, lines) if there and there[-1].running else None
+
+    @override
+    def tidy(self) -> None:
+        """End what will never run, or runs beside a later run, and remove what was begun by halves."""
+        if self._fence.epoch:
+            self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
+        there = self._watch.seen(self._options.timeout_s)
+        latest: dict[str, int] = {}
+        for seen in there:
+            if not seen.ended:
+                latest[seen.instance] = max(seen.attempt, latest.get(seen.instance, 0))
+        for seen in there:
+            if seen.hopeless and not seen.ended and not seen.failure:
+                self._end(seen, seen.hopeless)
+            elif not seen.ended and seen.attempt < latest[seen.instance]:
+                self._must_lead()
+                self._delete(seen)
+        self._give_other_ports(there)
+        self._remove_unbegun(_UNBEGUN_S)
+        if self._options.reach == "nodeport" and time.monotonic() - self._swept_at >= _SWEEP_S:
+            self._swept_at = time.monotonic()
+            self._remove_services({seen.instance for seen in there})
+        self._reports.begin()
+
+    def _remove_unbegun(self, older_than_s: float) -> None:
+        """Pods that have no Secret: who made them was killed, or another one leads by now."""
+        for seen in self._watch.seen(self._options.timeout_s):
+            young = time.time() - seen.made_at < older_than_s
+            if not (seen.ended or seen.running or young or self._is_begun(seen)):
+                self._must_lead()
+                self._delete(seen)
+        self._begun &= {seen.uid for seen in self._watch.seen(self._options.timeout_s)}
+
+    def _is_begun(self, seen: Seen) -> bool:
+        if seen.uid in self._begun:
+            return True
+        try:
+            self._cluster.get(self._cluster.path("secrets", seen.name))
+        except RefusedError as error:
+            if error.status == HTTPStatus.NOT_FOUND:
+                return False
+            raise
+        self._begun.add(seen.uid)
+        return True
+
+    @override
+    def dismantle(self) -> None:
+        for seen in self._watch.seen(self._options.timeout_s):
+            self._delete(seen)
+        self._remove_services(())
+        for one in self._labelled("networkpolicies", _NETWORKING):
+            self._cluster.delete(self._cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
+        self._fence.clear()
+
+    @override
+    def close(self) -> None:
+        self._reports.close()
+        self._watch.close()
+        self._cluster.close()
+
+
+def _kept_owner(folder: Path) -> str:
+    """For a site whose options name none: made up at first use."""
+    path = folder / "owner"
+    if not path.exists():
+        path.write_text(secrets.token_hex(6))
+    return path.read_text().strip()

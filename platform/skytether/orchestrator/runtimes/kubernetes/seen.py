@@ -1,0 +1,223 @@
+"""What a pod's description means: pure, data in and data out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from skytether.api.service_report import ServiceReport
+
+from ..base import Observation, Phase
+from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, PORT
+from .options import KubernetesOptions
+
+Document = Mapping[str, Any]
+_NO_FREE_PORT = "didn't have free ports"
+"""What a scheduler says of nodes where another pod has the port."""
+_SIGNALLED, _SIGNALS = 128, 64
+"""An exit status above the first means the signal that is left, as far as there are any."""
+_HOPELESS = {
+    "ErrImageNeverPull": "its image '{image}' is not on the node, and is never pulled",
+    "ImagePullBackOff": "its image '{image}' cannot be pulled",
+    "InvalidImageName": "'{image}' is no name of an image",
+    "CreateContainerConfigError": "its container cannot be made",
+    "CreateContainerError": "its container cannot be made",
+    "RunContainerError": "its container cannot be run",
+}
+"""Of a container that waits: for nothing that will come."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One pod of ours as the API server describes it."""
+
+    name: str
+    uid: str
+    version: str
+    """Of its description."""
+    instance: str
+    attempt: int
+    image: str
+    memory_limit: str
+    made_at: float
+    """By the API server's clock [s since the epoch]."""
+    phase: str
+    """``Pending``, ``Running``, ``Succeeded``, ``Failed`` or ``Unknown``."""
+    waits_for: str = ""
+    """What keeps it from being started, in words."""
+    hopeless: str = ""
+    """Why it never will be."""
+    port_taken: bool = False
+    """No node has its port free."""
+    running: bool = False
+    """Its container is."""
+    started: bool = False
+    """Its service has said that it is ready."""
+    healthy: bool = False
+    exit_code: int | None = None
+    """Of its container, when that has ended."""
+    ended_how: str = ""
+    """``OOMKilled``, ``Evicted``: where the exit code does not tell."""
+    last_words: str = ""
+    node: str = ""
+    host: str = ""
+    """Address of its node."""
+    address: str = ""
+    """Its own."""
+    host_port: int | None = None
+    """At which its node is asked for it."""
+    failure: str = ""
+    """Why it was given up."""
+    stops: bool = False
+    """It was asked to end."""
+    removed: bool = False
+    """It is deleted, by us or anybody: its node ends what runs of it yet."""
+
+    @property
+    def lingers(self) -> bool:
+        """It has ended, says its node, whose last word of the container is that it runs.
+
+        Nodes before Kubernetes 1.22 say so when they begin to end it, and nothing more.
+        """
+        return self.phase in ("Succeeded", "Failed") and self.running and not self.failure
+
+    @property
+    def ended(self) -> bool:
+        over = self.phase in ("Succeeded", "Failed") and not self.running
+        return over or bool(self.failure) or self.exit_code is not None
+
+
+def parse(document: Document) -> Seen | None:
+    """A pod out of its description; None: it is not one of ours."""
+    meta, spec, status = document["metadata"], document["spec"], document.get("status") or {}
+    labels, notes = meta.get("labels") or {}, meta.get("annotations") or {}
+    if INSTANCE not in labels or not labels.get(ATTEMPT, "").isdecimal():
+        return None
+    container = spec["containers"][0]
+    told: Document = next(
+        (one for one in status.get("containerStatuses") or () if one["name"] == container["name"]), {}
+    )
+    state = told.get("state") or {}
+    waiting, terminated = state.get("waiting") or {}, state.get("terminated") or {}
+    ports = [port["hostPort"] for port in container.get("ports") or () if port.get("hostPort")]
+    if notes.get(NODE_PORT, "").isdecimal():
+        ports = [int(notes[NODE_PORT])]
+    waits_for = _waits_for(status, waiting)
+    return Seen(
+        name=meta["name"],
+        uid=meta["uid"],
+        version=meta.get("resourceVersion", ""),
+        instance=labels[INSTANCE],
+        attempt=int(labels[ATTEMPT]),
+        image=container["image"],
+        memory_limit=str((container.get("resources") or {}).get("limits", {}).get("memory", "")),
+        made_at=datetime.fromisoformat(meta["creationTimestamp"]).timestamp(),
+        phase=status.get("phase", "Pending"),
+        waits_for=waits_for,
+        port_taken=_NO_FREE_PORT in waits_for and not spec.get("nodeName"),
+        hopeless=_hopeless(waiting, container["image"]),
+        running=state.get("running") is not None,
+        started=bool(told.get("started")),
+        healthy=bool(told.get("ready")),
+        exit_code=terminated.get("exitCode"),
+        ended_how=_ended_how(status, terminated),
+        last_words=str(terminated.get("message") or ""),
+        node=spec.get("nodeName", ""),
+        host=status.get("hostIP", ""),
+        address=status.get("podIP", ""),
+        host_port=ports[0] if ports else None,
+        failure=notes.get(FAILURE, ""),
+        stops=bool(spec.get("activeDeadlineSeconds")) or bool(meta.get("deletionTimestamp")),
+        removed=bool(meta.get("deletionTimestamp")),
+    )
+
+
+def _waits_for(status: Document, waiting: Document) -> str:
+    for condition in status.get("conditions") or ():
+        if condition["type"] == "PodScheduled" and condition["status"] == "False":
+            return f"no node takes it: {condition.get('message', '')}".rstrip(": ")
+    reason = str(waiting.get("reason", ""))
+    return {"ContainerCreating": "", "PodInitializing": ""}.get(
+        reason, f"{reason} {waiting.get('message', '')}".strip()
+    )
+
+
+def _hopeless(waiting: Document, image: str) -> str:
+    reason, message = str(waiting.get("reason", "")), str(waiting.get("message", ""))
+    if reason not in _HOPELESS:
+        return ""
+    text = _HOPELESS[reason].format(image=image)
+    return f"{text}: {message}" if message and image not in message else text
+
+
+def _ended_how(status: Document, terminated: Document) -> str:
+    if terminated.get("reason") == "OOMKilled":
+        return "OOMKilled"
+    if status.get("reason") in (None, "", "DeadlineExceeded"):
+        return ""
+    return f"{status['reason']}: {status.get('message', '')}".rstrip(": ")
+
+
+def observation(
+    seen: Seen,
+    options: KubernetesOptions,
+    external: str = "",
+    reports: tuple[ServiceReport, ...] = (),
+    *,
+    over: bool = False,
+    ill: bool = False,
+) -> Observation:
+    """What the contract calls it.
+
+    Args:
+        seen: The pod.
+        options: The site's.
+        external: Address of its node, as others reach it.
+        reports: Of its service.
+        over: It has lingered for as long as it could.
+        ill: Its health check fails.
+    """
+    if seen.ended or over:
+        if seen.failure:
+            why = f"could not be started: {seen.failure}"
+            return Observation(seen.attempt, Phase.EXITED, detail=why, unstarted=True)
+        code = seen.exit_code
+        signalled = code is not None and _SIGNALLED < code <= _SIGNALLED + _SIGNALS
+        return Observation(
+            seen.attempt,
+            Phase.EXITED,
+            exit_status=_SIGNALLED - code if signalled and code is not None else code,
+            last_line=last_line(seen.last_words),
+            detail=_detail(seen),
+            reports=reports,
+        )
+    if (seen.started or seen.lingers) and seen.running:
+        host, port = where(seen, options, external)
+        detail = "its health check fails" if ill and not seen.stops else ""
+        return Observation(seen.attempt, Phase.RUNNING, host, port, detail=detail, reports=reports)
+    return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, reports=reports)
+
+
+def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, int | None]:
+    """Host and port at which robots reach it."""
+    if options.reach == "pod":
+        return seen.address, PORT
+    return options.advertise_host or external or seen.host, seen.host_port
+
+
+def _detail(seen: Seen) -> str:
+    if seen.ended_how == "OOMKilled":
+        limit = seen.memory_limit.replace("Mi", " MiB")
+        return f"ran out of memory: its limit is {limit} (limits.memory_mb of its manifest)"
+    return f"was ended by the cluster: {seen.ended_how}" if seen.ended_how else ""
+
+
+def last_line(text: str) -> str:
+    """The last line that can be read, at most 300 characters of it."""
+    for line in reversed(text.split("\n")):
+        readable = "".join(c for c in line if c.isprintable()).strip()
+        if readable:
+            return readable[:300]
+    return ""

@@ -1,0 +1,228 @@
+"""What is known of a cluster's pods: a list, then what the API server tells of changes, again and again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from http import HTTPStatus
+from typing import Any
+
+import urllib3
+
+from ..base import RuntimeFailure
+from .cluster import Cluster, ClusterGoneError, RefusedError, cut
+from .objects import OWNER
+from .seen import Seen, parse
+
+log = logging.getLogger(__name__)
+
+_LIST_S = 300.0
+"""Seconds until all are listed anew: should an event ever have been missed."""
+_WATCH_S = 60
+"""The API server ends a watch after this, so that one that is dead is noticed."""
+_SILENCE_S = _WATCH_S + 15.0
+_AGAIN_S = 1.0
+"""Between two attempts to reach an API server that does not answer."""
+_ILL_S = 1.5
+"""A service is first asked of its health up to a second after it has said that it is ready."""
+_PAGE = 500
+"""Pods of one answer."""
+_MOST_EVENT = 4 << 20
+"""Bytes."""
+
+
+class Watch:
+    """Follows a site's pods, in a thread of its own."""
+
+    def __init__(self, cluster: Cluster, owner: str) -> None:
+        self._cluster = cluster
+        self._selector = f"{OWNER}={owner}"
+        self._lock = threading.Lock()
+        self._seen: dict[str, Seen] = {}
+        self._gone: dict[str, str] = {}
+        """By their uid, names of pods that were forgotten: a late event or list does not bring them back."""
+        self._lingers_since: dict[str, float] = {}
+        """By uid, since when a pod lingers, by the monotonic clock [s]."""
+        self._ill_since: dict[str, float] = {}
+        """By uid, since when a pod whose service is up is not ready."""
+        self._failure: RuntimeFailure | None = ClusterGoneError("the API server has not answered yet")
+        self._looked = threading.Event()
+        self._closing = threading.Event()
+        self._answer: urllib3.HTTPResponse | None = None
+        self._thread = threading.Thread(target=self._run, name="kubernetes-watch", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        answer = self._answer
+        if answer is not None:
+            cut(answer)
+        self._thread.join(5.0)
+
+    def seen(self, timeout_s: float) -> list[Seen]:
+        """All pods of ours; waits for the first list only, ``timeout_s`` [s] at most.
+
+        Raises:
+            RuntimeFailure: The API server does not answer, or refuses.
+        """
+        self._looked.wait(timeout_s)
+        failure = self._failure
+        if failure is not None:
+            raise type(failure)(*failure.args) if not isinstance(failure, RefusedError) else failure
+        with self._lock:
+            return list(self._seen.values())
+
+    def of(self, instance: str, timeout_s: float) -> list[Seen]:
+        """The pods of one instance, the newest run last; raises as ``seen``."""
+        return sorted((s for s in self.seen(timeout_s) if s.instance == instance), key=lambda seen: seen.attempt)
+
+    def lingered_s(self, seen: Seen) -> float:
+        """For how long a pod has been on the point of ending [s]; 0: it is not."""
+        if not seen.lingers:
+            return 0.0
+        now = time.monotonic()
+        return now - self._lingers_since.setdefault(seen.uid, now)
+
+    def ill(self, seen: Seen) -> bool:
+        """Whether the health check of a service that is up fails, and not only has not been done yet."""
+        if seen.healthy or not seen.started:
+            self._ill_since.pop(seen.uid, None)
+            return False
+        now = time.monotonic()
+        return now - self._ill_since.setdefault(seen.uid, now) > _ILL_S
+
+    def catch_up(self) -> None:
+        """List all of them now.
+
+        Raises:
+            RuntimeFailure: The API server does not answer, or refuses.
+        """
+        self._list()
+
+    def forget(self, seen: Seen) -> None:
+        """It was removed: no event that is late brings it back."""
+        with self._lock:
+            there = self._seen.get(seen.name)
+            if there is not None and there.uid == seen.uid:
+                del self._seen[seen.name]
+            self._gone[seen.uid] = seen.name
+
+    def take(self, document: Mapping[str, Any], *, gone: bool = False) -> None:
+        """A pod as an answer, or an event, describes it."""
+        seen = parse(document)
+        if seen is None:
+            return
+        if gone:
+            self.forget(seen)
+            return
+        with self._lock:
+            before = self._seen.get(seen.name)
+            if seen.uid not in self._gone and (before is None or _is_newer(seen, before)):
+                self._seen[seen.name] = seen
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                version = self._list()
+                until = time.monotonic() + _LIST_S
+                while version and not self._closing.is_set() and time.monotonic() < until:
+                    version = self._watch(version)
+            except RuntimeFailure as error:
+                self._fail(error)
+            except Exception as error:
+                log.exception("following a cluster failed")
+                self._fail(RuntimeFailure(f"the API server's answer is not understood: {error}"))
+            if self._failure is not None:
+                self._closing.wait(_AGAIN_S)
+
+    def _fail(self, error: RuntimeFailure) -> None:
+        if self._closing.is_set():
+            return
+        if str(error) != str(self._failure):
+            log.warning("%s", error)
+        self._failure = error
+        self._looked.set()
+
+    def _list(self) -> str:
+        """The version of the list."""
+        found: dict[str, Seen] = {}
+        query: dict[str, str | int] = {"labelSelector": self._selector, "limit": _PAGE}
+        while True:
+            said = self._cluster.get(self._cluster.path("pods"), **query)
+            for document in said["items"]:
+                seen = parse(document)
+                if seen is not None:
+                    found[seen.name] = seen
+            meta = said["metadata"]
+            if not meta.get("continue"):
+                break
+            query["continue"] = meta["continue"]
+        with self._lock:
+            # What an answer has told meanwhile may be newer than the list.
+            for name, seen in found.items():
+                before = self._seen.get(name)
+                if before is not None and before.uid == seen.uid and not _is_newer(seen, before):
+                    found[name] = before
+            at = _number(meta["resourceVersion"])
+            newer = {n: s for n, s in self._seen.items() if n not in found and _number(s.version) > at}
+            self._seen = {n: s for n, s in found.items() if s.uid not in self._gone} | newer
+            self._gone = {uid: name for uid, name in self._gone.items() if name in found}
+            there = {seen.uid for seen in self._seen.values()}
+            self._lingers_since = {uid: at for uid, at in self._lingers_since.items() if uid in there}
+            self._ill_since = {uid: at for uid, at in self._ill_since.items() if uid in there}
+        self._failure = None
+        self._looked.set()
+        return str(meta["resourceVersion"])
+
+    def _watch(self, version: str) -> str:
+        """Follow from one version on; the version it came to, empty: the list is to be read anew."""
+        query: dict[str, str | int] = {
+            "labelSelector": self._selector,
+            "watch": "true",
+            "allowWatchBookmarks": "true",
+            "resourceVersion": version,
+            "timeoutSeconds": _WATCH_S,
+        }
+        with self._cluster.stream(self._cluster.path("pods"), _SILENCE_S, **query) as answer:
+            self._answer = answer
+            try:
+                for event in _events(answer):
+                    if self._closing.is_set():
+                        return ""
+                    kind, document = event.get("type"), event.get("object") or {}
+                    if kind == "ERROR":
+                        if document.get("code") != HTTPStatus.GONE:
+                            log.info("a watch has ended: %s", document.get("message"))
+                        return ""
+                    version = str(document.get("metadata", {}).get("resourceVersion", version))
+                    if kind in ("ADDED", "MODIFIED", "DELETED"):
+                        self.take(document, gone=kind == "DELETED")
+            finally:
+                self._answer = None
+        return version
+
+
+def _events(answer: urllib3.HTTPResponse) -> Iterator[Any]:
+    """The lines of a watch, as documents."""
+    rest = b""
+    for piece in answer.stream(1 << 16):
+        *lines, rest = (rest + piece).split(b"\n")
+        if len(rest) > _MOST_EVENT:
+            raise RuntimeFailure(f"the API server tells of an object of more than {_MOST_EVENT >> 20} MiB")
+        for line in lines:
+            if line.strip():
+                yield json.loads(line)
+
+
+def _is_newer(seen: Seen, before: Seen) -> bool:
+    return seen.uid != before.uid or _number(seen.version) >= _number(before.version)
+
+
+def _number(version: str) -> int:
+    """Versions are numbers that grow, at every API server that there is (and by contract since Kubernetes 1.35)."""
+    return int(version) if version.isdecimal() else 0

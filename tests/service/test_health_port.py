@@ -1,0 +1,78 @@
+"""What a service answers of its health over HTTP, as a cluster asks it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import socket
+from pathlib import Path
+
+import httpx
+import pytest
+
+from skytether.api.grant import GRANT_VARIABLE, Grant
+from skytether.api.service_report import ServiceReport, write_reports
+from skytether.service.health import SILENT_S
+from skytether.service.health_port import answering
+
+
+@pytest.fixture
+def grant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Grant:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    given = Grant(
+        instance="i1",
+        service="toy",
+        robot="walker",
+        session_id="00112233445566aa",
+        session_key=base64.b64encode(bytes(32)).decode(),
+        topics=(),
+        ready_file=str(tmp_path / "ready.json"),
+        health_port=port,
+    )
+    (tmp_path / "grant.json").write_text(given.model_dump_json())
+    monkeypatch.setenv(GRANT_VARIABLE, str(tmp_path / "grant.json"))
+    return given
+
+
+def ask(grant: Grant, path: str) -> httpx.Response:
+    return httpx.get(f"http://127.0.0.1:{grant.health_port}{path}", trust_env=False)
+
+
+def test_it_is_well_when_it_is_ready_and_its_loop_alive(grant: Grant) -> None:
+    ready = Path(str(grant.ready_file))
+    with answering(grant):
+        assert (ask(grant, "/healthz").status_code, ask(grant, "/healthz").text) == (
+            503,
+            "the service is not ready: FileNotFoundError",
+        )
+        ready.write_text("{}")
+        assert (ask(grant, "/healthz").status_code, ask(grant, "/healthz").text) == (200, "alive")
+        os.utime(ready, (ready.stat().st_mtime - SILENT_S - 5,) * 2)
+        assert ask(grant, "/healthz").status_code == 503
+        assert "hung" in ask(grant, "/healthz").text
+    with pytest.raises(httpx.ConnectError):
+        ask(grant, "/healthz")
+
+
+def test_it_tells_what_was_reported_and_nothing_else(grant: Grant) -> None:
+    with answering(grant):
+        assert ask(grant, "/reports").json() == {}
+        report = ServiceReport(1, "no_path", "There is no way to the goal.")
+        Path(str(grant.ready_file)).with_name("reports.json").write_bytes(write_reports([report]))
+        assert ask(grant, "/reports").json()["reports"][0]["code"] == "no_path"
+        for path in ("/", "/grant.json", "/../grant.json", "/healthz/x"):
+            assert (ask(grant, path).status_code, ask(grant, path).content) == (404, b"")
+
+
+def test_one_that_says_nothing_holds_up_nobody_for_long(grant: Grant) -> None:
+    Path(str(grant.ready_file)).write_text("{}")
+    with answering(grant), socket.create_connection(("127.0.0.1", grant.health_port)):
+        assert ask(grant, "/healthz").status_code == 200
+
+
+def test_without_a_port_nobody_listens(grant: Grant) -> None:
+    quiet = Grant.model_validate(json.loads(grant.model_dump_json()) | {"health_port": 0})
+    with answering(quiet), pytest.raises(httpx.ConnectError):
+        ask(grant, "/healthz")
