@@ -14,7 +14,7 @@ import numpy as np
 
 from skytether.lab.trail import Pose
 from skytether.lab.world.lemniscate import Lemniscate
-from skytether.lab.world.operator import Operator
+from skytether.lab.world.operator import Operator, OperatorParams
 from skytether.lab.world.plan import hall
 from skytether.lab.world.robot import RearParams, RobotParams
 from skytether.lab.world.simulation import TICK, Robot, Simulation
@@ -47,10 +47,21 @@ class Loop:
         begun: When the robot moved first [s].
     """
 
-    def __init__(self, seed: int, *, round_trip: float = 0.0, face_rate: float = 15.0, face_noise: float = 2.0) -> None:
-        """``face_noise`` is a standard deviation in degrees."""
+    def __init__(
+        self,
+        seed: int,
+        *,
+        round_trip: float = 0.0,
+        face_rate: float = 15.0,
+        face_noise: float = 2.0,
+        gain: float = FormationParams().steering_gain,
+    ) -> None:
+        """``face_noise``: standard deviation in degrees; ``gain``: of the robot, as the operator is used to it [1/s].
+
+        Without pictures the robot sees the true angle, and answers as its law says.
+        """
         self.curve = Lemniscate()
-        self.operator = Operator(self.curve, seed)
+        self.operator = Operator(self.curve, seed, OperatorParams(gain=gain))
         self.world = Simulation(hall(), seed=seed, params=RobotParams(rear=REAR), operator=self.operator)
         self._half, self._rate, self._noise = round_trip / 2, face_rate, math.radians(face_noise)
         self._random = np.random.default_rng(seed + 1000)
