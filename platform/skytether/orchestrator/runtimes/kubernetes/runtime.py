@@ -157,7 +157,7 @@ class KubernetesRuntime(Runtime):
         there = self._watch.of(launch.instance, self._options.timeout_s)
         self._must_lead()
         newest = there[-1] if there else None
-        if newest is not None and newest.attempt > launch.attempt and not newest.ended:
+        if newest is not None and newest.attempt > launch.attempt and not self._over(newest):
             raise OvertakenError(
                 f"attempt {newest.attempt} of {launch.instance} runs, which another orchestrator has begun"
             )
@@ -171,7 +171,7 @@ class KubernetesRuntime(Runtime):
                 return
         self._must_hold_policy()
         for seen in there:
-            if not seen.ended or seen.attempt < launch.attempt - _KEPT:
+            if not self._over(seen) or seen.attempt < launch.attempt - _KEPT:
                 self._delete(seen)
         with self._lock:
             self._unrun.pop(launch.instance, None)
@@ -218,7 +218,7 @@ class KubernetesRuntime(Runtime):
         ports = self._options.ports
         there = self._watch.seen(self._options.timeout_s)
         # Its own of the run before is free: that run is ended.
-        taken = {seen.host_port for seen in there if not seen.ended and seen.instance != instance} | self._refused
+        taken = {seen.host_port for seen in there if not self._over(seen) and seen.instance != instance} | self._refused
         if preferred is None or not ports[0] <= preferred <= ports[1]:
             preferred = usual_port(ports, self._owner, instance)
         port = free_port(ports, preferred, [port for port in taken if port is not None])
@@ -230,7 +230,7 @@ class KubernetesRuntime(Runtime):
     def _give_other_ports(self, there: Iterable[Seen]) -> None:
         """To pods of ours that no node takes, for others have their ports."""
         for seen in there:
-            if seen.node or seen.ended:
+            if seen.node or self._over(seen):
                 self._waiting.pop(seen.uid, None)
             elif seen.port_taken and seen.host_port is not None and (launch := self._waiting.pop(seen.uid, None)):
                 log.info("site %s: UDP port %d of every node is taken by others", self._site, seen.host_port)
@@ -294,7 +294,7 @@ class KubernetesRuntime(Runtime):
                 self._options,
                 self._nodes.get(seen.node, ""),
                 self._reports.of(seen.name),
-                over=self._watch.lingered_s(seen) > _LINGERS_S,
+                over=self._over(seen),
                 ill=self._watch.ill(seen),
             )
             for instance, seen in newest.items()
@@ -305,11 +305,15 @@ class KubernetesRuntime(Runtime):
                     found[instance] = told
         return found
 
+    def _over(self, seen: Seen) -> bool:
+        """Whether nothing of it runs any more."""
+        return seen.ended or self._watch.lingered_s(seen) > _LINGERS_S
+
     def stop(self, instance: str, *, force: bool) -> None:
         there = self._watch.of(instance, self._options.timeout_s)
         self._must_lead()  # after the look: nothing of it was begun by a later leader
         for seen in there:
-            if seen.ended or (seen.stops and not force):
+            if self._over(seen) or (seen.stops and not force):
                 continue
             if not seen.running:
                 self._delete(seen)
@@ -385,12 +389,12 @@ class KubernetesRuntime(Runtime):
         there = self._watch.seen(self._options.timeout_s)
         latest: dict[str, int] = {}
         for seen in there:
-            if not seen.ended:
+            if not self._over(seen):
                 latest[seen.instance] = max(seen.attempt, latest.get(seen.instance, 0))
         for seen in there:
-            if seen.hopeless and not seen.ended and not seen.failure:
+            if seen.hopeless and not self._over(seen) and not seen.failure:
                 self._end(seen, seen.hopeless)
-            elif not seen.ended and seen.attempt < latest[seen.instance]:
+            elif not self._over(seen) and seen.attempt < latest[seen.instance]:
                 self._must_lead()
                 self._delete(seen)
         self._give_other_ports(there)
@@ -404,7 +408,7 @@ class KubernetesRuntime(Runtime):
         """Pods that have no Secret: who made them was killed, or another one leads by now."""
         for seen in self._watch.seen(self._options.timeout_s):
             young = time.time() - seen.made_at < older_than_s
-            if not (seen.ended or seen.running or young or self._is_begun(seen)):
+            if not (self._over(seen) or seen.running or young or self._is_begun(seen)):
                 self._must_lead()
                 self._delete(seen)
         self._begun &= {seen.uid for seen in self._watch.seen(self._options.timeout_s)}
