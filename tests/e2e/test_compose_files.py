@@ -13,7 +13,7 @@ import yaml
 
 from skytether.api import report_metrics as reported
 from skytether.orchestrator import metrics as exported
-from skytether.orchestrator.runtimes.docker.objects import USER
+from skytether.orchestrator.runtimes.containers import USER
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())

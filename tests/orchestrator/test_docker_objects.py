@@ -25,6 +25,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.api.pull import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.containers import last_line
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import Engine, EngineGoneError, Tunnel, root_cause
@@ -46,7 +47,6 @@ from skytether.orchestrator.runtimes.docker.objects import (
     grant_archive,
     guard,
     holder,
-    last_line,
     observation,
     parse,
     parse_helper,

@@ -2,53 +2,29 @@
 
 from __future__ import annotations
 
-import base64
 import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import docker_runs
 import pytest
 import yaml
+from docker_runs import launch
 from kubernetes_site import KubernetesSite
 
-from skytether.api.grant import Grant
-from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes.base import Launch, Observation, OvertakenError, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.objects import pod
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 90.0
+until = partial(docker_runs.until, patience_s=90.0)
 ENDS = {Phase.EXITED, Phase.RUNNING}
-KEY = base64.b64encode(bytes(range(32))).decode()
-
-
-def until(what: Callable[[], Any]) -> Any:
-    """Wait for a condition; gives what it gave."""
-    deadline = time.monotonic() + PATIENCE
-    while not (found := what()):
-        assert time.monotonic() < deadline, "it did not come to pass"
-        time.sleep(0.02)
-    return found
-
-
-def launch(site: KubernetesSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
-    params, image = more.pop("params", {}), more.pop("image", site.images.toy)
-    grant = Grant(
-        instance=instance,
-        service="toy",
-        robot="walker",
-        params=params,
-        session_id="00112233445566aa",
-        session_key=KEY,
-        topics=(),
-    )
-    return Launch(attempt, ServiceSpec.model_validate({"image": image, **more}), grant)
 
 
 @pytest.fixture

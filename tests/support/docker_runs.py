@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from docker_site import DockerSite
+from kubernetes_site import KubernetesSite
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
@@ -21,7 +22,7 @@ PATIENCE = 30.0
 PYTHON = "/app/bin/python"
 
 
-def launch(site: DockerSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
+def launch(site: DockerSite | KubernetesSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
     params, image = more.pop("params", {}), more.pop("image", site.images.toy)
     grant = Grant(
         instance=instance,
@@ -35,9 +36,9 @@ def launch(site: DockerSite, instance: str = "i1", attempt: int = 1, **more: Any
     return Launch(attempt, ServiceSpec.model_validate({"image": image, **more}), grant)
 
 
-def until(what: Callable[[], Any]) -> Any:
+def until(what: Callable[[], Any], patience_s: float = PATIENCE) -> Any:
     """Wait for a condition; gives what it gave."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + patience_s
     while not (found := what()):
         assert time.monotonic() < deadline, "it did not come to pass"
         time.sleep(0.02)

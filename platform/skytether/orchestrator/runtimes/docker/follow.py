@@ -23,9 +23,10 @@ from docker import APIClient
 from docker.errors import NotFound
 
 from ..base import RuntimeFailure
+from ..containers import last_line
 from .engine import Engine, EngineGoneError, root_cause
 from .meter import Meter
-from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, last_line, parse, parse_helper
+from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, parse, parse_helper
 
 log = logging.getLogger(__name__)
 

@@ -15,14 +15,20 @@ from skytether.api.manifest import ServiceSpec
 from skytether.api.service_report import FILE_NAME, ServiceReport
 
 from ..base import Launch, Observation, Phase, RuntimeFailure
+from ..containers import (
+    INNER_PORT,
+    USER,
+    exit_status,
+    image_refusal,
+    last_line,
+    most_cores,
+    most_memory_mb,
+    out_of_memory,
+)
 from ..egress import refusal_of
 from .meter import Usage
 from .options import DockerOptions
 
-USER = 65_532
-"""Who every service is, and who owns its files; nobody on the engine's machine."""
-INNER_PORT = 7600
-"""UDP port inside the container; robots are told the one that is published."""
 _ROOT = "/run/skytether"
 _OWN = "instance"
 """Folder of the grant and the ready file; only the service can read it."""
@@ -44,8 +50,6 @@ EPOCH = f"{_PREFIX}/epoch"
 """Of containers: of the leader who had them made. Of volumes: who led here last."""
 _HELPER = f"{_PREFIX}/helper"
 """Of the other containers of ours: whom a guard closes off, and nobody where it holds a network namespace."""
-_SIGNALLED, _SIGNALS = 128, 64
-"""An exit status above the first means the signal that is left, as far as there are any: 255 is a program's own -1."""
 _INNER = f"{INNER_PORT}/udp"
 _EXPOSED: dict[str, dict[str, str]] = {_INNER: {}}
 _MANAGED = {"app.kubernetes.io/managed-by": "skytether"}
@@ -156,10 +160,8 @@ def stored_by_robot(owner: str, sizes: Mapping[str, int]) -> dict[str, int]:
 
 def refusal(spec: ServiceSpec, options: DockerOptions) -> str | None:
     """Why a site with these options can never run the service; None: it can."""
-    if not spec.image:
-        return "the service has no image, only an entrypoint: it needs a process site"
-    if options.pinned and "@sha256:" not in spec.image:
-        return f"image '{spec.image}' is named without its digest, and the site takes pinned images only"
+    if refused := image_refusal(spec, pinned=options.pinned):
+        return refused
     missing = [device for device in spec.needs.devices if device not in options.devices]
     if missing:
         return f"the site does not offer {', '.join(missing)}: add it to the site's option 'devices'"
@@ -250,8 +252,8 @@ def container(
         epoch: Of the leader; 0: there is none.
     """
     spec, grant = launch.spec, launch.grant
-    memory = (spec.limits.memory_mb or spec.needs.memory_mb) << 20
-    limit = max(_LEAST_CORES, min(spec.limits.cpu or max(1.0, spec.needs.cpu), cores))
+    memory = most_memory_mb(spec) << 20
+    limit = max(_LEAST_CORES, min(most_cores(spec), cores))
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
     paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
@@ -429,15 +431,6 @@ def _complaint(log: Sequence[Mapping[str, Any]]) -> str:
     return said or "its health check fails"
 
 
-def last_line(text: str) -> str:
-    """The last line that can be read, at most 300 characters of it."""
-    for line in reversed(text.split("\n")):
-        readable = "".join(c for c in line if c.isprintable()).strip()
-        if readable:
-            return readable[:300]
-    return ""
-
-
 def carried_over(new: Seen, old: Seen | None) -> Seen:
     """What one look knows that the next cannot find out again."""
     if old is None:
@@ -461,11 +454,10 @@ def observation(
 ) -> Observation:
     """What the contract calls it; ``exceeds``: what it wrote too much of; ``cut_off``: its network is held no more."""
     if seen.ended:
-        signalled = _SIGNALLED < seen.exit_code <= _SIGNALLED + _SIGNALS
         return Observation(
             seen.attempt,
             Phase.EXITED,
-            exit_status=_SIGNALLED - seen.exit_code if signalled else seen.exit_code,
+            exit_status=exit_status(seen.exit_code),
             last_line=seen.last_line,
             detail=_how_it_ended(seen),
             reports=reports,
@@ -480,5 +472,5 @@ def observation(
 
 def _how_it_ended(seen: Seen) -> str:
     if seen.out_of_memory and seen.exit_code:
-        return f"ran out of memory: its limit is {seen.memory_limit >> 20} MiB (limits.memory_mb of its manifest)"
+        return out_of_memory(seen.memory_limit >> 20)
     return ""

@@ -7,7 +7,6 @@ import io
 import json
 import logging
 import tarfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
@@ -16,6 +15,7 @@ from typing import Any
 from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
 
 from ..base import RuntimeFailure
+from ..now_and_then import NowAndThen
 from .engine import Engine
 from .objects import REPORTS
 
@@ -45,9 +45,7 @@ class ReportReader:
         """``running`` tells the containers to look at; it may raise what the engine's failure is."""
         self._engine = engine
         self._running = running
-        self._clock = clock
-        self._looked_at = -_EVERY_S
-        self._thread: threading.Thread | None = None
+        self._now_and_then = NowAndThen("docker-reports", _EVERY_S, clock, self._look_quietly)
         self._known: Mapping[str, Known] = {}
 
     def of(self, container: str) -> tuple[ServiceReport, ...]:
@@ -57,11 +55,7 @@ class ReportReader:
 
     def begin(self) -> None:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
-        if self._clock() - self._looked_at < _EVERY_S or (self._thread is not None and self._thread.is_alive()):
-            return
-        self._looked_at = self._clock()
-        self._thread = threading.Thread(target=self._look_quietly, name="docker-reports", daemon=True)
-        self._thread.start()
+        self._now_and_then.begin()
 
     def _look_quietly(self) -> None:
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import secrets
 import stat
 import threading
 import time
@@ -29,6 +28,7 @@ from ..base import (
     Runtime,
     RuntimeFailure,
 )
+from ..containers import USER, kept_owner, with_owner
 from .engine import Engine, EngineGoneError
 from .fence import Fence
 from .follow import Follower
@@ -37,7 +37,7 @@ from .launch import Job, kill, later_runs, remove
 from .logs import ContainerLog
 from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
-from .objects import USER, Seen, data_volume, observation, refusal
+from .objects import Seen, data_volume, observation, refusal
 from .options import DockerOptions
 from .reports import ReportReader
 from .volumes import Scales, remove_left
@@ -84,7 +84,7 @@ class DockerRuntime(Runtime):
             check_credentials(options.registry_auth)
         self._site = site
         self._options = options
-        self._owner = options.owner or _kept_owner(folder)
+        self._owner = options.owner or kept_owner(folder)
         self._engine = Engine(options)
         self._fence = Fence(self._engine, self._owner)
         self._scales = Scales(self._engine, self._owner, options.data_mb)
@@ -109,7 +109,7 @@ class DockerRuntime(Runtime):
     @override
     @classmethod
     def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
-        return {"owner": secrets.token_hex(6), **options}
+        return with_owner(options)
 
     def _running(self) -> list[str]:
         return [seen.id for seen in self._follower.seen(self._options.timeout_s) if seen.runs]
@@ -393,11 +393,3 @@ class DockerRuntime(Runtime):
         if self._early is not None:
             self._early.join(self._options.timeout_s)  # or it leaves its container behind
         self._engine.drop()
-
-
-def _kept_owner(folder: Path) -> str:
-    """For a site whose options name none: made up at first use."""
-    path = folder / "owner"
-    if not path.exists():
-        path.write_text(secrets.token_hex(6))
-    return path.read_text().strip()

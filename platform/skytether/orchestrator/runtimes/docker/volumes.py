@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -12,6 +11,7 @@ import requests
 from docker.errors import create_api_error_from_http_exception
 
 from ..base import RuntimeFailure
+from ..now_and_then import NowAndThen
 from .engine import Engine
 from .fence import remove_volume
 from .objects import INSTANCE, OWNER, stored_by_robot
@@ -60,9 +60,7 @@ class Scales:
         self._engine = engine
         self._owner = owner
         self._data_mb = data_mb
-        self._clock = clock
-        self._weighed_at = -_EVERY_S
-        self._thread: threading.Thread | None = None
+        self._now_and_then = NowAndThen("docker-volumes", _EVERY_S, clock, self._weigh_quietly)
         self.sizes: Mapping[str, int] = {}
         """Bytes by volume, as weighed last; of the whole engine."""
         self.by_robot: Mapping[str, int] = {}
@@ -87,11 +85,7 @@ class Scales:
 
     def begin(self) -> None:
         """Weigh them, unless that is under way or was done a moment ago. Does not wait."""
-        if self._clock() - self._weighed_at < _EVERY_S or (self._thread is not None and self._thread.is_alive()):
-            return
-        self._weighed_at = self._clock()
-        self._thread = threading.Thread(target=self._weigh_quietly, name="docker-volumes", daemon=True)
-        self._thread.start()
+        self._now_and_then.begin()
 
     def _weigh_quietly(self) -> None:
         try:

@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import socket
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
@@ -27,7 +26,7 @@ _MOST = 32 << 20
 _PIECE = 1 << 16
 _POOL = 16
 """Connections that are kept."""
-MERGE = "application/merge-patch+json"
+_MERGE = "application/merge-patch+json"
 _JSON = "application/json"
 Document = Mapping[str, Any]
 
@@ -60,9 +59,6 @@ class Cluster:
             urllib3.disable_warnings(urllib3.exceptions.InsecureRequestWarning)  # once is enough
         self._client = client.ApiClient(self._settings)
         self._where = self._settings.host
-        self._lock = threading.Lock()
-        self.calls = 0
-        """Requests so far."""
 
     @property
     def namespace(self) -> str:
@@ -84,7 +80,7 @@ class Cluster:
 
     def merge(self, path: str, body: Document) -> Any:
         """A JSON merge patch."""
-        return self._document("PATCH", path, body=body, kind=MERGE)
+        return self._document("PATCH", path, body=body, kind=_MERGE)
 
     def delete(self, path: str, **options: Any) -> None:
         """What is not there any more is left so."""
@@ -143,8 +139,6 @@ class Cluster:
             body=body,
             auth_settings=["BearerToken"],
         )
-        with self._lock:
-            self.calls += 1
         try:
             answer = self._client.call_api(*request, _request_timeout=timeout).response
         except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:

@@ -15,14 +15,13 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import Opening, ServiceSpec
 
 from ..base import Capacity, Launch
+from ..containers import INNER_PORT, USER, image_refusal, most_cores, most_memory_mb
 from ..egress import refusal_of
 from .options import KubernetesOptions
 
 Document = Mapping[str, Any]
-USER = 65_532
-"""Who every service is."""
-PORT, HEALTH_PORT = 7600, 7601
-"""Of the bridge (UDP), and of what the SDK answers of its health (TCP), in the pod."""
+HEALTH_PORT = 7601
+"""TCP port on which the SDK answers of its health, in the pod."""
 GRACE_S = 5
 """Seconds between SIGTERM and SIGKILL."""
 _ROOT = "/run/skytether"
@@ -49,10 +48,8 @@ def name_of(owner: str, instance: str, attempt: int) -> str:
 
 def refusal(spec: ServiceSpec, options: KubernetesOptions) -> str | None:
     """Why a site with these options can never run the service; None: it can."""
-    if not spec.image:
-        return "the service has no image, only an entrypoint: it needs a process site"
-    if options.pinned and "@sha256:" not in spec.image:
-        return f"image '{spec.image}' is named without its digest, and the site takes pinned images only"
+    if refused := image_refusal(spec, pinned=options.pinned):
+        return refused
     if spec.needs.devices:
         return f"a cluster gives no device files, and the service needs {', '.join(spec.needs.devices)}"
     return refusal_of(spec.needs.openings, options.egress)
@@ -102,7 +99,7 @@ def pod(
     spec, grant = launch.spec, launch.grant
     name = name_of(owner, grant.instance, launch.attempt)
     environment = {**options.environment, GRANT_VARIABLE: f"{_GRANT}/grant.json"}
-    reached = {"containerPort": PORT, "protocol": "UDP", **({"hostPort": port} if port is not None else {})}
+    reached = {"containerPort": INNER_PORT, "protocol": "UDP", **({"hostPort": port} if port is not None else {})}
     aliases = [
         {"ip": address, "hostnames": [opening.host]}
         for opening, addresses in openings.items()
@@ -196,12 +193,11 @@ def pod(
 
 
 def _resources(spec: ServiceSpec) -> dict[str, Any]:
-    needs, limits = spec.needs, spec.limits
-    memory = limits.memory_mb or needs.memory_mb
+    needs = spec.needs
     gpus = {_GPU: str(needs.gpu)} if needs.gpu else {}
     return {
         "requests": {"cpu": _cores(needs.cpu), "memory": f"{needs.memory_mb}Mi", **gpus},
-        "limits": {"cpu": _cores(limits.cpu or max(1.0, needs.cpu)), "memory": f"{memory}Mi", **gpus},
+        "limits": {"cpu": _cores(most_cores(spec)), "memory": f"{most_memory_mb(spec)}Mi", **gpus},
     }
 
 
@@ -219,7 +215,7 @@ def secret(launch: Launch, owner: str, made: Document) -> dict[str, Any]:
     """With the grant, for the pod that was made."""
     told = {
         "bind_host": "0.0.0.0",  # noqa: S104 (in its own network)
-        "bind_port": PORT,
+        "bind_port": INNER_PORT,
         "health_port": HEALTH_PORT,
         "ready_file": f"{_OWN}/ready.json",
         "data_dir": _DATA,
@@ -252,7 +248,7 @@ def service(instance: str, owner: str) -> dict[str, Any]:
             "type": "NodePort",
             "externalTrafficPolicy": "Local",  # robots are told the pod's own node, and the service sees who they are
             "selector": {OWNER: owner, INSTANCE: instance},
-            "ports": [{"port": PORT, "protocol": "UDP"}],
+            "ports": [{"port": INNER_PORT, "protocol": "UDP"}],
         },
     }
 
@@ -266,7 +262,7 @@ def site_policy(owner: str) -> dict[str, Any]:
         "spec": {
             "podSelector": {"matchLabels": {OWNER: owner}},
             "policyTypes": ["Ingress", "Egress"],
-            "ingress": [{"ports": [{"port": PORT, "protocol": "UDP"}, {"port": HEALTH_PORT, "protocol": "TCP"}]}],
+            "ingress": [{"ports": [{"port": INNER_PORT, "protocol": "UDP"}, {"port": HEALTH_PORT, "protocol": "TCP"}]}],
             "egress": [],
         },
     }

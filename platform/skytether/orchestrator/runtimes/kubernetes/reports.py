@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 
 from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
 
 from ..base import RuntimeFailure
+from ..now_and_then import NowAndThen
 from .cluster import Cluster
 from .objects import HEALTH_PORT
 
@@ -29,9 +29,7 @@ class ReportReader:
         """``running`` tells the pods to look at; it may raise what the cluster's failure is."""
         self._cluster = cluster
         self._running = running
-        self._clock = clock
-        self._looked_at = -_EVERY_S
-        self._thread: threading.Thread | None = None
+        self._now_and_then = NowAndThen("kubernetes-reports", _EVERY_S, clock, self._look)
         self._closing = False
         self._known: Mapping[str, tuple[ServiceReport, ...]] = {}
 
@@ -41,11 +39,7 @@ class ReportReader:
 
     def begin(self) -> None:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
-        if self._clock() - self._looked_at < _EVERY_S or (self._thread is not None and self._thread.is_alive()):
-            return
-        self._looked_at = self._clock()
-        self._thread = threading.Thread(target=self._look, name="kubernetes-reports", daemon=True)
-        self._thread.start()
+        self._now_and_then.begin()
 
     def close(self) -> None:
         self._closing = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Collection, Iterable, Mapping
@@ -27,6 +26,7 @@ from ..base import (
     RuntimeFailure,
     SiteSilentError,
 )
+from ..containers import USER, kept_owner, with_owner
 from ..egress import resolve
 from .cluster import Cluster, RefusedError
 from .fence import Fence
@@ -36,7 +36,6 @@ from .objects import (
     GRACE_S,
     INSTANCE,
     OWNER,
-    USER,
     capacity,
     external_address,
     free_port,
@@ -84,7 +83,7 @@ class KubernetesRuntime(Runtime):
             raise TypeError("options must be KubernetesOptions")
         self._site = site
         self._options = options
-        self._owner = options.owner or _kept_owner(folder)
+        self._owner = options.owner or kept_owner(folder)
         self._cluster = Cluster(options)
         self._fence = Fence(self._cluster, self._owner)
         self._watch = Watch(self._cluster, self._owner)
@@ -109,7 +108,7 @@ class KubernetesRuntime(Runtime):
     @override
     @classmethod
     def completed(cls, options: dict[str, Any]) -> dict[str, Any]:
-        return {"owner": secrets.token_hex(6), **options}
+        return with_owner(options)
 
     def _ready(self) -> list[str]:
         return [seen.name for seen in self._watch.seen(0) if seen.running]
@@ -269,7 +268,7 @@ class KubernetesRuntime(Runtime):
         return found
 
     def _must_hold_policy(self) -> None:
-        """The NetworkPolicy of all pods is there; made again should somebody have removed it."""
+        """The NetworkPolicy of all pods is there."""
         if self._policy_there:
             return
         body = site_policy(self._owner)
@@ -439,11 +438,3 @@ class KubernetesRuntime(Runtime):
         self._reports.close()
         self._watch.close()
         self._cluster.close()
-
-
-def _kept_owner(folder: Path) -> str:
-    """For a site whose options name none: made up at first use."""
-    path = folder / "owner"
-    if not path.exists():
-        path.write_text(secrets.token_hex(6))
-    return path.read_text().strip()

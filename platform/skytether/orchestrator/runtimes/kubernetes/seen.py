@@ -10,14 +10,13 @@ from typing import Any
 from skytether.api.service_report import ServiceReport
 
 from ..base import Observation, Phase
-from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, PORT
+from ..containers import INNER_PORT, exit_status, last_line, out_of_memory
+from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, quantity
 from .options import KubernetesOptions
 
 Document = Mapping[str, Any]
 _NO_FREE_PORT = "didn't have free ports"
 """What a scheduler says of nodes where another pod has the port."""
-_SIGNALLED, _SIGNALS = 128, 64
-"""An exit status above the first means the signal that is left, as far as there are any."""
 _HOPELESS = {
     "ErrImageNeverPull": "its image '{image}' is not on the node, and is never pulled",
     "ImagePullBackOff": "its image '{image}' cannot be pulled",
@@ -39,7 +38,6 @@ class Seen:
     """Of its description."""
     instance: str
     attempt: int
-    image: str
     memory_limit: str
     made_at: float
     """By the API server's clock [s since the epoch]."""
@@ -111,7 +109,6 @@ def parse(document: Document) -> Seen | None:
         version=meta.get("resourceVersion", ""),
         instance=labels[INSTANCE],
         attempt=int(labels[ATTEMPT]),
-        image=container["image"],
         memory_limit=str((container.get("resources") or {}).get("limits", {}).get("memory", "")),
         made_at=datetime.fromisoformat(meta["creationTimestamp"]).timestamp(),
         phase=status.get("phase", "Pending"),
@@ -184,11 +181,10 @@ def observation(
             why = f"could not be started: {seen.failure}"
             return Observation(seen.attempt, Phase.EXITED, detail=why, unstarted=True)
         code = seen.exit_code
-        signalled = code is not None and _SIGNALLED < code <= _SIGNALLED + _SIGNALS
         return Observation(
             seen.attempt,
             Phase.EXITED,
-            exit_status=_SIGNALLED - code if signalled and code is not None else code,
+            exit_status=exit_status(code) if code is not None else None,
             last_line=last_line(seen.last_words),
             detail=_detail(seen),
             reports=reports,
@@ -203,21 +199,11 @@ def observation(
 def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, int | None]:
     """Host and port at which robots reach it."""
     if options.reach == "pod":
-        return seen.address, PORT
+        return seen.address, INNER_PORT
     return options.advertise_host or external or seen.host, seen.host_port
 
 
 def _detail(seen: Seen) -> str:
     if seen.ended_how == "OOMKilled":
-        limit = seen.memory_limit.replace("Mi", " MiB")
-        return f"ran out of memory: its limit is {limit} (limits.memory_mb of its manifest)"
+        return out_of_memory(int(quantity(seen.memory_limit)) >> 20)
     return f"was ended by the cluster: {seen.ended_how}" if seen.ended_how else ""
-
-
-def last_line(text: str) -> str:
-    """The last line that can be read, at most 300 characters of it."""
-    for line in reversed(text.split("\n")):
-        readable = "".join(c for c in line if c.isprintable()).strip()
-        if readable:
-            return readable[:300]
-    return ""
