@@ -116,6 +116,25 @@ def test_a_run_that_was_made_and_not_begun_is_removed_by_who_leads_next(
         until(lambda: late.observe()["i1"].phase is Phase.RUNNING)
 
 
+def test_no_run_is_begun_by_the_secret_of_an_earlier_pod_of_its_name(
+    kubernetes_site: KubernetesSite, runtime: KubernetesRuntime, tmp_path: Path
+) -> None:
+    lacking = launch(kubernetes_site, needs={"cpu": 1000})  # no node takes it: it waits
+    runtime.lead(1)
+    runtime.start(lacking)
+    (before,) = kubernetes_site.there("secrets", "skytether.io/instance=i1")
+    runtime.stop("i1", force=False)
+    assert kubernetes_site.there("secrets", "skytether.io/instance=i1") == []  # and not only when it is collected
+    earlier = {"metadata": {"name": before["metadata"]["name"]}, "kind": "Secret", "apiVersion": "v1"}
+    runtime._cluster.create(runtime._cluster.path("secrets"), earlier)
+    body = pod(lacking, runtime._options, kubernetes_site.owner, 20_123, {})
+    runtime._cluster.create(runtime._cluster.path("pods"), body)  # and killed then
+    with closing(kubernetes_site.open(tmp_path)) as late:
+        late.lead(2)
+        assert late.observe() == {}
+        until(lambda: kubernetes_site.there("pods", f"skytether.io/owner={kubernetes_site.owner}") == [])
+
+
 def test_a_port_that_another_site_has_is_not_waited_for(kubernetes_site: KubernetesSite, tmp_path: Path) -> None:
     folder = tmp_path / "other"
     folder.mkdir()

@@ -337,6 +337,10 @@ class KubernetesRuntime(Runtime):
 
     def _delete(self, seen: Seen) -> None:
         self._remove_pod(seen.name, seen.uid, grace_s=1 if seen.node else 0)
+        if (
+            not seen.node
+        ):  # gone at once; the cluster collects its Secret later, by which another pod of its name begins
+            self._cluster.delete(self._cluster.path("secrets", seen.name))
         self._watch.forget(seen)
 
     def _remove_pod(self, name: str, uid: str, *, grace_s: int) -> None:
@@ -416,11 +420,13 @@ class KubernetesRuntime(Runtime):
         if seen.uid in self._begun:
             return True
         try:
-            self._cluster.get(self._cluster.path("secrets", seen.name))
+            there = self._cluster.get(self._cluster.path("secrets", seen.name))
         except RefusedError as error:
             if error.status == HTTPStatus.NOT_FOUND:
                 return False
             raise
+        if seen.uid not in [owner["uid"] for owner in there["metadata"].get("ownerReferences") or ()]:
+            return False  # of an earlier pod of its name, which the cluster has not collected yet
         self._begun.add(seen.uid)
         return True
 
