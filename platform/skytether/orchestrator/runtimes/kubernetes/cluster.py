@@ -72,6 +72,11 @@ class Cluster:
     def get(self, path: str, **query: str | int) -> Any:
         return self._document("GET", path, query=query)
 
+    def labelled(self, kind: str, selector: str, *, group: str = "") -> list[Any]:
+        """Objects of the namespace with these labels."""
+        found: list[Any] = self.get(self.path(kind, group=group), labelSelector=selector)["items"]
+        return found
+
     def create(self, path: str, body: Document) -> Any:
         return self._document("POST", path, body=body)
 

@@ -235,22 +235,39 @@ def secret(launch: Launch, owner: str, made: Document) -> dict[str, Any]:
     }
 
 
-def service(instance: str, owner: str) -> dict[str, Any]:
-    """The Service of an instance, by which each of its runs is reached at the same port of the nodes."""
+def service_name(owner: str, instance: str) -> str:
+    """Of the Service of an instance."""
+    return f"skytether-{owner}-{instance}"
+
+
+def service(instance: str, owner: str, options: KubernetesOptions) -> dict[str, Any]:
+    """The Service of an instance, by which each of its runs is reached at the same address or port."""
+    balanced = options.reach == "loadbalancer"
     return {
         "apiVersion": "v1",
         "kind": "Service",
         "metadata": {
-            "name": f"skytether-{owner}-{instance}",
+            "name": service_name(owner, instance),
             "labels": {**MANAGED, OWNER: owner, INSTANCE: instance},
+            **({"annotations": options.service_annotations} if options.service_annotations else {}),
         },
         "spec": {
-            "type": "NodePort",
-            "externalTrafficPolicy": "Local",  # robots are told the pod's own node, and the service sees who they are
+            "type": "LoadBalancer" if balanced else "NodePort",
+            **({"loadBalancerClass": options.load_balancer_class} if options.load_balancer_class else {}),
+            "externalTrafficPolicy": options.external_traffic_policy,
             "selector": {OWNER: owner, INSTANCE: instance},
             "ports": [{"port": INNER_PORT, "protocol": "UDP"}],
         },
     }
+
+
+def balanced_address(made: Document) -> tuple[str, int] | None:
+    """At which a load balancer passes on to a Service; None: it has given none yet."""
+    given = ((made.get("status") or {}).get("loadBalancer") or {}).get("ingress") or ()
+    host = next(
+        (str(one.get("ip") or one.get("hostname")) for one in given if one.get("ip") or one.get("hostname")), ""
+    )
+    return (host, int(made["spec"]["ports"][0]["port"])) if host else None
 
 
 def site_policy(owner: str) -> dict[str, Any]:

@@ -24,13 +24,23 @@ class KubernetesOptions(Strict):
     """Of the kubeconfig; None: its current one."""
     namespace: Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$")] = "skytether"
     """Where the pods are. It is there already: who makes it says with quotas and roles what may be done in it."""
-    reach: Literal["hostport", "nodeport", "pod"] = "hostport"
+    reach: Literal["hostport", "nodeport", "loadbalancer", "pod"] = "hostport"
     """How a robot reaches a service: at a UDP port of the pod's node, out of ``ports``; at one that the cluster chooses
-    (a Service of type NodePort); or at the pod's own address, where that is routable."""
+    (a Service of type NodePort); at the address that the cluster's load balancer gives a Service of the instance; or at
+    the pod's own address, where that is routable."""
     ports: tuple[Port, Port] = (20_000, 29_999)
     """First and last UDP port of nodes that instances may have; for ``hostport``."""
     advertise_host: AdvertisedHost | None = None
     """Address that robots are told; None: the external address of the pod's node, or else its internal one."""
+    load_balancer_class: str | None = None
+    """Which load balancer is to serve, where there are several; for ``loadbalancer``, from Kubernetes 1.24 on."""
+    load_balancer_timeout_s: Annotated[float, Field(gt=0)] = 300.0
+    """A service whose load balancer has given no address for this long is given up."""
+    external_traffic_policy: Literal["Local", "Cluster"] = "Local"
+    """Of the instances' Services. ``Local``: only the pod's own node is asked, and the service sees its robot's
+    address. ``Cluster``: each node passes on to it."""
+    service_annotations: dict[Label, str] = {}
+    """Of the instances' Services, as the cluster's load balancer wants them."""
     cpu: Annotated[float, Field(gt=0)] | None = None
     """Cores that instances may ask for in all; None: all that the nodes give, which needs the right to list them."""
     memory_mb: Annotated[int, Field(gt=0)] | None = None

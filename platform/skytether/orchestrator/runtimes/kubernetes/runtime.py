@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
@@ -34,7 +34,6 @@ from .logs import PodLog
 from .objects import (
     FAILURE,
     GRACE_S,
-    INSTANCE,
     OWNER,
     capacity,
     external_address,
@@ -43,13 +42,13 @@ from .objects import (
     pod,
     refusal,
     secret,
-    service,
     site_policy,
     usual_port,
 )
 from .options import KubernetesOptions
 from .reports import ReportReader
 from .seen import Seen, observation
+from .services import Services
 from .watch import Watch
 
 log = logging.getLogger(__name__)
@@ -59,8 +58,6 @@ _KEPT = 2
 _NODES_S = 30.0
 """Seconds between two looks at the nodes."""
 _NETWORKING = "networking.k8s.io/v1"
-_SWEEP_S = 60.0
-"""Seconds between two looks for Services whose instances are gone."""
 _LINGERS_S = GRACE_S + 1.0
 """After so many seconds nothing of a pod that lingers runs any more."""
 _UNBEGUN_S = 30.0
@@ -87,6 +84,7 @@ class KubernetesRuntime(Runtime):
         self._cluster = Cluster(options)
         self._fence = Fence(self._cluster, self._owner)
         self._watch = Watch(self._cluster, self._owner)
+        self._services = Services(self._cluster, options, self._owner, self._must_lead)
         self._reports = ReportReader(self._cluster, self._ready)
         self._lock = threading.Lock()
         self._unrun: dict[str, Observation] = {}
@@ -98,7 +96,6 @@ class KubernetesRuntime(Runtime):
         self._refused: set[int] = set()
         """Ports that others have."""
         self._policy_there = False
-        self._swept_at = time.monotonic()
         self._capacity: tuple[float, Capacity] | None = None
         self._nodes: Mapping[str, str] = {}
         """External addresses, by their names."""
@@ -180,7 +177,7 @@ class KubernetesRuntime(Runtime):
         """Have the pod made, and begun unless somebody else leads by now; ``preferred``: the UDP port."""
         openings = resolve(launch.spec.needs.openings)
         port = self._port(launch.instance, preferred) if self._options.reach == "hostport" else None
-        node_port = self._node_port(launch.instance) if self._options.reach == "nodeport" else None
+        node_port = self._services.make(launch.instance)
         asked = launch, self._options, self._owner, port, openings
         body = pod(*asked, node_port=node_port, epoch=self._fence.epoch)
         try:
@@ -243,30 +240,6 @@ class KubernetesRuntime(Runtime):
                 except RuntimeFailure as error:
                     self._leave(seen, f"could not be started: {error}", unstarted=True)
 
-    def _node_port(self, instance: str) -> int:
-        """Of the instance's Service, which is made if it is not there."""
-        body = service(instance, self._owner)
-        try:
-            there = self._cluster.create(self._cluster.path("services"), body)
-        except RefusedError as error:
-            if error.reason != "AlreadyExists":
-                raise RuntimeFailure(f"the cluster refuses it: {error}") from error
-            there = self._cluster.get(self._cluster.path("services", body["metadata"]["name"]))
-        return int(there["spec"]["ports"][0]["nodePort"])
-
-    def _remove_services(self, kept: Collection[str]) -> None:
-        """Of instances that are not among these."""
-        for one in self._labelled("services"):
-            if one["metadata"]["labels"].get(INSTANCE) not in kept:
-                self._must_lead()
-                self._cluster.delete(self._cluster.path("services", one["metadata"]["name"]))
-
-    def _labelled(self, kind: str, group: str = "") -> list[Any]:
-        """Objects of a kind that are this site's."""
-        path = self._cluster.path(kind, group=group)
-        found: list[Any] = self._cluster.get(path, labelSelector=f"{OWNER}={self._owner}")["items"]
-        return found
-
     def _must_hold_policy(self) -> None:
         """The NetworkPolicy of all pods is there."""
         if self._policy_there:
@@ -295,6 +268,7 @@ class KubernetesRuntime(Runtime):
                 self._reports.of(seen.name),
                 over=self._over(seen),
                 ill=self._watch.ill(seen),
+                balancer=self._services.balancer(instance),
             )
             for instance, seen in newest.items()
         }
@@ -357,8 +331,7 @@ class KubernetesRuntime(Runtime):
         self._must_lead()
         for seen in there:
             self._delete(seen)
-        if self._options.reach == "nodeport":
-            self._cluster.delete(self._cluster.path("services", service(instance, self._owner)["metadata"]["name"]))
+        self._services.remove(instance)
         with self._lock:
             self._unrun.pop(instance, None)
 
@@ -402,10 +375,19 @@ class KubernetesRuntime(Runtime):
                 self._delete(seen)
         self._give_other_ports(there)
         self._remove_unbegun(_UNBEGUN_S)
-        if self._options.reach == "nodeport" and time.monotonic() - self._swept_at >= _SWEEP_S:
-            self._swept_at = time.monotonic()
-            self._remove_services({seen.instance for seen in there})
+        self._give_up_unbalanced(there)
         self._reports.begin()
+
+    def _give_up_unbalanced(self, there: Iterable[Seen]) -> None:
+        """Those to which no load balancer passes on."""
+        up = [seen for seen in there if seen.running and seen.started and not seen.stops and not self._over(seen)]
+        ready = {seen.instance: seen for seen in up}
+        for instance in self._services.look({seen.instance for seen in there}, ready):
+            self._must_lead()
+            self._delete(ready[instance])
+            within = f"{self._options.load_balancer_timeout_s:g} s"
+            why = f"the cluster's load balancer has given its Service no address within {within} (option 'reach')"
+            self._leave(ready[instance], f"could not be started: {why}", unstarted=True)
 
     def _remove_unbegun(self, older_than_s: float) -> None:
         """Pods that have no Secret: who made them was killed, or another one leads by now."""
@@ -434,8 +416,8 @@ class KubernetesRuntime(Runtime):
     def dismantle(self) -> None:
         for seen in self._watch.seen(self._options.timeout_s):
             self._delete(seen)
-        self._remove_services(())
-        for one in self._labelled("networkpolicies", _NETWORKING):
+        self._services.clear()
+        for one in self._cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=_NETWORKING):
             self._cluster.delete(self._cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
         self._fence.clear()
 

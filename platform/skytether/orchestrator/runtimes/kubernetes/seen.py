@@ -165,6 +165,7 @@ def observation(
     *,
     over: bool = False,
     ill: bool = False,
+    balancer: tuple[str, int] | str | None = None,
 ) -> Observation:
     """What the contract calls it.
 
@@ -175,6 +176,7 @@ def observation(
         reports: Of its service.
         over: It has lingered for as long as it could.
         ill: Its health check fails.
+        balancer: At which a load balancer passes on to it, or why there is no such address yet; None: there is none.
     """
     if seen.ended or over:
         if seen.failure:
@@ -190,7 +192,9 @@ def observation(
             reports=reports,
         )
     if (seen.started or seen.lingers) and seen.running:
-        host, port = where(seen, options, external)
+        if isinstance(balancer, str):
+            return Observation(seen.attempt, Phase.STARTING, detail=balancer, reports=reports)
+        host, port = balancer or where(seen, options, external)
         detail = "its health check fails" if ill and not seen.stops else ""
         return Observation(seen.attempt, Phase.RUNNING, host, port, detail=detail, reports=reports)
     return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, reports=reports)
