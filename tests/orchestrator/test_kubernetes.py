@@ -69,7 +69,7 @@ def test_what_no_node_has_room_for_says_what_is_lacking(
 def test_out_of_memory_is_told_with_the_limit(kubernetes_site: KubernetesSite, runtime: KubernetesRuntime) -> None:
     runtime.start(launch(kubernetes_site, needs={"memory_mb": 32}, params={"hog_mb": 200}))
     told = until_seen(runtime, lambda seen: seen.phase is Phase.EXITED)
-    assert told.detail == "ran out of memory: its limit is 32 MiB (limits.memory_mb of its manifest)"
+    assert told.detail.startswith("ran out of memory: its limit is 32 MiB (limits.memory_mb of its manifest)")
 
 
 def test_a_pod_that_somebody_deletes_is_gone_and_begun_anew(
@@ -194,7 +194,13 @@ def test_the_rights_of_the_docs_are_enough_and_one_that_lacks_is_named(
         assert runtime.capacity().cpu == 2
         runtime.lead(1)
         runtime.start(launch(kubernetes_site, params={"report": "at work"}))
-        until_seen(runtime, lambda seen: bool(seen.reports))
+        told = until_seen(runtime, lambda seen: bool(seen.reports) and seen.cpu_s is not None)
+        assert told.cpu_s is not None
+        assert 0 < told.cpu_s < 60
+        assert told.memory_bytes is not None
+        assert told.memory_bytes > 1 << 20
+        assert told.received_bytes
+        assert told.sent_bytes
         assert "toy service" in runtime.logs("i1", 10)
         runtime.stop("i1", force=False)
         until_seen(runtime, lambda seen: seen.phase is Phase.EXITED)

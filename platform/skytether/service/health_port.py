@@ -1,11 +1,13 @@
 """What a service answers of its health over HTTP, where its runtime cannot look at its files (Kubernetes).
 
 ``/healthz`` says 200 while the service is ready and its loop alive, 503 and one sentence otherwise; ``/reports`` gives
-what it reported (`skytether.api.service_report`). It is asked by the cluster, every second, and holds no secret.
+what it reported (`skytether.api.service_report`) and what its container uses (`skytether.api.usage`). The cluster
+asks every second; nothing of it is secret.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 import time
@@ -14,10 +16,13 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 from skytether.api.grant import DEFAULT_GRANT_PATH, GRANT_VARIABLE, Grant
 from skytether.api.service_report import FILE_NAME, MOST_BYTES
+from skytether.api.usage import write_usage
 
+from .container_usage import container_usage
 from .health import check
 
 _TIMEOUT_S = 2.0
@@ -45,7 +50,9 @@ def answering(grant: Grant) -> Iterator[None]:
                 trouble = check(path, time.time())
                 self._say(HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, (trouble or "alive").encode())
             elif self.path == "/reports":
-                self._say(HTTPStatus.OK, _read(reports))
+                self._say(
+                    HTTPStatus.OK, json.dumps({**_read(reports), "usage": write_usage(container_usage())}).encode()
+                )
             else:
                 self._say(HTTPStatus.NOT_FOUND, b"")
 
@@ -68,9 +75,10 @@ def answering(grant: Grant) -> Iterator[None]:
             thread.join()
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
-            return file.read(MOST_BYTES)
-    except OSError:
-        return b"{}"
+            document = json.loads(file.read(MOST_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) else {}

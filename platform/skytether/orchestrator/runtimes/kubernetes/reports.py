@@ -1,4 +1,7 @@
-"""What services in pods report: their pods are asked for it by way of the API server, now and then and in a thread."""
+"""What services in pods report, and what they say of their containers' use.
+
+Their pods are asked for it by way of the API server, now and then and in a thread.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 
 from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
+from skytether.api.usage import NO_USAGE, Usage, pull_usage
 
 from ..base import RuntimeFailure
 from ..now_and_then import NowAndThen
@@ -18,6 +22,9 @@ log = logging.getLogger(__name__)
 
 _EVERY_S = 3.0
 """Seconds between two looks at all of them."""
+
+_Told = tuple[tuple[ServiceReport, ...], Usage]
+_NOTHING: _Told = (), NO_USAGE
 
 
 class ReportReader:
@@ -31,11 +38,15 @@ class ReportReader:
         self._running = running
         self._now_and_then = NowAndThen("kubernetes-reports", _EVERY_S, clock, self._look)
         self._closing = False
-        self._known: Mapping[str, tuple[ServiceReport, ...]] = {}
+        self._known: Mapping[str, _Told] = {}
 
     def of(self, pod: str) -> tuple[ServiceReport, ...]:
         """What it reported, as read last."""
-        return self._known.get(pod, ())
+        return self._known.get(pod, _NOTHING)[0]
+
+    def usage(self, pod: str) -> Usage:
+        """What it says that it uses, as read last."""
+        return self._known.get(pod, _NOTHING)[1]
 
     def begin(self) -> None:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
@@ -45,26 +56,25 @@ class ReportReader:
         self._closing = True
 
     def _look(self) -> None:
-        found: dict[str, tuple[ServiceReport, ...]] = {}
+        found: dict[str, _Told] = {}
         try:
             for pod in self._running():
                 if self._closing:
                     return
-                told = self._ask(pod)
-                if told:
-                    found[pod] = told
+                found[pod] = self._ask(pod)
         except RuntimeFailure as error:
             log.debug("reports of services are not read: %s", error)
             return
         self._known = found
 
-    def _ask(self, pod: str) -> tuple[ServiceReport, ...]:
+    def _ask(self, pod: str) -> _Told:
         path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")
         try:
             text = self._cluster.text(path)
-            return pull_reports(json.loads(text)) if len(text) <= MOST_BYTES else ()
+            document = json.loads(text) if len(text) <= MOST_BYTES else None
+            return pull_reports(document), pull_usage(document)
         except (ValueError, RecursionError):
-            return ()
+            return _NOTHING
         except RuntimeFailure as error:  # this one alone: it has just ended, or speaks no HTTP
             log.debug("reports of pod %s are not read: %s", pod, error)
-            return self._known.get(pod, ())
+            return self._known.get(pod, _NOTHING)

@@ -49,6 +49,7 @@ from .options import KubernetesOptions
 from .reports import ReportReader
 from .seen import Seen, observation
 from .services import Services
+from .usage import Meter
 from .watch import Watch
 
 log = logging.getLogger(__name__)
@@ -86,6 +87,7 @@ class KubernetesRuntime(Runtime):
         self._watch = Watch(self._cluster, self._owner)
         self._services = Services(self._cluster, options, self._owner, self._must_lead)
         self._reports = ReportReader(self._cluster, self._ready)
+        self._meter = Meter(self._cluster, self._owner, self._reports.usage)
         self._lock = threading.Lock()
         self._unrun: dict[str, Observation] = {}
         """Of instances whose pod no node has taken when it was removed: nothing of it is left to be seen."""
@@ -266,6 +268,7 @@ class KubernetesRuntime(Runtime):
                 self._options,
                 self._nodes.get(seen.node, ""),
                 self._reports.of(seen.name),
+                self._meter.of(seen),
                 over=self._over(seen),
                 ill=self._watch.ill(seen),
                 balancer=self._services.balancer(instance),
@@ -377,6 +380,7 @@ class KubernetesRuntime(Runtime):
         self._remove_unbegun(_UNBEGUN_S)
         self._give_up_unbalanced(there)
         self._reports.begin()
+        self._meter.begin(there)
 
     def _give_up_unbalanced(self, there: Iterable[Seen]) -> None:
         """Those to which no load balancer passes on."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any
 
 from skytether.api.service_report import ServiceReport
+from skytether.api.usage import NO_USAGE, Usage
 
 from ..base import Observation, Phase
 from ..containers import INNER_PORT, exit_status, last_line, out_of_memory
@@ -39,6 +40,7 @@ class Seen:
     instance: str
     attempt: int
     memory_limit: str
+    cpu_limit: str
     made_at: float
     """By the API server's clock [s since the epoch]."""
     phase: str
@@ -102,6 +104,7 @@ def parse(document: Document) -> Seen | None:
     ports = [port["hostPort"] for port in container.get("ports") or () if port.get("hostPort")]
     if notes.get(NODE_PORT, "").isdecimal():
         ports = [int(notes[NODE_PORT])]
+    limits = (container.get("resources") or {}).get("limits") or {}
     waits_for = _waits_for(status, waiting)
     return Seen(
         name=meta["name"],
@@ -109,7 +112,8 @@ def parse(document: Document) -> Seen | None:
         version=meta.get("resourceVersion", ""),
         instance=labels[INSTANCE],
         attempt=int(labels[ATTEMPT]),
-        memory_limit=str((container.get("resources") or {}).get("limits", {}).get("memory", "")),
+        memory_limit=str(limits.get("memory", "")),
+        cpu_limit=str(limits.get("cpu", "")),
         made_at=datetime.fromisoformat(meta["creationTimestamp"]).timestamp(),
         phase=status.get("phase", "Pending"),
         waits_for=waits_for,
@@ -162,6 +166,7 @@ def observation(
     options: KubernetesOptions,
     external: str = "",
     reports: tuple[ServiceReport, ...] = (),
+    usage: Usage = NO_USAGE,
     *,
     over: bool = False,
     ill: bool = False,
@@ -174,6 +179,7 @@ def observation(
         options: The site's.
         external: Address of its node, as others reach it.
         reports: Of its service.
+        usage: What it uses, as known last.
         over: It has lingered for as long as it could.
         ill: Its health check fails.
         balancer: At which a load balancer passes on to it, or why there is no such address yet; None: there is none.
@@ -188,7 +194,7 @@ def observation(
             Phase.EXITED,
             exit_status=exit_status(code) if code is not None else None,
             last_line=last_line(seen.last_words),
-            detail=_detail(seen),
+            detail=_detail(seen, usage),
             reports=reports,
         )
     if (seen.started or seen.lingers) and seen.running:
@@ -196,7 +202,7 @@ def observation(
             return Observation(seen.attempt, Phase.STARTING, detail=balancer, reports=reports)
         host, port = balancer or where(seen, options, external)
         detail = "its health check fails" if ill and not seen.stops else ""
-        return Observation(seen.attempt, Phase.RUNNING, host, port, detail=detail, reports=reports)
+        return Observation(seen.attempt, Phase.RUNNING, host, port, detail=detail, reports=reports, **asdict(usage))
     return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, reports=reports)
 
 
@@ -207,7 +213,9 @@ def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, i
     return options.advertise_host or external or seen.host, seen.host_port
 
 
-def _detail(seen: Seen) -> str:
+def _detail(seen: Seen, usage: Usage) -> str:
     if seen.ended_how == "OOMKilled":
-        return out_of_memory(int(quantity(seen.memory_limit)) >> 20)
+        text = out_of_memory(int(quantity(seen.memory_limit)) >> 20)
+        used = usage.memory_bytes
+        return text if used is None else f"{text}, and it used {used >> 20} MiB when that was last looked at"
     return f"was ended by the cluster: {seen.ended_how}" if seen.ended_how else ""
