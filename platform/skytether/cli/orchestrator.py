@@ -177,6 +177,28 @@ def rotate(
         fail(str(error))
 
 
+@app.command("dismantle")
+def dismantle_sites(
+    file: Annotated[Path, typer.Argument(help="YAML of sites, as the setting sites_file has it.")],
+    state_dir: StateDir = None,
+) -> None:
+    """End and remove all that is at the sites of a file. For when their orchestrators are gone for good."""
+    from skytether.orchestrator.declared import read_sites
+    from skytether.orchestrator.defaults import default_state_dir
+    from skytether.orchestrator.errors import InvalidError
+    from skytether.orchestrator.runtimes.base import RuntimeFailure
+    from skytether.orchestrator.sites import dismantle
+
+    try:
+        declared = read_sites(file)
+        dismantle(declared, (state_dir or default_state_dir()).expanduser() / "sites")
+    except InvalidError as error:
+        fail(str(error), 2)
+    except RuntimeFailure as error:
+        fail(str(error))
+    console.print(f"nothing is left at {', '.join(one.name for one in declared) or 'no site'}", markup=False)
+
+
 @app.command("backup")
 def back_up(
     to: Annotated[Path, typer.Argument(help="A folder that is not there yet.")], state_dir: StateDir = None

@@ -61,19 +61,21 @@ class Principal:
     scopes: frozenset[str] = frozenset()
     """Of an operator's token."""
     token: TokenRow | None = None
-    """None: the operator's token in the state folder."""
+    """None: a token in a file beside the secret key."""
+    measures: bool = False
+    """Whether that is ``metrics.token``, and not the operator's."""
 
     @property
     def owner(self) -> str:
         """Whose idempotency keys these are, and who it was in the audit."""
         if self.robot is not None:
             return f"robot:{self.robot}"
-        return f"operator:{self.token.name}" if self.token else "operator"
+        return f"operator:{self.token.name}" if self.token else "metrics.token" if self.measures else "operator"
 
     @property
     def owns_state(self) -> bool:
         """Whether this is the operator of the state folder, who has the orchestrator's secrets anyway."""
-        return self.robot is None and self.token is None
+        return self.robot is None and self.token is None and not self.measures
 
     def may_use(self, service: str) -> bool:
         return ANY_SERVICE in self.services or service in self.services
@@ -202,6 +204,8 @@ class Access:
             raise UnauthenticatedError(_NO_TOKEN)
         if self._secrets.is_operator(token):
             return Principal(None, scopes=frozenset(SCOPES))
+        if self._secrets.may_measure(token):
+            return Principal(None, scopes=frozenset({"metrics"}), measures=True)
         for row, robot in self._store.holders(token[:PREFIX_LENGTH]):
             if row.hash.matches(token):
                 return self._principal(row, robot)

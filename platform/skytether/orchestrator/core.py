@@ -19,6 +19,7 @@ from .accounts import Account
 from .catalogue import Catalogue
 from .clocks import SharedClock
 from .db import GONE
+from .declared import read_sites
 from .discovery import advertised, named, targets
 from .errors import OutdatedError
 from .events import Broker
@@ -195,10 +196,11 @@ class Orchestrator:
         """Bring the database up to date, load the catalogue, adopt what runs, begin to reconcile.
 
         Raises:
-            InvalidError: The catalogue's folder is wrong.
+            InvalidError: The catalogue's folder, or the file of sites, is wrong.
             SecretFileError: The database belongs to orchestrators with another secret key.
         """
         self.catalogue.load(self.settings.catalogue_dir)
+        declared = read_sites(self.settings.sites_file) if self.settings.sites_file else []
         self.store.migrate()
         if self._shared_clock is not None:
             self._shared_clock.look()
@@ -208,7 +210,7 @@ class Orchestrator:
             )
         self.elector.start()
         self.elector.wait_first(_FIRST_LOOK)
-        self.sites.start(self.settings.local_site)
+        self.sites.start(self.settings.local_site, declared)
         self.placer.start()
         self.writer.start()
         self.keeper.start()

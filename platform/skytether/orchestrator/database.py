@@ -243,6 +243,11 @@ class Database:
         """False if there is one of that name."""
         return self._insert(sites, site.model_dump())
 
+    def change_site(self, site: SiteCreate) -> None:
+        """Have one of that name be as this one."""
+        with self._writing() as connection:
+            connection.execute(update(sites).where(sites.c.name == site.name).values(**site.model_dump()))
+
     def delete_site(self, name: str) -> None:
         with self._writing() as connection:
             connection.execute(delete(sites).where(sites.c.name == name))

@@ -23,6 +23,8 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 TOKEN_MARK = "sky-"  # noqa: S105 (a mark by which scanners can find leaked tokens, no secret)
 PREFIX_LENGTH = len(TOKEN_MARK) + 8
 KEY, OPERATOR = "secret.key", "operator.token"
+METRICS = "metrics.token"
+"""Of who may read measurements; nobody has to have it, and it is never made here."""
 OLD_KEY = "secret.key.old-"
 """Before the fingerprint, in the name of a file with a key that sessions still use."""
 _SHORTEST = 16
@@ -160,6 +162,7 @@ class _Held:
     old: tuple[bytes, ...]
     """Of sessions that began before the last rotation, the oldest first."""
     operator: TokenHash
+    metrics: TokenHash | None
 
 
 class Secrets:
@@ -190,7 +193,8 @@ class Secrets:
         before, held = self._held, self._read()
         self._seen, self._held = seen, held  # only now: files that could not be used are looked at again
         put_back = set(held.old) - set(before.old)
-        return held.current != before.current or held.operator != before.operator or bool(put_back)
+        tokens = (held.operator, held.metrics) != (before.operator, before.metrics)
+        return held.current != before.current or tokens or bool(put_back)
 
     def _read(self) -> _Held:
         current = _kept_secret(self._folder / KEY)  # first: a rotation keeps the old one before it puts the new one
@@ -199,10 +203,12 @@ class Secrets:
         except OSError as error:
             raise SecretFileError(f"cannot read {self._folder}: {error.strerror}") from error
         keys = tuple(key for key in map(_kept_secret, old) if key != current)
-        return _Held(current, keys, _operator(self._folder / OPERATOR))
+        metrics = self._folder / METRICS
+        return _Held(current, keys, _token(self._folder / OPERATOR), _token(metrics) if metrics.exists() else None)
 
     def _signature(self) -> tuple[tuple[str, int, int, int], ...]:
-        files = [self._folder / KEY, self._folder / OPERATOR, *sorted(self._folder.glob(f"{OLD_KEY}*"))]
+        named = [self._folder / name for name in (KEY, OPERATOR, METRICS)]
+        files = [*named, *sorted(self._folder.glob(f"{OLD_KEY}*"))]
         found = []
         for path in files:
             with contextlib.suppress(OSError):
@@ -212,6 +218,10 @@ class Secrets:
 
     def is_operator(self, token: str) -> bool:
         return self._held.operator.matches(token)
+
+    def may_measure(self, token: str) -> bool:
+        """Whether it is the one in ``metrics.token``."""
+        return self._held.metrics is not None and self._held.metrics.matches(token)
 
     @property
     def fingerprint(self) -> str:
@@ -270,11 +280,12 @@ def _kept_secret(path: Path) -> bytes:
     return content
 
 
-def _operator(path: Path) -> TokenHash:
+def _token(path: Path) -> TokenHash:
     try:
         return TokenHash.of(_kept_secret(path).decode("ascii").strip())
     except UnicodeDecodeError as error:
-        raise SecretFileError(f"{path} holds no token: delete it, and a new one is made at the next start") from error
+        made = ", and a new one is made at the next start" if path.name == OPERATOR else ""
+        raise SecretFileError(f"{path} holds no token: delete it{made}") from error
 
 
 @lru_cache(maxsize=16)

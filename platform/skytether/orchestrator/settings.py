@@ -242,9 +242,12 @@ class Settings(Group):
     """SQLAlchemy URL, `postgresql://user:password@host/name`; none: SQLite in the state folder."""
     secrets_dir: Path | None = None
     """Folder of `secret.key` and `operator.token`, the same for all orchestrators over one database; made (0700) where
-    it is not there. None: the state folder."""
+    it is not there. None: the state folder. A token in a file `metrics.token` there has the scope `metrics`."""
     catalogue_dir: Path | None = None
     """Folder of manifests (`*.yaml`, `*.yml`) beside the built-in ones."""
+    sites_file: Path | None = None
+    """YAML file of sites by their names, each with `tier`, `runtime`, `options` and what else it has. At the start they
+    are made, or become as it says; sites that it does not name stay."""
     stop_instances: bool = False
     """At shutdown: true ends all instances; false leaves them running, to be adopted at the next start."""
     open_metrics: bool = False
@@ -306,7 +309,7 @@ class Settings(Group):
             raise ValueError(f"write http://HOST:PORT or https://HOST:PORT, at most {MAX_ADDRESS} characters")
         return address
 
-    @field_validator("state_dir", "secrets_dir", "catalogue_dir")
+    @field_validator("state_dir", "secrets_dir", "catalogue_dir", "sites_file")
     @classmethod
     def _anywhere(cls, path: Path | None) -> Path | None:
         return path.expanduser().absolute() if path else None

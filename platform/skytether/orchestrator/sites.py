@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
 from .db import GONE
+from .declared import stored_as
 from .errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from .fitness import Fitness
 from .leader import LeadLostError, fence, fenced
@@ -195,14 +196,34 @@ class Sites:
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
 
-    def start(self, local: bool = True) -> None:
-        """Open every site of the store (``local``: make one, if there is none), and give them a moment to answer."""
+    def start(self, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
+        """Open every site of the store, and give them a moment to answer.
+
+        Args:
+            local: Make one, if there is none.
+            declared: Sites that are to be there, and as these.
+
+        Raises:
+            InvalidError: A declared one cannot be.
+        """
+        for asked in declared:
+            self._declare(asked)
         if local and not self._store.sites():
             self._store.add_site(DEFAULT_SITE)
         self.refresh()
         deadline = time.monotonic() + _FIRST_LOOK
         for site in self.all():
             site.loop.wait_first(max(0.0, deadline - time.monotonic()))
+
+    def _declare(self, asked: SiteCreate) -> None:
+        kind = self._find_runtime(asked.runtime)
+        there = next((site for site in self._store.sites() if site.name == asked.name), None)
+        wanted = stored_as(asked, there, kind)
+        if there is None:
+            self._store.add_site(wanted)  # or another orchestrator over this database has just done it
+        elif wanted != there:
+            self._store.change_site(wanted)
+            log.info("site %s is changed to what the sites file says", asked.name)
 
     def stored(self) -> dict[str, Mapping[str, int]]:
         """By site, bytes that services have written there by robot, as far as that is known."""
@@ -400,6 +421,31 @@ class Sites:
     def _close(self, site: Site) -> None:
         site.loop.stop(timeout=_CLOSE_TIMEOUT)
         site.runtime.close()
+
+
+def dismantle(
+    declared: Iterable[SiteCreate], folder: Path, find_runtime: Callable[[str], type[Runtime]] = load_runtime
+) -> None:
+    """End and remove all that is at declared sites, whose orchestrators are gone for good.
+
+    Args:
+        declared: As `declared.read_sites` gives them.
+        folder: Where the runtimes keep what they note.
+        find_runtime: Gives a runtime by its name.
+
+    Raises:
+        InvalidError: Runtime or options are wrong.
+        RuntimeFailure: A site does not answer, or refuses.
+    """
+    for asked in declared:
+        kind = find_runtime(asked.runtime)
+        options = parse(kind.Options, asked.options, prefix=(asked.name, "options"))
+        (folder / asked.name).mkdir(mode=0o700, parents=True, exist_ok=True)
+        runtime = kind(asked.name, folder / asked.name, options)
+        try:
+            _empty(runtime)
+        finally:
+            runtime.close()
 
 
 def _empty(runtime: Runtime) -> None:
