@@ -24,6 +24,7 @@ ROBOT = {
 BOTH = {**ROBOT, "role": "both", "peer": None, "link": {"up": LINK, "down": LINK}}
 RELAY = {
     "listen": END, "upstream": END, "routes": [{"id": "01*", "target": END}],
+    "kubernetes": {"kubeconfig": "k", "context": "c", "namespace": "n", "owner": "o"},
     "limits": {"sessions": 1, "addresses": 1, "newcomers": 1, "rate_mbps": 1, "idle_s": 1},
 }  # fmt: skip
 ROOTS = {"robot": (BridgeConfig, ROBOT), "both": (BridgeConfig, BOTH), "relay": (RelayConfig, RELAY)}

@@ -22,7 +22,6 @@ from skytether.orchestrator.runtimes.kubernetes.objects import pod
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 
-ROOT = Path(__file__).parents[2]
 until = partial(docker_runs.until, patience_s=90.0)
 ENDS = {Phase.EXITED, Phase.RUNNING}
 
@@ -168,27 +167,11 @@ def test_a_port_of_the_nodes_that_the_cluster_chooses_is_kept_over_runs(
         assert kubernetes_site.there("services") == []
 
 
-ACCOUNT = """\
-apiVersion: v1
-kind: ServiceAccount
-metadata: {{name: skytether, namespace: {space}}}
----
-apiVersion: rbac.authorization.k8s.io/v1
-kind: RoleBinding
-metadata: {{name: skytether, namespace: {space}}}
-roleRef: {{apiGroup: rbac.authorization.k8s.io, kind: Role, name: skytether}}
-subjects: [{{kind: ServiceAccount, name: skytether, namespace: {space}}}]
-"""
-
-
 def test_the_rights_of_the_docs_are_enough_and_one_that_lacks_is_named(
     kubernetes_site: KubernetesSite, tmp_path: Path
 ) -> None:
-    page = (ROOT / "docs/kubernetes.md").read_text()
-    role, _ = yaml.safe_load_all(re.findall("```\n(apiVersion.*?)```", page, re.DOTALL)[0])
-    role["metadata"]["namespace"] = kubernetes_site.namespace
-    documents = yaml.safe_dump(role) + "---\n" + ACCOUNT.format(space=kubernetes_site.namespace)
-    kubernetes_site.kubectl("apply", "-f", "-", given=documents)
+    role = kubernetes_site.role("skytether")
+    kubernetes_site.give_account(role)
     own = {"kubeconfig": kubernetes_site.kubeconfig_of("skytether", tmp_path), "cpu": 2, "memory_mb": 1024}
     with closing(kubernetes_site.open(tmp_path, **own)) as runtime:
         assert runtime.capacity().cpu == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -24,6 +25,7 @@ from skytether.orchestrator.runtimes.kubernetes.objects import (
     usual_port,
 )
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
+from skytether.orchestrator.runtimes.kubernetes.relayed import routes_of
 from skytether.orchestrator.runtimes.kubernetes.seen import Seen, observation, parse
 
 KEY = base64.b64encode(bytes(range(32))).decode()
@@ -186,6 +188,29 @@ def test_a_run_starts_then_runs_where_robots_reach_it() -> None:
     assert observation(found, options(), ill=True).detail == "its health check fails"
 
 
+def test_a_robot_is_told_the_relay_that_its_session_chooses() -> None:
+    running = {"running": {"startedAt": "2026-11-25T07:00:01Z"}}
+    found = seen(running, started=True, ready=True)
+    one = options(reach="relay", relay="203.0.113.5:8700")
+    assert observation(found, one) == Observation(1, Phase.RUNNING, "203.0.113.5", 8700)
+    relays = ["[2001:db8::5]:8700", "relay.example.org:8701", "203.0.113.5:8702"]
+    told = [observation(found, options(reach="relay", relay=given)) for given in (relays, relays[::-1])]
+    assert told[0] == told[1]
+    assert told[0].host in ("2001:db8::5", "relay.example.org", "203.0.113.5")
+    others = {observation(replace(found, session=f"{n:016x}"), options(reach="relay", relay=relays)) for n in range(30)}
+    assert {one.port for one in others} == {8700, 8701, 8702}
+
+
+def test_a_relay_sends_each_session_to_its_newest_run() -> None:
+    running: dict[str, Any] = {"state": {"running": {}}}
+    now = replace(seen(running["state"]), attempt=2, address="10.1.0.10")
+    ended = seen({"terminated": {"exitCode": 1}}, "Failed")
+    nowhere = replace(now, session="00000000000000bb", address="")
+    nobodys = replace(now, session="*")
+    assert routes_of([now, seen(running["state"]), nowhere, nobodys]) == {"00112233445566aa": ("10.1.0.10", 7600)}
+    assert routes_of([ended]) == {}
+
+
 def test_what_keeps_a_pod_from_being_started_is_said() -> None:
     condition = {"type": "PodScheduled", "status": "False", "message": "0/1 nodes are available: 1 Insufficient cpu."}
     told = looked_at(seen({}, "Pending", conditions=[condition]))
@@ -265,6 +290,10 @@ def test_quantities_are_read_as_kubernetes_writes_them() -> None:
         ({"advertise_host": "0.0.0.0"}, "wildcard"),
         ({"namespace": "Robots"}, "namespace"),
         ({"nodeport": True}, "nodeport"),
+        ({"reach": "relay"}, "relay: HOST:PORT of the relay goes with reach: relay"),
+        ({"relay": "203.0.113.5:8700"}, "relay: HOST:PORT of the relay goes with reach: relay"),
+        ({"reach": "relay", "relay": "203.0.113.5"}, "must be HOST:PORT"),
+        ({"reach": "relay", "relay": ["0.0.0.0:8700"]}, "wildcard address 0.0.0.0"),
         ({"kubeconfig": None, "context": "lab"}, "context is of a kubeconfig"),
     ],
 )

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from docker_runs import launch, until
 from kubernetes_house import OPERATOR, House
 from kubernetes_site import KubernetesSite
@@ -65,6 +69,63 @@ def test_a_robot_is_driven_by_way_of_a_load_balancer(kubernetes_site: Kubernetes
         house.drive(instance)
         house.core.instances.delete(OPERATOR, instance)
         house.until(instance, State.STOPPED)
+
+
+class RelayProgram:
+    """``skytether relay`` as a process, that knows of the cluster's pods what the docs' rights let it."""
+
+    def __init__(self, site: KubernetesSite, folder: Path) -> None:
+        site.give_account(site.role("skytether-relay"))
+        cluster = {
+            "kubeconfig": site.kubeconfig_of("skytether-relay", folder),
+            "namespace": site.namespace,
+            "owner": site.owner,
+        }
+        config = folder / "relay.yaml"
+        config.write_text(yaml.safe_dump({"listen": {"host": "127.0.0.1"}, "kubernetes": cluster}))
+        command = [sys.executable, "-m", "skytether.cli", "relay", "--config", str(config), "--json"]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self._process.stderr is not None
+        listens = next(line for line in self._process.stderr if "listens on UDP" in line)
+        self.port = int(listens.rpartition(":")[2])
+
+    def told(self) -> dict[str, Any]:
+        """What it tells next, of the second that ends."""
+        assert self._process.stdout is not None
+        told: dict[str, Any] = json.loads(self._process.stdout.readline())
+        return told
+
+    def __enter__(self) -> RelayProgram:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        self._process.communicate()
+
+
+def test_a_robot_is_driven_by_way_of_a_relay_that_follows_the_pods(
+    kubernetes_site: KubernetesSite, tmp_path: Path
+) -> None:
+    with RelayProgram(kubernetes_site, tmp_path) as relay:
+        options: dict[str, object] = {"reach": "relay", "relay": f"127.0.0.1:{relay.port}"}
+        with (
+            opened(tmp_path / "state", kubernetes_site, **options) as house,
+            kubernetes_site.images.another("virtual-trail") as image,
+        ):
+            house.put_trail(image)
+            instance = house.ask("trail")
+            record = house.until(instance, State.RUNNING)
+            assert (record.host, record.port) == ("127.0.0.1", relay.port)  # which is all that its robot is told
+            session = house.drive(instance)
+            flow = until(lambda: relay.told()["sessions"].get(session.id))
+            assert min(flow["packets_up"], flow["packets_down"]) > 0
+            # Its next run is another pod, at another address.
+            kubernetes_site.kubectl("-n", kubernetes_site.namespace, "delete", "pods", "--all", "--wait=false")
+            house.until(instance, State.RUNNING, lambda record: record.attempt == 2)
+            house.drive(instance)
+            house.core.instances.delete(OPERATOR, instance)
+            house.until(instance, State.STOPPED)
+        until(lambda: relay.told()["legs"] == 0)  # its route went with it
 
 
 def test_a_load_balancer_that_gives_no_address_is_given_up(kubernetes_site: KubernetesSite, tmp_path: Path) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import secrets
 import subprocess
 from pathlib import Path
 from typing import Any
 
+import yaml
 from docker_site import Images
 
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
@@ -47,6 +49,25 @@ class KubernetesSite:
         done = subprocess.run(command, capture_output=True, text=True, input=given)
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
+
+    def role(self, name: str) -> dict[str, Any]:
+        """The Role of this name that docs/kubernetes.md gives, for our namespace."""
+        page = (Path(__file__).parents[2] / "docs" / "kubernetes.md").read_text()
+        blocks = re.findall("```\n(apiVersion: rbac.*?)```", page, re.DOTALL)
+        roles = [one for block in blocks for one in yaml.safe_load_all(block) if one["kind"] == "Role"]
+        found: dict[str, Any] = next(one for one in roles if one["metadata"]["name"] == name)
+        found["metadata"]["namespace"] = self.namespace
+        return found
+
+    def give_account(self, role: dict[str, Any]) -> None:
+        """Make a service account with the name of a Role, and the rights of that."""
+        name = role["metadata"]["name"]
+        self.kubectl("apply", "-f", "-", given=json.dumps(role))
+        self.kubectl("-n", self.namespace, "create", "serviceaccount", name)
+        account = f"{self.namespace}:{name}"
+        self.kubectl(
+            "-n", self.namespace, "create", "rolebinding", name, f"--role={name}", f"--serviceaccount={account}"
+        )
 
     def kubeconfig_of(self, account: str, folder: Path) -> str:
         """A file with which one is a service account of the namespace."""

@@ -197,7 +197,7 @@ class RelayTable:
         self._limits = limits
         self._routes: dict[Prefix, Route] = {}
         self._lengths: list[int] = []
-        """Digits of the prefixes, longest first."""
+        """Digits of the prefixes, longest first; those of routes that were removed, too: each costs one look."""
         self._legs: dict[tuple[int, Address], Leg] = {}
         self._ids: dict[int, list[Leg]] = {}
         """Legs of a session by an id that its packets have."""
@@ -221,14 +221,18 @@ class RelayTable:
         if known is not None:
             known.target = target
         else:
+            before = self._find(prefix.value)
             self._routes[prefix] = Route(prefix, target, self._limits, now)
-            self._rerouted()
+            if prefix.digits not in self._lengths:
+                self._lengths = sorted([*self._lengths, prefix.digits], reverse=True)
+            self._rerouted(prefix, before)
 
     def remove(self, prefix: Prefix) -> bool:
         """Forward these sessions no longer; False if there is no such route."""
-        if self._routes.pop(prefix, None) is None:
+        before = self._routes.pop(prefix, None)
+        if before is None:
             return False
-        self._rerouted()
+        self._rerouted(prefix, before)
         return True
 
     def up(self, data: memoryview | bytes, source: Address, now: float, packets: int = 1) -> Leg | None:
@@ -350,9 +354,19 @@ class RelayTable:
                 return route
         return None
 
-    def _rerouted(self) -> None:
-        self._lengths = sorted({prefix.digits for prefix in self._routes}, reverse=True)
-        for leg in list(self._legs.values()):
+    def _rerouted(self, prefix: Prefix, before: Route | None) -> None:
+        """Forget legs whose route is another by now; ``before``: the one that a whole id had.
+
+        Routes of whole ids come and go by the thousand where instances do, so only the legs of that id are looked at.
+        """
+        if prefix.digits < ID_DIGITS:
+            legs = list(self._legs.values())
+        else:
+            session = self.sessions.get(prefix.value)
+            legs = [*session.legs.values()] if session is not None else []
+            newcomers = before.newcomers.values() if before is not None else ()
+            legs += [leg for leg in newcomers if leg.session_id == prefix.value]
+        for leg in legs:
             if self._find(leg.session_id) is not leg.route:
                 self.close(leg)
 

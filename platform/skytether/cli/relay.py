@@ -14,13 +14,14 @@ import typer
 from .output import console, fail, print_json
 
 if TYPE_CHECKING:
-    from skytether.bridge.relay import RelayStats
+    from skytether.bridge.relay import Relay, RelayStats
+    from skytether.orchestrator.runtimes.kubernetes.relayed import PodRoutes
 
-    from .relay_config import RelayConfig
+    from .relay_config import PodsConfig, RelayConfig
 
 
 def relay(
-    config: Annotated[Path | None, typer.Option(help="YAML: listen, routes, upstream, limits.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML: listen, routes, upstream, kubernetes, limits.")] = None,
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Public UDP port; 0.0.0.0:0 unless given.")
     ] = None,
@@ -29,6 +30,10 @@ def relay(
         typer.Option(metavar="ID=HOST:PORT", help="Where a session goes: its 16 digits, or its first ones and '*'."),
     ] = None,
     upstream: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Where all other sessions go.")] = None,
+    kubernetes: Annotated[
+        str | None,
+        typer.Option(metavar="NAMESPACE", help="Sessions of pods there go to these, in the relay's cluster."),
+    ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after this long; without it at Ctrl-C.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Each second one JSON document on standard output.")] = False,
 ) -> None:
@@ -41,9 +46,9 @@ def relay(
 
     try:
         if config is None:
-            settings = _from_options(listen, route or [], upstream)
-        elif listen or route or upstream:
-            fail("give either --config or --listen, --route and --upstream", 2)
+            settings = _from_options(listen, route or [], upstream, kubernetes)
+        elif listen or route or upstream or kubernetes:
+            fail("give either --config or --listen, --route, --upstream and --kubernetes", 2)
         else:
             settings = read_config(config, RelayConfig)
     except ConfigError as error:
@@ -51,7 +56,7 @@ def relay(
     _run(settings, seconds, as_json=json)
 
 
-def _from_options(listen: str | None, routes: list[str], upstream: str | None) -> RelayConfig:
+def _from_options(listen: str | None, routes: list[str], upstream: str | None, kubernetes: str | None) -> RelayConfig:
     from .config_file import check_config
     from .relay_config import RelayConfig, parse_endpoint
 
@@ -63,6 +68,8 @@ def _from_options(listen: str | None, routes: list[str], upstream: str | None) -
         document["routes"].append({"id": sessions, "target": _endpoint(parse_endpoint(target, f"--route {sessions}"))})
     if upstream is not None:
         document["upstream"] = _endpoint(parse_endpoint(upstream, "--upstream"))
+    if kubernetes is not None:
+        document["kubernetes"] = {"namespace": kubernetes}
     return check_config(document, RelayConfig, "options")
 
 
@@ -85,6 +92,7 @@ def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None
     except BridgeError as error:
         here.stop()
         fail(f"{error}; change listen, routes or upstream")
+    pods = _pods(settings.kubernetes, here) if settings.kubernetes is not None else None
     console.print(f"relay: listens on UDP {show_address(*here.address)}", markup=False, soft_wrap=True)
     start = time.monotonic()
     before = ""
@@ -98,7 +106,33 @@ def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None
                 console.print(now, markup=False, soft_wrap=True)
                 before = now
     finally:
+        if pods is not None:
+            pods.close()
         here.stop()
+
+
+def _pods(config: PodsConfig, relay: Relay) -> PodRoutes:
+    """Have the relay's routes follow a cluster's pods."""
+    from skytether.orchestrator.runtimes.base import RuntimeFailure
+
+    from .config_file import ConfigError, check_config
+
+    try:
+        import kubernetes  # noqa: F401 - told apart from an ImportError of our own
+    except ImportError:
+        relay.stop()
+        fail("pods of a cluster need the extra 'kubernetes': pip install 'skytether[kubernetes]'", 2)
+    from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
+    from skytether.orchestrator.runtimes.kubernetes.relayed import PodRoutes
+
+    try:
+        options = check_config(config.model_dump(exclude={"owner"}), KubernetesOptions, "kubernetes")
+        pods = PodRoutes(options, config.owner, relay.add, relay.remove)
+    except (ConfigError, RuntimeFailure) as error:
+        relay.stop()
+        fail(str(error), 2)
+    pods.start()
+    return pods
 
 
 def _left(start: float, seconds: float | None) -> float:

@@ -45,6 +45,18 @@ class Limits(Strict):
     idle_s: Annotated[float, Field(ge=1, le=86_400)] = _DEFAULT.idle
 
 
+class PodsConfig(Strict):
+    """Of which pods of a cluster the sessions are forwarded."""
+
+    kubeconfig: str | None = None
+    """File that says where the cluster is and who we are; null: the cluster that the relay runs in."""
+    context: str | None = None
+    """Of the kubeconfig; null: its current one."""
+    namespace: Annotated[str, Field(min_length=1)] = "skytether"
+    owner: Annotated[str, Field(min_length=1)] | None = None
+    """Of one site; null: those of all sites of the namespace."""
+
+
 class RelayConfig(Strict):
     """One relay."""
 
@@ -52,12 +64,14 @@ class RelayConfig(Strict):
     routes: tuple[RouteConfig, ...] = ()
     upstream: Target | None = None
     """Where every session goes that no route names; null: it is not forwarded."""
+    kubernetes: PodsConfig | None = None
+    """Sessions of pods go to these, as they come and go."""
     limits: Limits = Limits()
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> RelayConfig:
-        if not self.routes and self.upstream is None:
-            raise ValueError("routes: name at least one route, or an upstream for all sessions")
+        if not self.routes and self.upstream is None and self.kubernetes is None:
+            raise ValueError("routes: name at least one route, or an upstream for all sessions, or a cluster")
         ids = [Prefix.parse(route.id) for route in self.routes]
         for i, prefix in enumerate(ids):
             if prefix in ids[:i]:

@@ -32,6 +32,8 @@ _PREFIX = "skytether.io"
 OWNER, INSTANCE, ATTEMPT = f"{_PREFIX}/owner", f"{_PREFIX}/instance", f"{_PREFIX}/attempt"
 EPOCH = f"{_PREFIX}/epoch"
 """Annotation: of the leader."""
+SESSION = f"{_PREFIX}/session"
+"""Annotation of a pod: id of its session, by which a relay forwards."""
 NODE_PORT = f"{_PREFIX}/port"
 """Annotation of a pod: the port of its nodes at which a Service of its instance is reached."""
 FAILURE = f"{_PREFIX}/failure"
@@ -123,7 +125,11 @@ def pod(
                 INSTANCE: grant.instance,
                 ATTEMPT: str(launch.attempt),
             },
-            "annotations": {EPOCH: str(epoch), **({NODE_PORT: str(node_port)} if node_port else {})},
+            "annotations": {
+                EPOCH: str(epoch),
+                SESSION: grant.session_id,
+                **({NODE_PORT: str(node_port)} if node_port else {}),
+            },
         },
         "spec": {
             "restartPolicy": "Never",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from skytether.api.manifest import Strict
 
-from ..hosts import AdvertisedHost, check_advertised
+from ..hosts import AdvertisedHost, check_advertised, parse_address
 
 Port = Annotated[int, Field(ge=1, le=65_535)]
 Label = Annotated[str, Field(max_length=253)]
@@ -24,10 +24,12 @@ class KubernetesOptions(Strict):
     """Of the kubeconfig; None: its current one."""
     namespace: Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$")] = "skytether"
     """Where the pods are. It is there already: who makes it says with quotas and roles what may be done in it."""
-    reach: Literal["hostport", "nodeport", "loadbalancer", "pod"] = "hostport"
+    reach: Literal["hostport", "nodeport", "loadbalancer", "pod", "relay"] = "hostport"
     """How a robot reaches a service: at a UDP port of the pod's node, out of ``ports``; at one that the cluster chooses
-    (a Service of type NodePort); at the address that the cluster's load balancer gives a Service of the instance; or at
-    the pod's own address, where that is routable."""
+    (a Service of type NodePort); at the address that the cluster's load balancer gives a Service of the instance; at
+    the pod's own address, where that is routable; or by way of a relay."""
+    relay: Annotated[tuple[str, ...], BeforeValidator(lambda told: (told,) if isinstance(told, str) else told)] = ()
+    """``HOST:PORT`` of the relay as robots reach it; of several, its session's id chooses one for each robot."""
     ports: tuple[Port, Port] = (20_000, 29_999)
     """First and last UDP port of nodes that instances may have; for ``hostport``."""
     advertise_host: AdvertisedHost | None = None
@@ -77,6 +79,10 @@ class KubernetesOptions(Strict):
     def _robots_can_connect(self) -> KubernetesOptions:
         if self.advertise_host is not None:
             check_advertised(self.advertise_host)
+        for one in self.relay:
+            parse_address(one)
+        if (self.reach == "relay") != bool(self.relay):
+            raise ValueError("relay: HOST:PORT of the relay goes with reach: relay, and with that alone")
         if self.ports[0] > self.ports[1]:
             raise ValueError("ports: the first is above the last")
         if self.context is not None and self.kubeconfig is None:

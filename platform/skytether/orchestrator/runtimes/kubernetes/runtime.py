@@ -84,7 +84,7 @@ class KubernetesRuntime(Runtime):
         self._owner = options.owner or kept_owner(folder)
         self._cluster = Cluster(options)
         self._fence = Fence(self._cluster, self._owner)
-        self._watch = Watch(self._cluster, self._owner)
+        self._watch = Watch(self._cluster, f"{OWNER}={self._owner}")
         self._services = Services(self._cluster, options, self._owner, self._must_lead)
         self._reports = ReportReader(self._cluster, self._ready)
         self._meter = Meter(self._cluster, self._owner, self._reports.usage)

@@ -12,7 +12,8 @@ from skytether.api.usage import NO_USAGE, Usage
 
 from ..base import Observation, Phase
 from ..containers import INNER_PORT, exit_status, last_line, out_of_memory
-from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, quantity
+from ..hosts import parse_address, rendezvous
+from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, SESSION, quantity
 from .options import KubernetesOptions
 
 Document = Mapping[str, Any]
@@ -68,6 +69,8 @@ class Seen:
     """Its own."""
     host_port: int | None = None
     """At which its node is asked for it."""
+    session: str = ""
+    """Its session's id."""
     failure: str = ""
     """Why it was given up."""
     stops: bool = False
@@ -129,6 +132,7 @@ def parse(document: Document) -> Seen | None:
         host=status.get("hostIP", ""),
         address=status.get("podIP", ""),
         host_port=ports[0] if ports else None,
+        session=notes.get(SESSION, ""),
         failure=notes.get(FAILURE, ""),
         stops=bool(spec.get("activeDeadlineSeconds")) or bool(meta.get("deletionTimestamp")),
         removed=bool(meta.get("deletionTimestamp")),
@@ -210,6 +214,8 @@ def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, i
     """Host and port at which robots reach it."""
     if options.reach == "pod":
         return seen.address, INNER_PORT
+    if options.reach == "relay":
+        return parse_address(rendezvous(seen.session, options.relay))
     return options.advertise_host or external or seen.host, seen.host_port
 
 

@@ -14,7 +14,6 @@ import urllib3
 
 from ..base import RuntimeFailure
 from .cluster import Cluster, ClusterGoneError, RefusedError, cut
-from .objects import OWNER
 from .seen import Seen, parse
 
 log = logging.getLogger(__name__)
@@ -35,11 +34,14 @@ _MOST_EVENT = 4 << 20
 
 
 class Watch:
-    """Follows a site's pods, in a thread of its own."""
+    """Follows pods, in a thread of its own."""
 
-    def __init__(self, cluster: Cluster, owner: str) -> None:
+    def __init__(self, cluster: Cluster, selector: str) -> None:
+        """``selector``: of the labels that they have."""
         self._cluster = cluster
-        self._selector = f"{OWNER}={owner}"
+        self._selector = selector
+        self.changed = threading.Event()
+        """Set whenever another thing may be known than before; whoever waits for it clears it."""
         self._lock = threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._gone: dict[str, str] = {}
@@ -111,6 +113,7 @@ class Watch:
             if there is not None and there.uid == seen.uid:
                 del self._seen[seen.name]
             self._gone[seen.uid] = seen.name
+        self.changed.set()
 
     def take(self, document: Mapping[str, Any], *, gone: bool = False) -> None:
         """A pod as an answer, or an event, describes it."""
@@ -124,6 +127,7 @@ class Watch:
             before = self._seen.get(seen.name)
             if seen.uid not in self._gone and (before is None or _is_newer(seen, before)):
                 self._seen[seen.name] = seen
+        self.changed.set()
 
     def _run(self) -> None:
         while not self._closing.is_set():
@@ -177,6 +181,7 @@ class Watch:
             self._ill_since = {uid: at for uid, at in self._ill_since.items() if uid in there}
         self._failure = None
         self._looked.set()
+        self.changed.set()
         return str(meta["resourceVersion"])
 
     def _watch(self, version: str) -> str:
