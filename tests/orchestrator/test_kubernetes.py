@@ -153,6 +153,28 @@ def test_a_port_that_another_site_has_is_not_waited_for(kubernetes_site: Kuberne
         assert one.detail == ("could not be started: every UDP port from 20500 to 20501 is taken (option 'ports')")
 
 
+def test_pods_stay_closed_off_whatever_becomes_of_the_policy(
+    kubernetes_site: KubernetesSite, runtime: KubernetesRuntime
+) -> None:
+    runtime.start(launch(kubernetes_site))
+    (before,) = kubernetes_site.there("networkpolicies", f"skytether.io/owner={kubernetes_site.owner}")
+    name, space = before["metadata"]["name"], ("-n", kubernetes_site.namespace)
+    asked = runtime._cluster.path("networkpolicies", name, group="networking.k8s.io/v1")
+    written_by = runtime._cluster.get(asked)["metadata"]["managedFields"]
+    assert [(one["manager"], one["operation"]) for one in written_by] == [("skytether", "Apply")]
+
+    def restored() -> bool:
+        runtime.tidy()
+        there = kubernetes_site.there("networkpolicies", f"skytether.io/owner={kubernetes_site.owner}")
+        return [one["spec"] for one in there] == [before["spec"]]
+
+    kubernetes_site.kubectl(*space, "delete", "networkpolicy", name)
+    until(restored)
+    opened = '{"spec": {"egress": [{}]}}'
+    kubernetes_site.kubectl(*space, "patch", "networkpolicy", name, "--type=merge", "-p", opened)
+    until(restored)
+
+
 def test_a_port_of_the_nodes_that_the_cluster_chooses_is_kept_over_runs(
     kubernetes_site: KubernetesSite, tmp_path: Path
 ) -> None:

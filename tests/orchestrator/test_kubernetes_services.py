@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from skytether.orchestrator.runtimes.base import OvertakenError, SiteSilentError
-from skytether.orchestrator.runtimes.kubernetes.cluster import Cluster, RefusedError
+from skytether.orchestrator.runtimes.kubernetes.cluster import Cluster
 from skytether.orchestrator.runtimes.kubernetes.objects import balanced_address, service
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 from skytether.orchestrator.runtimes.kubernetes.services import Services
@@ -30,15 +30,8 @@ class DictCluster:
     def path(self, kind: str, name: str = "") -> str:
         return f"{kind}/{name}"
 
-    def create(self, path: str, body: Mapping[str, Any]) -> Any:
-        name = body["metadata"]["name"]
-        if path + name in self.there:
-            raise RefusedError("there is one", 409, "AlreadyExists")
-        self.there[path + name] = dict(body)
-        return body
-
-    def get(self, path: str) -> Any:
-        return self.there[path]
+    def apply(self, path: str, body: Mapping[str, Any]) -> Any:
+        return self.there.setdefault(path, dict(body))
 
     def labelled(self, kind: str, selector: str) -> list[Any]:
         assert (kind, selector) == ("services", "skytether.io/owner=o1")

@@ -27,6 +27,9 @@ _PIECE = 1 << 16
 _POOL = 16
 """Connections that are kept."""
 _MERGE = "application/merge-patch+json"
+_APPLY = "application/apply-patch+yaml"
+_MANAGER = {"fieldManager": "skytether"}
+"""Who has written what we write, as every object says (``managedFields``)."""
 _JSON = "application/json"
 Document = Mapping[str, Any]
 
@@ -78,14 +81,21 @@ class Cluster:
         return found
 
     def create(self, path: str, body: Document) -> Any:
-        return self._document("POST", path, body=body)
+        return self._document("POST", path, query=_MANAGER, body=body)
 
     def replace(self, path: str, body: Document) -> Any:
-        return self._document("PUT", path, body=body)
+        return self._document("PUT", path, query=_MANAGER, body=body)
 
     def merge(self, path: str, body: Document) -> Any:
         """A JSON merge patch."""
-        return self._document("PATCH", path, body=body, kind=_MERGE)
+        return self._document("PATCH", path, query=_MANAGER, body=body, kind=_MERGE)
+
+    def apply(self, path: str, body: Document) -> Any:
+        """Server-side apply: it is there afterwards, and has what ``body`` says; what others have added stays.
+
+        Not for what only one may make, or may change only as it was read: then ``create`` and ``replace``.
+        """
+        return self._document("PATCH", path, query={**_MANAGER, "force": "true"}, body=body, kind=_APPLY)
 
     def delete(self, path: str, **options: Any) -> None:
         """What is not there any more is left so."""

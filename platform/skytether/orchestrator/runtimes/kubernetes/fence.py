@@ -3,6 +3,9 @@
 An act cannot be kept from being overtaken between its look and its call. What makes that harmless: a pod is made first,
 under a name that only one can have; then it is looked whether another one leads; only then it is begun, by its Secret.
 Whatever a later leader finds made and not begun it removes, and the Secret that comes then goes with its pod.
+
+Neither is server-side apply for: it makes what is not there, and changes what is, whoever was there meanwhile. The
+ConfigMap is for who has read it, the pod's name for who is first, and both are refused to everybody else.
 """
 
 from __future__ import annotations

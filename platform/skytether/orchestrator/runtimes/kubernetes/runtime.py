@@ -59,6 +59,8 @@ _KEPT = 2
 _NODES_S = 30.0
 """Seconds between two looks at the nodes."""
 _NETWORKING = "networking.k8s.io/v1"
+_POLICY_S = 10.0
+"""Seconds between two looks whether pods are still closed off."""
 _LINGERS_S = GRACE_S + 1.0
 """After so many seconds nothing of a pod that lingers runs any more."""
 _UNBEGUN_S = 30.0
@@ -97,7 +99,8 @@ class KubernetesRuntime(Runtime):
         """Of pods that we made and no node has taken yet, by uid."""
         self._refused: set[int] = set()
         """Ports that others have."""
-        self._policy_there = False
+        self._policy_at: float | None = None
+        """When the NetworkPolicy of all pods was seen to be there, by the monotonic clock [s]."""
         self._capacity: tuple[float, Capacity] | None = None
         self._nodes: Mapping[str, str] = {}
         """External addresses, by their names."""
@@ -167,7 +170,8 @@ class KubernetesRuntime(Runtime):
             told = self._unrun.get(launch.instance)
             if told is not None and told.attempt >= launch.attempt:
                 return
-        self._must_hold_policy()
+        if self._policy_at is None:
+            self._hold_policy()
         for seen in there:
             if not self._over(seen) or seen.attempt < launch.attempt - _KEPT:
                 self._delete(seen)
@@ -242,18 +246,16 @@ class KubernetesRuntime(Runtime):
                 except RuntimeFailure as error:
                     self._leave(seen, f"could not be started: {error}", unstarted=True)
 
-    def _must_hold_policy(self) -> None:
-        """The NetworkPolicy of all pods is there."""
-        if self._policy_there:
-            return
+    def _hold_policy(self) -> None:
+        """Have the NetworkPolicy of all pods, as it is to be, whoever has changed or removed it."""
         body = site_policy(self._owner)
+        path = self._cluster.path("networkpolicies", body["metadata"]["name"], group=_NETWORKING)
         try:
-            self._cluster.create(self._cluster.path("networkpolicies", group=_NETWORKING), body)
+            self._cluster.apply(path, body)
         except RefusedError as error:
-            if error.reason != "AlreadyExists":
-                self._blocked = str(error)
-                raise
-        self._policy_there, self._blocked = True, ""
+            self._blocked = str(error)
+            raise
+        self._policy_at, self._blocked = time.monotonic(), ""
 
     def observe(self) -> Mapping[str, Observation]:
         newest: dict[str, Seen] = {}
@@ -379,6 +381,9 @@ class KubernetesRuntime(Runtime):
         self._give_other_ports(there)
         self._remove_unbegun(_UNBEGUN_S)
         self._give_up_unbalanced(there)
+        if there and time.monotonic() - (self._policy_at or 0.0) >= _POLICY_S:
+            with suppress(RefusedError):  # which blocks the site; what runs is looked after all the same
+                self._hold_policy()
         self._reports.begin()
         self._meter.begin(there)
 

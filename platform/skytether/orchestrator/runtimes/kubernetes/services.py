@@ -53,13 +53,11 @@ class Services:
         if not self._used:
             return None
         try:
-            there = self._cluster.create(self._cluster.path("services"), service(instance, self._owner, self._options))
+            there = self._cluster.apply(self._path(instance), service(instance, self._owner, self._options))
         except RefusedError as error:
-            if error.reason != "AlreadyExists":
-                raise RuntimeFailure(f"the cluster refuses it: {error}") from error
-            there = self._cluster.get(self._path(instance))
-            if "deletionTimestamp" in there["metadata"]:
-                raise SiteSilentError("somebody has deleted its Service, which is not gone yet") from error
+            raise RuntimeFailure(f"the cluster refuses it: {error}") from error
+        if "deletionTimestamp" in there["metadata"]:
+            raise SiteSilentError("somebody has deleted its Service, which is not gone yet")
         return None if self._balanced else int(there["spec"]["ports"][0]["nodePort"])
 
     def balancer(self, instance: str) -> Address | str | None:
