@@ -14,7 +14,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import Opening, ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase
 from skytether.orchestrator.runtimes.kubernetes.objects import (
-    capacity,
+    disruption_budget,
     free_port,
     openings_policy,
     pod,
@@ -176,7 +176,9 @@ def test_a_pod_of_somebody_else_is_none_of_ours() -> None:
 
 
 def test_a_run_starts_then_runs_where_robots_reach_it() -> None:
-    assert looked_at(seen({"waiting": {"reason": "ContainerCreating"}}, "Pending")) == Observation(1, Phase.STARTING)
+    assert looked_at(seen({"waiting": {"reason": "ContainerCreating"}}, "Pending")) == Observation(
+        1, Phase.STARTING, unstarted=True
+    )
     running = {"running": {"startedAt": "2026-11-25T07:00:01Z"}}
     assert looked_at(seen(running)).phase is Phase.STARTING  # its service has not said that it is ready
     found = seen(running, started=True, ready=True)
@@ -259,22 +261,19 @@ def test_one_that_was_asked_to_end_runs_until_it_has() -> None:
     assert looked_at(seen({"terminated": {"exitCode": 0}}, "Failed", reason="DeadlineExceeded")).detail == ""
 
 
-def node(name: str = "n1", **spec: Any) -> dict[str, Any]:
-    labels = {"zone": spec.pop("zone", "a")}
-    gives = {"cpu": "3920m", "memory": "8Gi", "nvidia.com/gpu": "1"}
-    status = {"allocatable": gives, "nodeInfo": {"architecture": spec.pop("architecture", "amd64")}}
-    return {"metadata": {"name": name, "labels": labels}, "spec": spec, "status": status}
+def test_no_pod_of_a_site_is_evicted_while_it_serves() -> None:
+    budget = disruption_budget("o1", "policy/v1")
+    assert budget["spec"]["selector"]["matchLabels"].items() <= made()["metadata"]["labels"].items()
+    assert budget["spec"]["minAvailable"] == 2**31 - 1  # an integer: budgets of bare pods know nothing else
 
 
-def test_a_site_offers_what_the_nodes_give_that_its_pods_may_have() -> None:
-    taint = {"key": "robots", "value": "yes", "effect": "NoSchedule"}
-    nodes = [node(), node("n2", zone="b"), node("n3", unschedulable=True), node("n4", taints=[taint])]
-    told = capacity(nodes, options(node_selector={"zone": "a"}))
-    assert (told.cpu, told.memory_mb, told.gpu, told.architecture) == (pytest.approx(3.92), 8192, 1, "amd64")
-    tolerant = options(tolerations=[{"key": "robots", "value": "yes", "effect": "NoSchedule"}])
-    assert capacity(nodes, tolerant).cpu == pytest.approx(3 * 3.92)
-    assert capacity([*nodes, node(architecture="arm64")], options()).architecture == ""
-    assert capacity([], options(cpu=4, memory_mb=100)).cpu == 4
+def test_what_the_cluster_is_about_to_end_says_so_until_it_was_asked_to_end() -> None:
+    condition = {"type": "DisruptionTarget", "status": "True", "message": "deleting by taint manager"}
+    up = seen({"running": {}}, started=True, ready=True, conditions=[condition])
+    assert looked_at(up).leaving == "the cluster is about to end its pod: deleting by taint manager"
+    well = seen({"running": {}}, started=True, ready=True)
+    assert observation(well, options(), leaving="its node n1 is cordoned").leaving == "its node n1 is cordoned"
+    assert observation(replace(well, stops=True), options(), leaving="its node n1 is cordoned").leaving == ""
 
 
 def test_quantities_are_read_as_kubernetes_writes_them() -> None:

@@ -188,3 +188,62 @@ def test_a_bad_link_alone_moves_nothing(served_with: Callable[..., Any]) -> None
         report = Report(rtt_s=0.3, control_source="fallback")
         answer = served.operator.renew_instance(first.id, Renew(report=report, measurements=same))
         assert answer.successor is None
+
+
+WHY = "its node n1 is cordoned"
+
+
+def leaves(served: Any, instance: str, why: str = WHY) -> None:
+    for runtime in served.fleet.made.values():
+        if instance in runtime.world:
+            runtime.world[instance].leaving = why
+
+
+def successor(served: Any, instance: str) -> Any:
+    return until(lambda: (found := served.operator.get_instance(instance)).successor and found)
+
+
+def test_what_its_site_is_about_to_end_is_moved_and_its_site_may_have_another_place(two: Any, manifest: Any) -> None:
+    put(two, manifest, cpu=40)  # twice that is more than a site has
+    first = ask(two, measurements=MEASURED)
+    leaves(two, first.id)
+    moving = successor(two, first.id)
+    assert (moving.state, moving.placement.site) == (State.RUNNING, "near")
+    second = until(lambda: two.running(moving.successor))
+    assert second.placement.site == "near"
+    until(lambda: two.operator.get_instance(first.id).reason == f"{WHY}: its robot is handed over")
+    two.operator.delete_instance(first.id)
+    until(lambda: two.operator.get_instance(first.id).state.final)
+    two.fleet.made["near"].closed = "no node takes pods"
+    leaves(two, second.id)
+    third = until(lambda: two.running(successor(two, second.id).successor))
+    assert third.placement.site == "far"
+
+
+def test_what_nothing_else_takes_stays_and_says_why_until_something_does(two: Any) -> None:
+    near, far = (two.fleet.made[name] for name in ("near", "far"))
+    first = ask(two, measurements=MEASURED)
+    near.closed = far.closed = "no node takes pods: n1 is cordoned"
+    leaves(two, first.id)
+    said = f"{WHY}, and nothing else takes it: far: {far.closed}; near: {near.closed}"
+    until(lambda: two.operator.get_instance(first.id).reason == said)
+    assert two.running(first.id)
+    leaves(two, first.id, "")
+    until(lambda: two.operator.get_instance(first.id).reason == "")
+    leaves(two, first.id)
+    until(lambda: two.operator.get_instance(first.id).reason == said)
+    far.closed = ""
+    assert until(lambda: two.running(successor(two, first.id).successor)).placement.site == "far"
+
+
+def test_a_standby_takes_over_from_what_leaves_and_none_is_kept_where_it_would_end(two: Any, manifest: Any) -> None:
+    put(two, manifest, standby=1)
+    spare = until(lambda: spares(two))[0]
+    leaves(two, spare.id)
+    other = until(lambda: [s for s in spares(two) if s.id != spare.id])[0]
+    until(lambda: two.operator.get_instance(spare.id).state.final)
+    first = ask(two)
+    assert first.id == other.id
+    warm = until(lambda: spares(two))[0]
+    leaves(two, first.id)
+    assert successor(two, first.id).successor == warm.id

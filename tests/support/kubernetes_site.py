@@ -90,7 +90,7 @@ class KubernetesSite:
 
     def clean(self) -> None:
         """Remove what the tests have made."""
-        kinds = "pods,services,secrets,configmaps,networkpolicies"
+        kinds = "pods,services,secrets,configmaps,networkpolicies,poddisruptionbudgets"
         chosen = ["-l", "app.kubernetes.io/managed-by=skytether", "--grace-period=1", "--wait=false"]
         self.kubectl("-n", self.namespace, "delete", kinds, *chosen)
 

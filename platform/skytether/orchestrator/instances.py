@@ -30,10 +30,10 @@ from .catalogue import Catalogue
 from .errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from .gates import Gates
 from .metrics import Metrics
-from .moves import Moves
+from .moves import Moves, told
 from .placement import Decision
 from .quotas import Quotas
-from .reconcile import Reconciler, told
+from .reconcile import Reconciler
 from .records import Record, new_record
 from .reports import Reports
 from .runtimes.base import LogStream, RuntimeFailure

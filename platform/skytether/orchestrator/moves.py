@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from skytether.api.manifest import Manifest
-from skytether.api.rest import Measurement, Report, State
+from skytether.api.rest import Measurement, Refusal, Report, State
 
 from .catalogue import Catalogue
 from .errors import InvalidError
@@ -99,7 +99,8 @@ class Moves:
         scores = {score.site: score.total_ms for score in self._weigh(record, others, runs=True).scores}
         cold = (score.total_ms for score in self._weigh(record, others).scores)
         limit = min(cold, default=math.inf) + self._weights.migrate_ms
-        good = [s for s in same if s.site in scores and scores[s.site] <= limit and self._reachable(s)]
+        here = [s for s in same if self._reachable(s) and not self._leaving(s)]
+        good = [s for s in here if s.site in scores and scores[s.site] <= limit]
         return sorted(good, key=lambda spare: (scores[spare.site or ""], spare.created_at))
 
     def keep_spares(self) -> None:
@@ -115,7 +116,7 @@ class Moves:
             manifest = catalogue.get(spare.service)
             wanted = manifest.spec.needs.standby if manifest else 0
             current = manifest is not None and _document(manifest) == spare.manifest
-            if current and (self._stale(spare, now) or self._drains(spare)):
+            if current and (self._stale(spare, now) or self._drains(spare) or self._leaving(spare)):
                 current = False
             if current and kept.get(spare.service, 0) < wanted:
                 kept[spare.service] = kept.get(spare.service, 0) + 1
@@ -177,17 +178,43 @@ class Moves:
                 return
 
     def watch(self, live: Sequence[Record]) -> None:
-        """Fail over from sites that do not answer, and move what has not been good enough for its robot for long."""
+        """Fail over from sites that do not answer, and move what is about to be ended, or serves its robot badly."""
         now = self._clock()
         for record in live:
-            if record.state is State.RUNNING and not record.spare and not self._reachable(record):
+            if record.state is not State.RUNNING or record.spare:
+                continue
+            if not self._reachable(record):
                 self.fail_over(record, f"site {record.site} does not answer")
+            elif why := self._leaving(record):
+                self._evacuate(record, why, live, now)
+            elif record.reason:
+                self._store.change(record, now, reason="")  # it need not leave any more
         reports = self._store.reports(_BY_ITSELF)
         bad = {r.id for r in live if r.state is State.RUNNING and r.id in reports}
         self._bad_since = {i: self._bad_since.get(i, now) for i in bad}
         for record in live:
             if now - self._bad_since.get(record.id, now) >= self._timing.replace_after:
                 self._replace(record, Report.model_validate(reports[record.id]), live, now)
+
+    def _evacuate(self, record: Record, why: str, live: Sequence[Record], now: float) -> None:
+        """Move what its site is about to end; it stays where nothing else takes it, and says so."""
+        self.fail_over(record, why)
+        if self._store.successor(record.id) is not None:
+            reason = f"{why}: its robot is handed over"
+        else:
+            wanted = self.successor_of(record)
+            decision = self._weigh(wanted, [other for other in live if other is not record])
+            if decision.site is not None:
+                self._store.add(wanted, "", None, "")
+                log.warning(
+                    "%s for %s (%s): %s: moving it to %s",
+                    *(record.service, record.robot, record.id, why, decision.site),
+                )
+                reason = f"{why}: its robot is handed over"
+            else:
+                reason = f"{why}, and nothing else takes it: {told(wanted, decision.refused)}"
+        if reason != record.reason:
+            self._store.change(record, now, reason=reason)
 
     def _replace(self, record: Record, report: Report, live: Sequence[Record], now: float) -> None:
         if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
@@ -213,6 +240,11 @@ class Moves:
         site = self._sites().find(record.site)
         return site is not None and site.draining
 
+    def _leaving(self, record: Record) -> str:
+        """Why its site is about to end it; empty: it is not."""
+        site = self._sites().find(record.site)
+        return site.leaving.get(record.id, "") if site is not None else ""
+
     def _reachable(self, record: Record) -> bool:
         site = self._sites().find(record.site)
         return site is not None and not site.unreachable
@@ -225,3 +257,9 @@ def _alike(spare: Record, record: Record) -> bool:
 
 def _document(manifest: Manifest) -> dict[str, Any]:
     return manifest.model_dump(mode="json", by_alias=True)
+
+
+def told(record: Record, refused: Sequence[Refusal]) -> str:
+    """All refusals in one sentence."""
+    none = "no other" if record.replaces else "none"
+    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or f"there is {none}: add one with `skytether site add`"

@@ -176,7 +176,8 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
     if seen.detail and seen.detail != record.reason:
         return Progress(record, seen.detail)
     if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:
-        return Crash(record, f"was not ready within {timing.start_timeout:g} s")
+        why = f"was not ready within {timing.start_timeout:g} s"
+        return Crash(record, f"{why}: {seen.detail}" if seen.detail else why, unstarted=seen.unstarted)
     return None
 
 

@@ -21,7 +21,7 @@ from .clocks import SetClock
 from .db import GONE
 from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
-from .moves import Moves
+from .moves import Moves, told
 from .placement import NOTHING, UNSTARTED, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .records import Record
@@ -254,7 +254,8 @@ class Reconciler:
         """Where it would run now, beside what is placed; looks only. ``runs``: it need not be started any more."""
         others = self._store.live() if placed is None else placed
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
-        used = _used(others)
+        leaving = self._leaving()
+        used = _used([other for other in others if other.id not in leaving] if leaving else others)
         there = Counter(other.site for other in others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
         tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
@@ -284,11 +285,15 @@ class Reconciler:
         return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
 
     def _allows(self, record: Record, site: Site) -> bool:
-        """One that replaces another does not go where that is, unless it was told to."""
+        """One that replaces another does not go where that is, unless it was told to or that one is ended there."""
         if record.pinned is not None:
             return site.name == record.pinned
         replaced = self._store.get(record.replaces) if record.replaces else None
-        return replaced is None or site.name != replaced.site
+        return replaced is None or site.name != replaced.site or replaced.id in site.leaving
+
+    def _leaving(self) -> set[str]:
+        """What sites are about to end: it takes no room of what they have left."""
+        return {instance for site in self.sites.all() for instance in site.leaving}
 
     def _waits(self, record: Record) -> bool:
         """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
@@ -343,11 +348,12 @@ class Reconciler:
                 site.runtime.lead(led)
                 site.led, site.ended, site.seen_since = led, frozenset(), None
                 site.fitness.forget()
-            if site.capacity is None:
-                site.capacity = site.runtime.capacity()
+            due = whole and time.monotonic() - site.tidied_at >= _TIDY
+            if site.capacity is None or due:
+                site.capacity = site.runtime.capacity()  # nodes come and go
             ids = {record.id for record in live}
             looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
-            if due := whole and time.monotonic() - site.tidied_at >= _TIDY:
+            if due:
                 site.load = site.runtime.load()
         except RuntimeFailure as error:
             if isinstance(error, OvertakenError) and error.epoch > self._clock():  # of no leader of this time
@@ -364,6 +370,7 @@ class Reconciler:
                 self._store.count(record, [of_run(record, seen)])
         others = {} if whole else {i: seen for i, seen in site.observed.items() if i not in ids}
         site.observed, site.failure, site.looked_at = {**others, **looked}, "", time.monotonic()
+        site.leaving = {i: seen.leaving for i, seen in site.observed.items() if seen.leaving}
         if not self._leads():
             return self._timing.observe
         now = self._now()
@@ -571,7 +578,7 @@ def _same(one: Observation | None, other: Observation | None) -> bool:
 
 
 def _phase(seen: Observation) -> tuple[object, ...]:
-    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port, seen.exceeds
+    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port, seen.exceeds, seen.leaving
 
 
 def _ended(
@@ -595,9 +602,3 @@ def _used(records: Sequence[Record]) -> dict[str, Capacity]:
             needs, (cpu, memory_mb, gpu) = record.spec.needs, sums.get(record.site, (0.0, 0, 0))
             sums[record.site] = cpu + needs.cpu, memory_mb + needs.memory_mb, gpu + needs.gpu
     return {site: Capacity(*sum_) for site, sum_ in sums.items()}
-
-
-def told(record: Record, refused: Sequence[Refusal]) -> str:
-    """All refusals in one sentence."""
-    none = "no other" if record.replaces else "none"
-    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or f"there is {none}: add one with `skytether site add`"

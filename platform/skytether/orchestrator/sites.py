@@ -116,6 +116,8 @@ class Site:
         """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
         self.ended: frozenset[str] = frozenset()
         """Those of the observed that the store knows as ended."""
+        self.leaving: Mapping[str, str] = {}
+        """Of the observed those that the site is about to end, and why."""
         self.awaited: Collection[str] | None = None
         """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
         self.draining = False

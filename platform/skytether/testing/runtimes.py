@@ -49,6 +49,8 @@ class FakeRun:
     last_line: str = ""
     log: str = ""
     reports: tuple[ServiceReport, ...] = ()
+    leaving: str = ""
+    """Why the site is about to end it."""
 
 
 class FakeWorld(dict[str, FakeRun]):
@@ -79,6 +81,8 @@ class FakeRuntime(Runtime):
         """Of the leader for whom it acts; 0: of any."""
         self.silent = False
         """Set it, and the site answers no more."""
+        self.closed = ""
+        """Why nothing can be started at present."""
         self.started: list[tuple[str, int]] = []
         """Instance and attempt of every run that was begun here."""
         self._options = options
@@ -86,6 +90,10 @@ class FakeRuntime(Runtime):
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return None if spec.entrypoint else "the service has no entrypoint"
+
+    @override
+    def blocked(self) -> str:
+        return self.closed
 
     def capacity(self) -> Capacity:
         self._answer()
@@ -123,7 +131,7 @@ class FakeRuntime(Runtime):
             return Observation(attempt, Phase.EXITED, exit_status=run.exit_status, last_line=run.last_line)
         if run.looks < self.looks_until_ready:
             return Observation(attempt, Phase.STARTING)
-        here = Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, reports=run.reports)
+        here = Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, leaving=run.leaving, reports=run.reports)
         return replace(here, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
 
     def stop(self, instance: str, *, force: bool) -> None:

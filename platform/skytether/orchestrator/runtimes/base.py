@@ -55,7 +55,10 @@ class Observation:
     RUNNING: what its own health check finds wrong; empty: it is well. EXITED: how it ended, where the status does not
     tell; continues "the service ..."."""
     unstarted: bool = False
-    """EXITED: it could not even be begun, and nothing of it or of earlier runs is left: another site may do better."""
+    """EXITED: it could not even be begun, and nothing of it or of earlier runs is left: another site may do better.
+    STARTING: nothing of it runs yet."""
+    leaving: str = ""
+    """RUNNING: why the site is about to end it, though nothing is wrong with it, as a sentence: it is moved first."""
     exceeds: str = ""
     """STARTING, RUNNING: what it took more of than it may, and is ended for; continues "the service ..."."""
     cpu_s: float | None = None
@@ -183,7 +186,7 @@ class Runtime(ABC):
 
     @abstractmethod
     def capacity(self) -> Capacity:
-        """What the site offers.
+        """What the site offers. Called about once a second, so it should be cheap.
 
         Raises:
             RuntimeFailure: The site does not answer.

@@ -291,6 +291,19 @@ def site_policy(owner: str) -> dict[str, Any]:
     }
 
 
+def disruption_budget(owner: str, version: str) -> dict[str, Any]:
+    """That no pod that serves is evicted: who drains a node waits until its robots have been handed over.
+
+    More pods are to be left than there ever are: that is how a budget of bare pods says "none".
+    """
+    return {
+        "apiVersion": version,
+        "kind": "PodDisruptionBudget",
+        "metadata": {"name": f"skytether-{owner}", "labels": {**MANAGED, OWNER: owner}},
+        "spec": {"minAvailable": 2**31 - 1, "selector": {"matchLabels": {OWNER: owner}}},
+    }
+
+
 def openings_policy(openings: Openings, made: Document, owner: str) -> dict[str, Any]:
     """The NetworkPolicy of one run that may connect to some addresses."""
     meta = made["metadata"]
@@ -331,16 +344,11 @@ def leader(owner: str, epoch: int) -> dict[str, Any]:
 
 
 def capacity(nodes: Iterable[Document], options: KubernetesOptions) -> Capacity:
-    """What nodes give that may have pods of the site."""
+    """What nodes give, or what the site's options say instead."""
     cpu = memory = 0.0
     gpu = 0
     architectures = set()
     for node in nodes:
-        labels = node["metadata"].get("labels") or {}
-        if node["spec"].get("unschedulable") or any(labels.get(k) != v for k, v in options.node_selector.items()):
-            continue
-        if not all(_tolerated(taint, options) for taint in node["spec"].get("taints") or ()):
-            continue
         gives = node["status"]["allocatable"]
         cpu += quantity(gives["cpu"])
         memory += quantity(gives["memory"])
@@ -354,7 +362,8 @@ def capacity(nodes: Iterable[Document], options: KubernetesOptions) -> Capacity:
     )
 
 
-def _tolerated(taint: Document, options: KubernetesOptions) -> bool:
+def tolerated(taint: Document, options: KubernetesOptions) -> bool:
+    """Whether pods of the site may be on a node with this taint."""
     if taint["effect"] == "PreferNoSchedule":
         return True
     for toleration in options.tolerations:

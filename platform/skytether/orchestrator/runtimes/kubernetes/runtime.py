@@ -28,15 +28,15 @@ from ..base import (
 )
 from ..containers import USER, kept_owner, with_owner
 from ..egress import resolve
+from .budget import Budget
 from .cluster import Cluster, RefusedError
 from .fence import Fence
 from .logs import PodLog
+from .nodes import Nodes
 from .objects import (
     FAILURE,
     GRACE_S,
     OWNER,
-    capacity,
-    external_address,
     free_port,
     openings_policy,
     pod,
@@ -56,8 +56,6 @@ log = logging.getLogger(__name__)
 
 _KEPT = 2
 """Earlier runs whose pods stay, for their logs."""
-_NODES_S = 30.0
-"""Seconds between two looks at the nodes."""
 _NETWORKING = "networking.k8s.io/v1"
 _POLICY_S = 10.0
 """Seconds between two looks whether pods are still closed off."""
@@ -87,6 +85,8 @@ class KubernetesRuntime(Runtime):
         self._cluster = Cluster(options)
         self._fence = Fence(self._cluster, self._owner)
         self._watch = Watch(self._cluster, f"{OWNER}={self._owner}")
+        self._nodes = Nodes(self._cluster)
+        self._budget = Budget(self._cluster, self._owner)
         self._services = Services(self._cluster, options, self._owner, self._must_lead)
         self._reports = ReportReader(self._cluster, self._ready)
         self._meter = Meter(self._cluster, self._owner, self._reports.usage)
@@ -101,11 +101,11 @@ class KubernetesRuntime(Runtime):
         """Ports that others have."""
         self._policy_at: float | None = None
         """When the NetworkPolicy of all pods was seen to be there, by the monotonic clock [s]."""
-        self._capacity: tuple[float, Capacity] | None = None
-        self._nodes: Mapping[str, str] = {}
-        """External addresses, by their names."""
         self._blocked = ""
+        self._closed = ""
+        """Why no node takes pods at present."""
         self._watch.start()
+        self._nodes.start()
 
     @override
     @classmethod
@@ -117,7 +117,7 @@ class KubernetesRuntime(Runtime):
 
     @override
     def blocked(self) -> str:
-        return self._blocked
+        return self._blocked or self._closed
 
     @override
     def isolation(self) -> tuple[str, ...]:
@@ -128,22 +128,8 @@ class KubernetesRuntime(Runtime):
 
     def capacity(self) -> Capacity:
         self._watch.seen(self._options.timeout_s)
-        if self._capacity is None or time.monotonic() - self._capacity[0] >= _NODES_S:
-            self._capacity = time.monotonic(), self._look_at_nodes()
-        return self._capacity[1]
-
-    def _look_at_nodes(self) -> Capacity:
-        options = self._options
-        try:
-            nodes = self._cluster.get("/api/v1/nodes")["items"]
-        except RefusedError as error:
-            if options.cpu is None or options.memory_mb is None:
-                raise RuntimeFailure(
-                    f"{error}: give the site's account that right, or the site the options cpu and memory_mb"
-                ) from error
-            nodes = []
-        self._nodes = {node["metadata"]["name"]: external_address(node) for node in nodes}
-        return capacity(nodes, options)
+        total, self._closed = self._nodes.offered(self._options)
+        return total
 
     @override
     def lead(self, epoch: int) -> None:
@@ -255,6 +241,7 @@ class KubernetesRuntime(Runtime):
         except RefusedError as error:
             self._blocked = str(error)
             raise
+        self._budget.hold()
         self._policy_at, self._blocked = time.monotonic(), ""
 
     def observe(self) -> Mapping[str, Observation]:
@@ -268,11 +255,12 @@ class KubernetesRuntime(Runtime):
             instance: observation(
                 seen,
                 self._options,
-                self._nodes.get(seen.node, ""),
+                self._nodes.address(seen.node),
                 self._reports.of(seen.name),
                 self._meter.of(seen),
                 over=self._over(seen),
                 ill=self._watch.ill(seen),
+                leaving=self._nodes.leaving(seen.node),
                 balancer=self._services.balancer(instance),
             )
             for instance, seen in newest.items()
@@ -428,10 +416,12 @@ class KubernetesRuntime(Runtime):
         self._services.clear()
         for one in self._cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=_NETWORKING):
             self._cluster.delete(self._cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
+        self._budget.remove()
         self._fence.clear()
 
     @override
     def close(self) -> None:
         self._reports.close()
         self._watch.close()
+        self._nodes.close()
         self._cluster.close()

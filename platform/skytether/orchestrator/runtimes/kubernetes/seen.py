@@ -75,6 +75,8 @@ class Seen:
     """Why it was given up."""
     stops: bool = False
     """It was asked to end."""
+    disrupted: str = ""
+    """Why the cluster is about to end it."""
     removed: bool = False
     """It is deleted, by us or anybody: its node ends what runs of it yet."""
 
@@ -135,6 +137,7 @@ def parse(document: Document) -> Seen | None:
         session=notes.get(SESSION, ""),
         failure=notes.get(FAILURE, ""),
         stops=bool(spec.get("activeDeadlineSeconds")) or bool(meta.get("deletionTimestamp")),
+        disrupted=_disrupted(status),
         removed=bool(meta.get("deletionTimestamp")),
     )
 
@@ -147,6 +150,13 @@ def _waits_for(status: Document, waiting: Document) -> str:
     return {"ContainerCreating": "", "PodInitializing": ""}.get(
         reason, f"{reason} {waiting.get('message', '')}".strip()
     )
+
+
+def _disrupted(status: Document) -> str:
+    for condition in status.get("conditions") or ():
+        if condition["type"] == "DisruptionTarget" and condition["status"] == "True":
+            return f"the cluster is about to end its pod: {condition.get('message') or condition.get('reason', '')}"
+    return ""
 
 
 def _hopeless(waiting: Document, image: str) -> str:
@@ -174,6 +184,7 @@ def observation(
     *,
     over: bool = False,
     ill: bool = False,
+    leaving: str = "",
     balancer: tuple[str, int] | str | None = None,
 ) -> Observation:
     """What the contract calls it.
@@ -186,6 +197,7 @@ def observation(
         usage: What it uses, as known last.
         over: It has lingered for as long as it could.
         ill: Its health check fails.
+        leaving: Why its node is about to be without it.
         balancer: At which a load balancer passes on to it, or why there is no such address yet; None: there is none.
     """
     if seen.ended or over:
@@ -206,8 +218,17 @@ def observation(
             return Observation(seen.attempt, Phase.STARTING, detail=balancer, reports=reports)
         host, port = balancer or where(seen, options, external)
         detail = "its health check fails" if ill and not seen.stops else ""
-        return Observation(seen.attempt, Phase.RUNNING, host, port, detail=detail, reports=reports, **asdict(usage))
-    return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, reports=reports)
+        return Observation(
+            seen.attempt,
+            Phase.RUNNING,
+            host,
+            port,
+            detail=detail,
+            leaving="" if seen.stops else seen.disrupted or leaving,
+            reports=reports,
+            **asdict(usage),
+        )
+    return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, unstarted=not seen.node, reports=reports)
 
 
 def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, int | None]:

@@ -196,7 +196,7 @@ class Watch:
         with self._cluster.stream(self._cluster.path("pods"), _SILENCE_S, **query) as answer:
             self._answer = answer
             try:
-                for event in _events(answer):
+                for event in events(answer):
                     if self._closing.is_set():
                         return ""
                     kind, document = event.get("type"), event.get("object") or {}
@@ -212,7 +212,7 @@ class Watch:
         return version
 
 
-def _events(answer: urllib3.HTTPResponse) -> Iterator[Any]:
+def events(answer: urllib3.HTTPResponse) -> Iterator[Any]:
     """The lines of a watch, as documents."""
     rest = b""
     for piece in answer.stream(1 << 16):
