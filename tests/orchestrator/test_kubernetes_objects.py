@@ -13,7 +13,9 @@ from pydantic import ValidationError
 from skytether.api.grant import Grant
 from skytether.api.manifest import Opening, ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase
+from skytether.orchestrator.runtimes.containers import data_name
 from skytether.orchestrator.runtimes.kubernetes.objects import (
+    claim,
     disruption_budget,
     free_port,
     openings_policy,
@@ -120,6 +122,56 @@ def test_the_key_is_in_the_secret_alone_which_goes_with_its_pod() -> None:
     assert grant["metadata"]["ownerReferences"][0]["uid"] == "u1"
     told = Grant.model_validate_json(base64.b64decode(grant["data"]["grant.json"]))
     assert (told.session_key, told.bind_port, told.health_port) == (KEY, 7600, 7601)
+
+
+def test_data_goes_with_its_run_or_is_kept_for_a_robot_and_a_service() -> None:
+    def volume(given: KubernetesOptions) -> Any:
+        return next(one for one in pod(launch(), given, "o1", None, {})["spec"]["volumes"] if one["name"] == "data")
+
+    assert volume(options(data_mb=64)) == {"name": "data", "emptyDir": {"sizeLimit": "64Mi"}}
+    kept = options(data_mb=64, keep_data=True, storage_class="fast")
+    name = "skytether-o1-data-walker-toy"
+    assert volume(kept) == {"name": "data", "persistentVolumeClaim": {"claimName": name}}
+    assert claim(launch(), kept, "o1") == {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": {
+            "name": name,
+            "labels": {
+                "app.kubernetes.io/managed-by": "skytether",
+                "app.kubernetes.io/part-of": "skytether",
+                "skytether.io/owner": "o1",
+                "skytether.io/robot": "walker",
+                "skytether.io/service": "toy",
+            },
+        },
+        "spec": {
+            "accessModes": ["ReadWriteOnce"],
+            "resources": {"requests": {"storage": "64Mi"}},
+            "storageClassName": "fast",
+        },
+    }
+    by_default = claim(launch(), options(keep_data=True, storage_access="ReadWriteMany"), "o1")["spec"]
+    assert "storageClassName" not in by_default
+    assert by_default["accessModes"] == ["ReadWriteMany"]
+
+
+def test_names_of_data_do_not_collide() -> None:
+    assert data_name("o1", "a-b", "c") != data_name("o1", "a", "b-c")
+    assert data_name("o1", "a-b", "c") == "skytether-o1-data-a-b.c"
+
+
+def test_what_a_claim_waits_for_is_said_with_where_to_look() -> None:
+    document = made()
+    document["spec"]["volumes"] = pod(launch(), options(keep_data=True), "o1", None, {})["spec"]["volumes"]
+    message = "0/1 nodes are available: 1 pod has unbound immediate PersistentVolumeClaims."
+    condition = {"type": "PodScheduled", "status": "False", "message": message}
+    found = parse({**document, "status": {"phase": "Pending", "conditions": [condition]}})
+    assert found is not None
+    assert looked_at(found).detail == (
+        f"no node takes it: {message} "
+        "('kubectl describe pvc skytether-o1-data-walker-toy' says why; site's option 'storage_class')"
+    )
 
 
 def test_a_pod_reaches_what_its_site_opens_and_knows_it_by_name() -> None:
@@ -289,6 +341,7 @@ def test_quantities_are_read_as_kubernetes_writes_them() -> None:
         ({"advertise_host": "0.0.0.0"}, "wildcard"),
         ({"namespace": "Robots"}, "namespace"),
         ({"nodeport": True}, "nodeport"),
+        ({"storage_class": "fast"}, "set keep_data, too"),
         ({"reach": "relay"}, "relay: HOST:PORT of the relay goes with reach: relay"),
         ({"relay": "203.0.113.5:8700"}, "relay: HOST:PORT of the relay goes with reach: relay"),
         ({"reach": "relay", "relay": "203.0.113.5"}, "must be HOST:PORT"),

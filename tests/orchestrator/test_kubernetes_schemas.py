@@ -13,6 +13,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import Opening, ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.kubernetes.objects import (
+    claim,
     leader,
     openings_policy,
     pod,
@@ -53,6 +54,9 @@ def objects() -> Iterator[dict[str, Any]]:
     made = pod(launch, options(**EVERYTHING, reach="nodeport"), "o1", None, openings, node_port=30_000, epoch=3)
     yield made
     made["metadata"]["uid"] = "u1"
+    kept = options(keep_data=True, storage_class="fast")
+    yield claim(launch, kept, "o1")
+    yield pod(launch, kept, "o1", None, {})
     yield secret(launch, "o1", made)
     yield openings_policy(openings, made, "o1")
     yield site_policy("o1")

@@ -90,7 +90,7 @@ class KubernetesSite:
 
     def clean(self) -> None:
         """Remove what the tests have made."""
-        kinds = "pods,services,secrets,configmaps,networkpolicies,poddisruptionbudgets"
+        kinds = "pods,services,secrets,configmaps,networkpolicies,poddisruptionbudgets,persistentvolumeclaims"
         chosen = ["-l", "app.kubernetes.io/managed-by=skytether", "--grace-period=1", "--wait=false"]
         self.kubectl("-n", self.namespace, "delete", kinds, *chosen)
 

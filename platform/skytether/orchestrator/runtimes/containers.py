@@ -29,6 +29,15 @@ def kept_owner(folder: Path) -> str:
     return path.read_text().strip()
 
 
+def data_name(owner: str, robot: str, service: str) -> str:
+    """Of what keeps what one service writes for one robot, over all its instances.
+
+    Names have hyphens: between two of them a dot says where the one ends, which is part of neither. Where there is no
+    other hyphen there is nothing to mistake, and it has the name that it always had.
+    """
+    return f"skytether-{owner}-data-{robot}{'.' if '-' in robot + service else '-'}{service}"
+
+
 def image_refusal(spec: ServiceSpec, *, pinned: bool) -> str | None:
     """Why a service's image is not run; None: it is."""
     if not spec.image:

@@ -18,6 +18,7 @@ from ..base import Launch, Observation, Phase, RuntimeFailure
 from ..containers import (
     INNER_PORT,
     USER,
+    data_name,
     exit_status,
     image_refusal,
     last_line,
@@ -134,13 +135,8 @@ def name_of(owner: str, instance: str, attempt: int) -> str:
 
 
 def data_volume(owner: str, launch: Launch) -> str:
-    """The volume that keeps what one service writes for one robot, over all its instances.
-
-    Names have hyphens: between two of them a dot says where the one ends, which is part of neither. Where there is no
-    other hyphen there is nothing to mistake, and the volume has the name that it always had.
-    """
-    robot, service = launch.grant.robot, launch.grant.service
-    return f"skytether-{owner}-data-{robot}{'.' if '-' in robot + service else '-'}{service}"
+    """The volume that keeps what one service writes for one robot, over all its instances."""
+    return data_name(owner, launch.grant.robot, launch.grant.service)
 
 
 def epoch_volume(owner: str, epoch: int) -> tuple[str, dict[str, str]]:

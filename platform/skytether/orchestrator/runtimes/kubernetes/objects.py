@@ -15,7 +15,7 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import Opening, ServiceSpec
 
 from ..base import Capacity, Launch
-from ..containers import INNER_PORT, USER, image_refusal, most_cores, most_memory_mb
+from ..containers import INNER_PORT, USER, data_name, image_refusal, most_cores, most_memory_mb
 from ..egress import refusal_of
 from .options import KubernetesOptions
 
@@ -191,9 +191,33 @@ def pod(
             "volumes": [
                 {"name": "grant", "secret": {"secretName": name, "defaultMode": 0o440}},
                 {"name": "own", "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
-                {"name": "data", "emptyDir": {"sizeLimit": f"{options.data_mb}Mi"}},
+                _data(launch, options, owner),
                 {"name": "tmp", "emptyDir": {"medium": "Memory", "sizeLimit": "64Mi"}},
             ],
+        },
+    }
+
+
+def _data(launch: Launch, options: KubernetesOptions, owner: str) -> dict[str, Any]:
+    """The volume for what a service writes."""
+    if not options.keep_data:
+        return {"name": "data", "emptyDir": {"sizeLimit": f"{options.data_mb}Mi"}}
+    named = data_name(owner, launch.grant.robot, launch.grant.service)
+    return {"name": "data", "persistentVolumeClaim": {"claimName": named}}
+
+
+def claim(launch: Launch, options: KubernetesOptions, owner: str) -> dict[str, Any]:
+    """What keeps what a service writes for a robot; nobody owns it, so that it outlives runs and instances."""
+    robot, service = launch.grant.robot, launch.grant.service
+    labels = {**MANAGED, OWNER: owner, f"{_PREFIX}/robot": robot, f"{_PREFIX}/service": service}
+    return {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": {"name": data_name(owner, robot, service), "labels": labels},
+        "spec": {
+            "accessModes": [options.storage_access],
+            "resources": {"requests": {"storage": f"{options.data_mb}Mi"}},
+            **({"storageClassName": options.storage_class} if options.storage_class is not None else {}),
         },
     }
 

@@ -63,6 +63,14 @@ class KubernetesOptions(Strict):
     """Names of Secrets in the namespace, with the credentials of private registries."""
     data_mb: Annotated[int, Field(ge=1)] = 1024
     """MiB that one run may write; what writes beyond is evicted by its node. It goes with the run."""
+    keep_data: bool = False
+    """What a service writes for a robot outlives its runs, in a PersistentVolumeClaim of ``data_mb``, and is left when
+    the site is deleted."""
+    storage_class: str | None = None
+    """Of these claims; None: the cluster's default."""
+    storage_access: Literal["ReadWriteOnce", "ReadWriteMany"] = "ReadWriteOnce"
+    """Of these claims. ``ReadWriteOnce``: the next run, or a successor, waits until the one before has ended, unless
+    both are on one node."""
     egress: tuple[Annotated[str, Field(min_length=1, max_length=300)], ...] = ()
     """Patterns of what manifests may open (``needs.egress``), such as ``*.example.org:443/tcp``; ``*`` is everything.
     It, and that nothing else is reached, holds where the cluster's network enforces NetworkPolicies."""
@@ -79,6 +87,8 @@ class KubernetesOptions(Strict):
     def _robots_can_connect(self) -> KubernetesOptions:
         if self.advertise_host is not None:
             check_advertised(self.advertise_host)
+        if self.storage_class is not None and not self.keep_data:
+            raise ValueError("storage_class: data that goes with its run has none; set keep_data, too")
         for one in self.relay:
             parse_address(one)
         if (self.reach == "relay") != bool(self.relay):

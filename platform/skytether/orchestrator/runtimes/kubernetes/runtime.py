@@ -37,6 +37,7 @@ from .objects import (
     FAILURE,
     GRACE_S,
     OWNER,
+    claim,
     free_port,
     openings_policy,
     pod,
@@ -170,6 +171,8 @@ class KubernetesRuntime(Runtime):
         openings = resolve(launch.spec.needs.openings)
         port = self._port(launch.instance, preferred) if self._options.reach == "hostport" else None
         node_port = self._services.make(launch.instance)
+        if self._options.keep_data:
+            self._hold_claim(launch)
         asked = launch, self._options, self._owner, port, openings
         body = pod(*asked, node_port=node_port, epoch=self._fence.epoch)
         try:
@@ -191,6 +194,22 @@ class KubernetesRuntime(Runtime):
         self._begun.add(made["metadata"]["uid"])
         self._waiting[made["metadata"]["uid"]] = launch
         self._watch.take(made)
+
+    def _hold_claim(self, launch: Launch) -> None:
+        """Have what keeps the data of a service, as it was made before or anew."""
+        body = claim(launch, self._options, self._owner)
+        try:
+            made = self._cluster.create(self._cluster.path("persistentvolumeclaims"), body)
+        except RefusedError as error:
+            if error.reason == "AlreadyExists":
+                return
+            raise RuntimeFailure(f"the cluster refuses it: {error}") from error
+        if not made["spec"].get("storageClassName"):
+            self._cluster.delete(self._cluster.path("persistentvolumeclaims", body["metadata"]["name"]))
+            raise RuntimeFailure(
+                "data is to be kept (option 'keep_data'), and the cluster has no default StorageClass: name one in the "
+                "site's option 'storage_class'"
+            )
 
     def _put(self, kind: str, body: dict[str, Any], group: str = "") -> None:
         """Create what belongs to a pod, in the place of what an earlier pod of its name has left."""

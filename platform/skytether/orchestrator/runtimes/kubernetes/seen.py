@@ -19,6 +19,7 @@ from .options import KubernetesOptions
 Document = Mapping[str, Any]
 _NO_FREE_PORT = "didn't have free ports"
 """What a scheduler says of nodes where another pod has the port."""
+_CLAIM = "persistentVolumeClaim"
 _HOPELESS = {
     "ErrImageNeverPull": "its image '{image}' is not on the node, and is never pulled",
     "ImagePullBackOff": "its image '{image}' cannot be pulled",
@@ -111,6 +112,9 @@ def parse(document: Document) -> Seen | None:
         ports = [int(notes[NODE_PORT])]
     limits = (container.get("resources") or {}).get("limits") or {}
     waits_for = _waits_for(status, waiting)
+    claims = [one["persistentVolumeClaim"]["claimName"] for one in spec.get("volumes") or () if one.get(_CLAIM)]
+    if _CLAIM.lower() in waits_for.lower() and claims:
+        waits_for += f" ('kubectl describe pvc {claims[0]}' says why; site's option 'storage_class')"
     return Seen(
         name=meta["name"],
         uid=meta["uid"],
