@@ -8,6 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from skytether.bridge.relay_table import (
     AMPLIFICATION,
     NEWCOMER_IDLE,
+    SILENT,
     Bucket,
     Prefix,
     RelayLimits,
@@ -251,6 +252,31 @@ def test_a_flood_of_made_up_handshakes_holds_up_no_robot_that_moves():
     moved = relay.up(data(7), ("192.0.2.2", 5000), 1.0)
     assert relay.down(moved, data(7), SERVICE, 1.0)
     assert moved.session is relay.sessions[7]
+
+
+def test_a_flood_through_newcomers_holds_up_no_robot_that_moves():
+    relay = table(rate_bps=8e5, newcomers=8)
+    admit(relay)
+    for number in range(1000):  # more than newcomers may send together
+        relay.up(packet(1000 + number % 8, 1200), ("198.51.100.1", number % 8), 1.0)
+    assert relay.rejected["rate"]
+    moved = relay.up(data(7), ("192.0.2.2", 5000), 1.0)
+    assert relay.down(moved, data(7), SERVICE, 1.0)
+
+
+def test_sessions_that_somebody_answers_in_the_targets_name_keep_no_robot_out():
+    relay = table(sessions=4)
+    alive = admit(relay, 7)
+    for number in range(3):
+        admit(relay, 100 + number, ("198.51.100.1", number))
+    for now in (1.0, 2.0, SILENT):  # a bridge's end speaks all the time; who makes up its words once
+        assert relay.down(alive, data(7), SERVICE, now)
+        for number in range(3):
+            assert relay.up(packet(100 + number), ("198.51.100.1", number), now)
+    late = admit(relay, 8, ("192.0.2.2", 5000), now=SILENT)
+    assert late.session is relay.sessions[8]
+    assert set(relay.sessions) == {7, 8, 101, 102}
+    assert alive in relay.legs
 
 
 def test_who_overheard_a_session_opens_no_more_addresses_than_it_may_have():

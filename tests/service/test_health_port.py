@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import os
 import socket
+import threading
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -70,6 +73,40 @@ def test_one_that_says_nothing_holds_up_nobody_for_long(grant: Grant) -> None:
     Path(str(grant.ready_file)).write_text("{}")
     with answering(grant), socket.create_connection(("127.0.0.1", grant.health_port)):
         assert ask(grant, "/healthz").status_code == 200
+
+
+def test_strangers_keep_the_cluster_from_no_answer_however_slowly_and_many_they_ask(
+    grant: Grant, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Path(str(grant.ready_file)).write_text("{}")
+    done = threading.Event()
+
+    def drip(strangers: list[socket.socket]) -> None:
+        """A request that is never over, of which something comes all the time."""
+        while not done.wait(0.2):
+            for stranger in strangers:
+                with contextlib.suppress(OSError):
+                    stranger.sendall(b"x")
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(answering(grant))
+        connect = partial(socket.create_connection, ("127.0.0.1", grant.health_port))
+        strangers = [stack.enter_context(connect()) for _ in range(200)]
+        for stranger in strangers[:100]:
+            with contextlib.suppress(OSError):  # it had to give way already
+                stranger.sendall(b"GET /" + b"x" * 20_000)
+        dripping = threading.Thread(target=drip, args=(strangers,))
+        dripping.start()
+        try:
+            for _ in range(10):
+                assert ask(grant, "/healthz").status_code == 200
+            strangers[-1].settimeout(10)
+            with contextlib.suppress(ConnectionResetError):
+                assert strangers[-1].recv(1) == b""  # the last one, too, has its end
+        finally:
+            done.set()
+            dripping.join()
+    assert (caplog.text, *capfd.readouterr()) == ("", "", "")  # nobody fills the service's log
 
 
 def test_without_a_port_nobody_listens(grant: Grant) -> None:

@@ -17,7 +17,7 @@ one is bounded by the session's rate.
 from __future__ import annotations
 
 import re
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -33,6 +33,9 @@ AMPLIFICATION = 3
 """Bytes sent to an address for each byte from it, until it is admitted (as in RFC 9000, section 8)."""
 NEWCOMER_IDLE = 10.0
 """Seconds of silence after which a newcomer is forgotten."""
+SILENT = 3.0
+"""Seconds without a word of its target after which a session makes room where there are too many. The end of a bridge
+says something every 100 ms; who speaks in a target's name has to find the port again each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,10 +144,11 @@ class Route:
 class SessionFlow(Flow):
     """A session whose robot was answered."""
 
-    __slots__ = ("legs", "moves")
+    __slots__ = ("answered_at", "legs", "moves")
 
     def __init__(self, limits: RelayLimits, now: float) -> None:
         super().__init__(limits, now)
+        self.answered_at = now
         self.legs: dict[Address, Leg] = {}
         self.moves = Bucket(limits.addresses, limits.addresses, now)
         """Addresses from which its packets may begin to come in a second, whatever strangers do meanwhile."""
@@ -201,7 +205,8 @@ class RelayTable:
         self._legs: dict[tuple[int, Address], Leg] = {}
         self._ids: dict[int, list[Leg]] = {}
         """Legs of a session by an id that its packets have."""
-        self.sessions: dict[int, SessionFlow] = {}
+        self.sessions: OrderedDict[int, SessionFlow] = OrderedDict()
+        """Those first whose target has been silent for longest."""
         self.closed: deque[Leg] = deque()
         self.rejected: Counter[str] = Counter()
 
@@ -258,8 +263,10 @@ class RelayTable:
         if route is None:
             self.rejected["unknown"] += packets
             return None
-        flow = route.flow if leg is None or leg.session is None else leg.session
-        if leg is None and not self._may_open(route, None if hello else session_id, now):
+        flow: Flow | None = route.flow if leg is None or leg.session is None else leg.session
+        if leg is None:
+            flow = self._may_open(route, None if hello else session_id, now)
+        if flow is None:
             self.rejected["newcomers"] += packets
             return None
         if not flow.up.take(len(data), now):
@@ -290,6 +297,9 @@ class RelayTable:
         leg.answered_at = now
         if leg.session is None and leg.session_id in self.sessions:
             self._admit(leg, now)
+        if leg.session is not None:
+            leg.session.answered_at = now
+            self.sessions.move_to_end(leg.session_id)
         flow: Flow = leg.route.flow if leg.session is None else leg.session
         if flow is leg.route.flow and leg.bytes_down + len(data) > AMPLIFICATION * leg.bytes_up:
             self.rejected["amplification"] += packets
@@ -370,13 +380,16 @@ class RelayTable:
             if self._find(leg.session_id) is not leg.route:
                 self.close(leg)
 
-    def _may_open(self, route: Route, known: int | None, now: float) -> bool:
-        """Whether a new address may have a leg; ``known``: the session that its packet is of, by the target's word.
+    def _may_open(self, route: Route, known: int | None, now: float) -> Flow | None:
+        """What pays for the first packet of a new address; None: it may have no leg.
 
-        Only who saw a packet of that session can have sent it: no flood of made-up HELLOs holds up a robot that moves.
+        ``known``: the session that its packet is of, by the target's word. Only who saw a packet of that session can
+        have sent it: no flood of made-up HELLOs holds up a robot that moves.
         """
         session = None if known is None else self.sessions.get(known)
-        return (session is not None and session.moves.take(1, now)) or route.openings.take(1, now)
+        if session is not None and session.moves.take(1, now):
+            return session
+        return route.flow if route.openings.take(1, now) else None
 
     def _open(self, session_id: int, source: Address, route: Route) -> Leg:
         if len(route.newcomers) >= self._limits.newcomers:
@@ -388,7 +401,7 @@ class RelayTable:
     def _admit(self, leg: Leg, now: float) -> None:
         session = self.sessions.get(leg.session_id)
         if session is None:
-            if len(self.sessions) >= self._limits.sessions:
+            if len(self.sessions) >= self._limits.sessions and not self._make_room(now):
                 self.rejected["sessions_full"] += 1
                 return
             session = self.sessions[leg.session_id] = SessionFlow(self._limits, now)
@@ -398,6 +411,15 @@ class RelayTable:
         if len(session.legs) > self._limits.addresses:
             # The target speaks to where the robot is, so the one that it left long ago is no loss.
             self.close(min(session.legs.values(), key=lambda one: one.answered_at or 0.0))
+
+    def _make_room(self, now: float) -> bool:
+        """Forget the session whose target has been silent for longest, if that is long."""
+        silent = next(iter(self.sessions.values()))
+        if silent.answered_at + SILENT > now:
+            return False
+        for leg in list(silent.legs.values()):
+            self.close(leg)
+        return True
 
 
 def same_session(data: memoryview, segment: int | None) -> Iterator[tuple[memoryview, int | None, int]]:

@@ -3,18 +3,22 @@
 ``/healthz`` says 200 while the service is ready and its loop alive, 503 and one sentence otherwise; ``/reports`` gives
 what it reported (`skytether.api.service_report`) and what its container uses (`skytether.api.usage`). The cluster
 asks every second; nothing of it is secret.
+
+Whoever reaches the pod may ask, however slowly and often: each has a moment in all, and of too many at once the oldest
+gives way, so the cluster's own question is answered.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +30,10 @@ from .container_usage import container_usage
 from .health import check
 
 _TIMEOUT_S = 2.0
-"""Of one request: one is answered at a time."""
+"""Of one connection, whatever comes on it."""
+_MOST_AT_ONCE = 64
+_MOST_HEAD = 16 << 10
+"""Bytes of a request."""
 
 
 @contextmanager
@@ -39,46 +46,79 @@ def answering(grant: Grant) -> Iterator[None]:
     if not grant.health_port or grant.ready_file is None:
         yield
         return
-    reports = Path(grant.ready_file).with_name(FILE_NAME)
-    path = os.environ.get(GRANT_VARIABLE, DEFAULT_GRANT_PATH)
-
-    class Handler(BaseHTTPRequestHandler):
-        timeout = _TIMEOUT_S
-
-        def do_GET(self) -> None:
-            if self.path == "/healthz":
-                trouble = check(path, time.time())
-                self._say(HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, (trouble or "alive").encode())
-            elif self.path == "/reports":
-                self._say(
-                    HTTPStatus.OK, json.dumps({**_read(reports), "usage": write_usage(container_usage())}).encode()
-                )
-            else:
-                self._say(HTTPStatus.NOT_FOUND, b"")
-
-        def _say(self, status: HTTPStatus, body: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            """Nobody wants to read of each."""
-
-    with HTTPServer((grant.bind_host, grant.health_port), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, name="health", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-def _read(path: Path) -> dict[str, Any]:
+    listener = socket.create_server((grant.bind_host, grant.health_port))
+    answers = _Answers(Path(grant.ready_file).with_name(FILE_NAME))
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=_serve, args=(loop, listener, answers), name="health", daemon=True)
+    thread.start()
     try:
-        with path.open("rb") as file:
-            document = json.loads(file.read(MOST_BYTES))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) else {}
+        yield
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+
+
+def _serve(loop: asyncio.AbstractEventLoop, listener: socket.socket, answers: _Answers) -> None:
+    server = loop.run_until_complete(asyncio.start_server(answers.connected, sock=listener, limit=_MOST_HEAD))
+    loop.run_forever()
+    server.close()
+    answers.end()
+    loop.run_until_complete(asyncio.sleep(0))  # who was being answered sees the end
+    loop.close()
+
+
+class _Answers:
+    def __init__(self, reports: Path) -> None:
+        self._reports = reports
+        self._grant = os.environ.get(GRANT_VARIABLE, DEFAULT_GRANT_PATH)
+        self._open: dict[asyncio.StreamWriter, None] = {}
+        """Oldest first."""
+
+    async def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request, and close."""
+        self._open[writer] = None
+        if len(self._open) > _MOST_AT_ONCE:
+            self._cut(next(iter(self._open)))
+        try:
+            async with asyncio.timeout(_TIMEOUT_S):
+                head = await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._answer(head))
+                await writer.drain()
+                writer.close()
+                await writer.wait_closed()
+        except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError):
+            pass
+        finally:
+            self._cut(writer)
+
+    def end(self) -> None:
+        """Cut all that are open."""
+        for writer in list(self._open):
+            self._cut(writer)
+
+    def _cut(self, writer: asyncio.StreamWriter) -> None:
+        if writer in self._open:
+            del self._open[writer]
+            writer.transport.abort()
+
+    def _answer(self, head: bytes) -> bytes:
+        status, body = HTTPStatus.NOT_FOUND, b""
+        method, _, rest = head.partition(b" ")
+        path = rest.partition(b" ")[0]
+        if method != b"GET":
+            status = HTTPStatus.METHOD_NOT_ALLOWED
+        elif path == b"/healthz":
+            trouble = check(self._grant, time.time())
+            status, body = HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, (trouble or "alive").encode()
+        elif path == b"/reports":
+            told = {**self._read(), "usage": write_usage(container_usage())}
+            status, body = HTTPStatus.OK, json.dumps(told).encode()
+        return f"HTTP/1.0 {status} {status.phrase}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            with self._reports.open("rb") as file:
+                document = json.loads(file.read(MOST_BYTES))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return document if isinstance(document, dict) else {}

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 import time
 from collections.abc import Iterable, Iterator
 from functools import partial
 from http import HTTPStatus
-from http.client import HTTPResponse
 from math import inf
 from typing import Any
 
 import requests
 from docker import APIClient
 from typing_extensions import override
+
+from ..whole_answer import hurried, original
 
 _MOST = 32 << 20
 """Bytes of an answer: a container's whole log has 4 MiB, a list of a thousand containers some."""
@@ -36,7 +36,7 @@ class Client(APIClient):
         self.trust_env = False
         adapters: Iterable[Any] = self.adapters.values()
         for adapter in adapters:
-            adapter.get_connection_with_tls_context = partial(_hurried, adapter.get_connection_with_tls_context)
+            adapter.get_connection_with_tls_context = partial(hurried, adapter.get_connection_with_tls_context)
 
     @override
     def send(self, request: requests.PreparedRequest, **options: Any) -> requests.Response:
@@ -46,7 +46,7 @@ class Client(APIClient):
         if answer.status_code >= HTTPStatus.BAD_REQUEST or not options.get("stream"):
             _read(answer)
         else:
-            _original(answer).until = inf
+            original(answer.raw).until = inf
         return answer
 
     def fetch(self, url: str, most: int, **options: Any) -> requests.Response:
@@ -57,7 +57,7 @@ class Client(APIClient):
         """
         answer = self.get(url, stream=True, **options)
         if answer.status_code < HTTPStatus.BAD_REQUEST:  # else `send` has read it
-            _original(answer).until = time.monotonic() + (options.get("timeout") or self.timeout)
+            original(answer.raw).until = time.monotonic() + (options.get("timeout") or self.timeout)
             _read(answer, most)
         return answer
 
@@ -72,7 +72,7 @@ class Client(APIClient):
                 yield json.loads(line)
             return
         if not response.raw.chunked:
-            _original(response).until = time.monotonic() + self.timeout
+            original(response.raw).until = time.monotonic() + self.timeout
             _read(response)
         yield from super()._stream_helper(response, decode)  # type: ignore[misc]
 
@@ -87,61 +87,6 @@ class Client(APIClient):
                     return
                 left -= len(piece)
                 yield piece
-
-
-class _Hurried(io.RawIOBase):
-    """What comes from a socket, up to a moment: http.client waits for each byte anew, and so without end for drops."""
-
-    def __init__(self, sock: Any, raw: io.RawIOBase, answer: _Answer) -> None:
-        self._sock, self._raw, self._answer = sock, raw, answer
-        self._patience = sock.gettimeout()
-
-    @override
-    def readable(self) -> bool:
-        return True
-
-    @override
-    def readinto(self, buffer: Any) -> int | None:
-        left = self._answer.until - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        if self._patience is not None and left < inf:
-            self._sock.settimeout(min(left, self._patience))
-        return self._raw.readinto(buffer)
-
-    @override
-    def close(self) -> None:
-        self._raw.close()
-        super().close()
-
-
-class _Answer(HTTPResponse):
-    """Head and body are there within the socket's time-out, but for a stream's."""
-
-    def __init__(self, sock: Any, *arguments: Any, **options: Any) -> None:
-        super().__init__(sock, *arguments, **options)
-        self.until = time.monotonic() + (sock.gettimeout() or inf)
-        self.fp = io.BufferedReader(_Hurried(sock, self.fp.detach(), self))
-
-
-def _hurried(get: Any, *arguments: Any, **options: Any) -> Any:
-    """A pool whose connections' answers are such ones."""
-    pool = get(*arguments, **options)
-    make = pool._new_conn  # noqa: SLF001 (the SDK's pools have their own, and no other place for it)
-    if not isinstance(make, partial):
-        pool._new_conn = partial(_connection, make)  # noqa: SLF001
-    return pool
-
-
-def _connection(make: Any) -> Any:
-    made = make()
-    made.response_class = _Answer
-    return made
-
-
-def _original(answer: requests.Response) -> Any:
-    """http.client's, below those of two libraries."""
-    return answer.raw._original_response  # noqa: SLF001
 
 
 def _read(answer: requests.Response, most: int | None = None) -> None:

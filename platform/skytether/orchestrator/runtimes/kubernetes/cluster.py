@@ -8,7 +8,9 @@ import os
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from http import HTTPStatus
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,14 @@ from kubernetes import client, config
 from kubernetes.config.config_exception import ConfigException
 
 from ..base import RuntimeFailure, SiteSilentError
+from ..whole_answer import hurried, original
 from .options import KubernetesOptions
 
 log = logging.getLogger(__name__)
 
 _MOST = 32 << 20
 """Bytes of an answer."""
+_MOST_REFUSAL = 64 << 10
 _PIECE = 1 << 16
 _POOL = 16
 """Connections that are kept."""
@@ -61,6 +65,8 @@ class Cluster:
             log.warning("kubeconfig %s: the API server's certificate is not checked, as it says", options.kubeconfig)
             urllib3.disable_warnings(urllib3.exceptions.InsecureRequestWarning)  # once is enough
         self._client = client.ApiClient(self._settings)
+        manager: Any = self._client.rest_client.pool_manager
+        manager.connection_from_host = partial(hurried, manager.connection_from_host)
         self._where = self._settings.host
 
     @property
@@ -106,15 +112,25 @@ class Cluster:
                 raise
 
     def text(self, path: str, **query: str | int) -> str:
-        """Of what answers with no JSON: logs, a pod's own answers."""
+        """Of what answers with no JSON: logs."""
         with self._asked("GET", path, query, timeout=self._options.timeout_s) as answer:
             return _read(answer).decode(errors="replace")
+
+    def small(self, path: str, most: int, timeout_s: float) -> bytes:
+        """Of what somebody else answers: ``most`` bytes, whole within that time [s].
+
+        Raises:
+            RuntimeFailure: It is larger, or later.
+        """
+        with self._asked("GET", path, {}, timeout=min(timeout_s, self._options.timeout_s)) as answer:
+            return _read(answer, most)
 
     @contextmanager
     def stream(self, path: str, silence_s: float, **query: str | int) -> Iterator[urllib3.HTTPResponse]:
         """An answer that goes on; ``silence_s``: for how long nothing may come."""
         timeout = (self._options.timeout_s, silence_s)
         with self._asked("GET", path, query, timeout=timeout) as answer:
+            original(answer).until = inf
             yield answer
 
     def close(self) -> None:
@@ -197,9 +213,9 @@ def _cause(error: Exception) -> str:
 def _refusal(answer: urllib3.HTTPResponse, method: str, path: str) -> RuntimeFailure:
     status = answer.status
     try:
-        said = json.loads(_read(answer))
+        said = json.loads(_read(answer, _MOST_REFUSAL))
         message, reason = str(said.get("message", "")), str(said.get("reason", ""))
-    except (ValueError, AttributeError):
+    except (ValueError, AttributeError, RecursionError, RuntimeFailure):
         message, reason = "", ""
     message = message or f"{method} {path}: HTTP {status}"
     if status == HTTPStatus.UNAUTHORIZED:
@@ -213,12 +229,12 @@ def _refusal(answer: urllib3.HTTPResponse, method: str, path: str) -> RuntimeFai
     return RefusedError(message, status, reason)
 
 
-def _read(answer: urllib3.HTTPResponse) -> bytes:
+def _read(answer: urllib3.HTTPResponse, most: int = _MOST) -> bytes:
     data = bytearray()
-    for piece in answer.stream(_PIECE):
+    for piece in answer.stream(_PIECE, decode_content=False):  # nobody was asked to pack it: it may grow to anything
         data += piece
-        if len(data) > _MOST:
-            raise RuntimeFailure(f"the API server answers with more than {_MOST >> 20} MiB")
+        if len(data) > most:
+            raise RuntimeFailure(f"an answer of more than {most / (1 << 20):g} MiB")
     return bytes(data)
 
 

@@ -22,6 +22,10 @@ log = logging.getLogger(__name__)
 
 _EVERY_S = 3.0
 """Seconds between two looks at all of them."""
+_TIMEOUT_S = 2.0
+"""Of one pod's answer."""
+_REST = 20
+"""A pod is left alone for so many times as long as its answer took: it has a twentieth of the time that all share."""
 
 _Told = tuple[tuple[ServiceReport, ...], Usage]
 _NOTHING: _Told = (), NO_USAGE
@@ -38,6 +42,8 @@ class ReportReader:
         self._running = running
         self._now_and_then = NowAndThen("kubernetes-reports", _EVERY_S, clock, self._look)
         self._closing = False
+        self._rest_until: dict[str, float] = {}
+        """By pod, by the monotonic clock [s]."""
         self._known: Mapping[str, _Told] = {}
 
     def of(self, pod: str) -> tuple[ServiceReport, ...]:
@@ -57,21 +63,26 @@ class ReportReader:
 
     def _look(self) -> None:
         found: dict[str, _Told] = {}
+        rest_until: dict[str, float] = {}
         try:
             for pod in self._running():
                 if self._closing:
                     return
-                found[pod] = self._ask(pod)
+                before = time.monotonic()
+                rest = self._rest_until.get(pod, 0.0)
+                found[pod] = self._ask(pod) if rest <= before else self._known.get(pod, _NOTHING)
+                after = time.monotonic()
+                rest_until[pod] = max(rest, after + _REST * (after - before))
         except RuntimeFailure as error:
             log.debug("reports of services are not read: %s", error)
             return
+        self._rest_until = rest_until
         self._known = found
 
     def _ask(self, pod: str) -> _Told:
         path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")
         try:
-            text = self._cluster.text(path)
-            document = json.loads(text) if len(text) <= MOST_BYTES else None
+            document = json.loads(self._cluster.small(path, MOST_BYTES, _TIMEOUT_S))
             return pull_reports(document), pull_usage(document)
         except (ValueError, RecursionError):
             return _NOTHING
