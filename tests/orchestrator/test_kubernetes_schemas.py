@@ -14,6 +14,7 @@ from skytether.api.manifest import Opening, ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.kubernetes.objects import (
     claim,
+    disruption_budget,
     leader,
     openings_policy,
     pod,
@@ -60,6 +61,7 @@ def objects() -> Iterator[dict[str, Any]]:
     yield secret(launch, "o1", made)
     yield openings_policy(openings, made, "o1")
     yield site_policy("o1")
+    yield disruption_budget("o1", "policy/v1")
     yield leader("o1", 3)
     yield service("i1", "o1", options(reach="nodeport"))
     yield service("i1", "o1", options(**EVERYTHING, reach="loadbalancer", load_balancer_class="metallb"))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import socket
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from http import HTTPStatus
@@ -20,6 +22,7 @@ from kubernetes.config.config_exception import ConfigException
 
 from ..base import RuntimeFailure, SiteSilentError
 from ..whole_answer import hurried, original
+from .credentials import expired
 from .options import KubernetesOptions
 
 log = logging.getLogger(__name__)
@@ -28,6 +31,8 @@ _MOST = 32 << 20
 """Bytes of an answer."""
 _MOST_REFUSAL = 64 << 10
 _PIECE = 1 << 16
+OLDEST = 1, 20
+"""Version of Kubernetes: startup probes, immutable Secrets and server-side apply are there."""
 _POOL = 16
 """Connections that are kept."""
 _MERGE = "application/merge-patch+json"
@@ -35,6 +40,11 @@ _APPLY = "application/apply-patch+yaml"
 _MANAGER = {"fieldManager": "skytether"}
 """Who has written what we write, as every object says (``managedFields``)."""
 _JSON = "application/json"
+_STRANGER = 'User "system:anonymous"'
+"""Whom API servers take us for that know none of what we show."""
+_LACKS = re.compile(r'User ".*" cannot \S+ (resource|path)')
+_WEBHOOK = "failed calling webhook"
+"""Says an API server of an admission webhook that does not answer: it refuses, and is not unwell itself."""
 Document = Mapping[str, Any]
 
 
@@ -77,6 +87,16 @@ class Cluster:
         """Of objects of the namespace; ``group``: API group and version, "" for the core's."""
         api = f"/apis/{group}" if group else "/api/v1"
         return f"{api}/namespaces/{self.namespace}/{kind}{f'/{name}' if name else ''}"
+
+    def check_version(self) -> None:
+        """Raises RuntimeFailure: it is too old for what is asked of it, or does not answer."""
+        told = self.get("/version")
+        version = told.get("major", "0"), str(told.get("minor", "0")).rstrip("+")
+        if all(part.isdecimal() for part in version) and tuple(map(int, version)) < OLDEST:
+            raise RuntimeFailure(
+                f"the cluster has Kubernetes {'.'.join(version)}, and {'.'.join(map(str, OLDEST))} is the oldest that "
+                "can be a site: upgrade it"
+            )
 
     def get(self, path: str, **query: str | int) -> Any:
         return self._document("GET", path, query=query)
@@ -177,7 +197,7 @@ class Cluster:
         ended = False
         try:
             if answer.status >= HTTPStatus.BAD_REQUEST:
-                raise _refusal(answer, method, path)
+                raise refusal(answer.status, _said(answer), f"{method} {path}", self._expired)
             yield answer
             ended = True
         except (urllib3.exceptions.HTTPError, OSError) as error:
@@ -185,6 +205,10 @@ class Cluster:
         finally:
             # What was not read to its end cannot be used again.
             answer.release_conn() if ended and answer.isclosed() else answer.close()
+
+    def _expired(self) -> str:
+        token = (self._settings.api_key or {}).get("authorization", "")
+        return expired(self._settings.cert_file, token.removeprefix("Bearer "), time.time())
 
     def _silent(self, error: Exception) -> str:
         return f"the API server {self._where} does not answer: {_cause(error)}"
@@ -210,23 +234,33 @@ def _cause(error: Exception) -> str:
     return text[:300] or type(error).__name__
 
 
-def _refusal(answer: urllib3.HTTPResponse, method: str, path: str) -> RuntimeFailure:
-    status = answer.status
-    try:
-        said = json.loads(_read(answer, _MOST_REFUSAL))
-        message, reason = str(said.get("message", "")), str(said.get("reason", ""))
-    except (ValueError, AttributeError, RecursionError, RuntimeFailure):
-        message, reason = "", ""
-    message = message or f"{method} {path}: HTTP {status}"
-    if status == HTTPStatus.UNAUTHORIZED:
-        return RefusedError(
-            "the API server does not know us: the token or certificate is wrong or expired", status, reason
-        )
-    if status == HTTPStatus.FORBIDDEN and "cannot" in message:
+def refusal(status: int, said: Document, asked: str, expired: Callable[[], str]) -> RuntimeFailure:
+    """What an answer means that is no success.
+
+    Args:
+        status: Of HTTP.
+        said: The document in it.
+        asked: What was asked for: told where the document says nothing.
+        expired: What of our credentials has expired; empty: nothing.
+    """
+    message, reason = str(said.get("message") or f"{asked}: HTTP {status}"), str(said.get("reason", ""))
+    if status == HTTPStatus.UNAUTHORIZED or (status == HTTPStatus.FORBIDDEN and _STRANGER in message):
+        why = expired() or "the token or certificate is wrong or expired"
+        return RefusedError(f"the API server does not know us: {why}", status, reason)
+    if status == HTTPStatus.FORBIDDEN and _LACKS.search(message):
         return RefusedError(f"the site's account lacks a right: {message}", status, reason)
-    if status == HTTPStatus.TOO_MANY_REQUESTS or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+    busy = status == HTTPStatus.TOO_MANY_REQUESTS or status >= HTTPStatus.INTERNAL_SERVER_ERROR
+    if busy and _WEBHOOK not in message:
         return ClusterGoneError(f"the API server is busy or unwell: {message}")
     return RefusedError(message, status, reason)
+
+
+def _said(answer: urllib3.HTTPResponse) -> Document:
+    try:
+        said = json.loads(_read(answer, _MOST_REFUSAL))
+    except (ValueError, RecursionError, RuntimeFailure):
+        return {}
+    return said if isinstance(said, dict) else {}
 
 
 def _read(answer: urllib3.HTTPResponse, most: int = _MOST) -> bytes:

@@ -108,7 +108,7 @@ def pod(
         for address in addresses
         if "/" not in address
     ]
-    health = {"httpGet": {"path": "/healthz", "port": HEALTH_PORT}, "periodSeconds": 1, "timeoutSeconds": 2}
+    health = {"httpGet": {"path": "/healthz", "port": HEALTH_PORT}, "periodSeconds": 1, "timeoutSeconds": 1}
     return {
         "apiVersion": "v1",
         "kind": "Pod",

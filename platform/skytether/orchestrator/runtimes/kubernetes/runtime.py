@@ -48,7 +48,7 @@ from .objects import (
 )
 from .options import KubernetesOptions
 from .reports import ReportReader
-from .seen import Seen, observation
+from .seen import Seen, observation, refused
 from .services import Services
 from .usage import Meter
 from .watch import Watch
@@ -103,6 +103,7 @@ class KubernetesRuntime(Runtime):
         self._policy_at: float | None = None
         """When the NetworkPolicy of all pods was seen to be there, by the monotonic clock [s]."""
         self._blocked = ""
+        self._new_enough = False
         self._closed = ""
         """Why no node takes pods at present."""
         self._watch.start()
@@ -129,6 +130,9 @@ class KubernetesRuntime(Runtime):
 
     def capacity(self) -> Capacity:
         self._watch.seen(self._options.timeout_s)
+        if not self._new_enough:
+            self._cluster.check_version()
+            self._new_enough = True
         total, self._closed = self._nodes.offered(self._options)
         return total
 
@@ -181,7 +185,7 @@ class KubernetesRuntime(Runtime):
             if error.reason == "AlreadyExists":
                 self._watch.catch_up()  # another orchestrator has begun this very run
                 return
-            raise RuntimeFailure(f"the cluster refuses it: {error}") from error
+            raise RuntimeFailure(refused(str(error))) from error
         try:
             self._must_lead()  # now that it is there for a later leader to see
             if openings:

@@ -179,6 +179,14 @@ def _ended_how(status: Document, terminated: Document) -> str:
     return f"{status['reason']}: {status.get('message', '')}".rstrip(": ")
 
 
+def refused(message: str) -> str:
+    """What to tell of a pod that the API server refuses; ``message``: its own words."""
+    advice = ""
+    if "violates PodSecurity" in message and "hostPort" in message:
+        advice = ": give the site another option 'reach', or its namespace the label of Pod Security 'privileged'"
+    return f"the cluster refuses it: {message}{advice}"
+
+
 def observation(
     seen: Seen,
     options: KubernetesOptions,

@@ -49,7 +49,9 @@ class Watch:
         self._lingers_since: dict[str, float] = {}
         """By uid, since when a pod lingers, by the monotonic clock [s]."""
         self._ill_since: dict[str, float] = {}
-        """By uid, since when a pod whose service is up is not ready."""
+        """By uid, since when a pod whose service is up has not been ready yet."""
+        self._well: set[str] = set()
+        """Uids of pods that were ready."""
         self._failure: RuntimeFailure | None = ClusterGoneError("the API server has not answered yet")
         self._looked = threading.Event()
         self._closing = threading.Event()
@@ -92,9 +94,13 @@ class Watch:
 
     def ill(self, seen: Seen) -> bool:
         """Whether the health check of a service that is up fails, and not only has not been done yet."""
+        if seen.healthy:
+            self._well.add(seen.uid)
         if seen.healthy or not seen.started:
             self._ill_since.pop(seen.uid, None)
             return False
+        if seen.uid in self._well:
+            return True
         now = time.monotonic()
         return now - self._ill_since.setdefault(seen.uid, now) > _ILL_S
 
@@ -179,6 +185,7 @@ class Watch:
             there = {seen.uid for seen in self._seen.values()}
             self._lingers_since = {uid: at for uid, at in self._lingers_since.items() if uid in there}
             self._ill_since = {uid: at for uid, at in self._ill_since.items() if uid in there}
+            self._well &= there
         self._failure = None
         self._looked.set()
         self.changed.set()
