@@ -61,13 +61,17 @@ class KubernetesSite:
 
     def give_account(self, role: dict[str, Any]) -> None:
         """Make a service account with the name of a Role, and the rights of that."""
-        name = role["metadata"]["name"]
-        self.kubectl("apply", "-f", "-", given=json.dumps(role))
-        self.kubectl("-n", self.namespace, "create", "serviceaccount", name)
-        account = f"{self.namespace}:{name}"
-        self.kubectl(
-            "-n", self.namespace, "create", "rolebinding", name, f"--role={name}", f"--serviceaccount={account}"
-        )
+        named = {"name": role["metadata"]["name"], "namespace": self.namespace}
+        account = {"apiVersion": "v1", "kind": "ServiceAccount", "metadata": named}
+        binding = {
+            "apiVersion": "rbac.authorization.k8s.io/v1",
+            "kind": "RoleBinding",
+            "metadata": named,
+            "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "Role", "name": named["name"]},
+            "subjects": [{"kind": "ServiceAccount", **named}],
+        }
+        for document in (role, account, binding):
+            self.kubectl("apply", "-f", "-", given=json.dumps(document))
 
     def kubeconfig_of(self, account: str, folder: Path) -> str:
         """A file with which one is a service account of the namespace."""

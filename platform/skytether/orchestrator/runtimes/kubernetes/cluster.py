@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import urllib3
+import yaml
 from kubernetes import client, config
 from kubernetes.config.config_exception import ConfigException
 
@@ -45,6 +47,8 @@ _STRANGER = 'User "system:anonymous"'
 _LACKS = re.compile(r'User ".*" cannot \S+ (resource|path)')
 _WEBHOOK = "failed calling webhook"
 """Says an API server of an admission webhook that does not answer: it refuses, and is not unwell itself."""
+_RENEW_S = 1.0
+"""Seconds between two looks for other credentials, while those that we have are refused."""
 Document = Mapping[str, Any]
 
 
@@ -68,16 +72,13 @@ class Cluster:
     def __init__(self, options: KubernetesOptions) -> None:
         """Raises RuntimeFailure: it can never be reached with these options."""
         self._options = options
-        self._settings = _settings(options)
-        self._settings.connection_pool_maxsize = _POOL
-        self._settings.retries = False
-        if not self._settings.verify_ssl:
+        self._lock = threading.Lock()
+        self._client = _client(options)
+        self._opened_at = time.monotonic()
+        self._where = self._client.configuration.host
+        if not self._client.configuration.verify_ssl:
             log.warning("kubeconfig %s: the API server's certificate is not checked, as it says", options.kubeconfig)
             urllib3.disable_warnings(urllib3.exceptions.InsecureRequestWarning)  # once is enough
-        self._client = client.ApiClient(self._settings)
-        manager: Any = self._client.rest_client.pool_manager
-        manager.connection_from_host = partial(hurried, manager.connection_from_host)
-        self._where = self._settings.host
 
     @property
     def namespace(self) -> str:
@@ -181,23 +182,17 @@ class Cluster:
         kind: str = _JSON,
         timeout: float | tuple[float, float] = 0,
     ) -> Iterator[urllib3.HTTPResponse]:
-        headers = {"Accept": f"{_JSON}, */*", **({"Content-Type": kind} if body is not None else {})}
-        request = self._client.param_serialize(
-            method,
-            path,
-            query_params=list(query.items()),
-            header_params=headers,
-            body=body,
-            auth_settings=["BearerToken"],
-        )
-        try:
-            answer = self._client.call_api(*request, _request_timeout=timeout).response
-        except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:
-            raise ClusterGoneError(self._silent(error)) from error
+        used = self._client
+        answer = self._answer(used, method, path, query, body, kind, timeout)
         ended = False
         try:
+            said = _said(answer) if answer.status >= HTTPStatus.BAD_REQUEST else {}
+            if _is_stranger(answer.status, said) and self._has_others(used):
+                answer.close()
+                answer = self._answer(self._client, method, path, query, body, kind, timeout)
+                said = _said(answer) if answer.status >= HTTPStatus.BAD_REQUEST else {}
             if answer.status >= HTTPStatus.BAD_REQUEST:
-                raise refusal(answer.status, _said(answer), f"{method} {path}", self._expired)
+                raise refusal(answer.status, said, f"{method} {path}", self._expired)
             yield answer
             ended = True
         except (urllib3.exceptions.HTTPError, OSError) as error:
@@ -207,8 +202,53 @@ class Cluster:
             answer.release_conn() if ended and answer.isclosed() else answer.close()
 
     def _expired(self) -> str:
-        token = (self._settings.api_key or {}).get("authorization", "")
-        return expired(self._settings.cert_file, token.removeprefix("Bearer "), time.time())
+        settings = self._client.configuration
+        token = (settings.api_key or {}).get("authorization", "")
+        return expired(settings.cert_file, token.removeprefix("Bearer "), time.time())
+
+    def _answer(
+        self,
+        used: client.ApiClient,
+        method: str,
+        path: str,
+        query: Mapping[str, str | int],
+        body: Document | None,
+        kind: str,
+        timeout: float | tuple[float, float],
+    ) -> urllib3.HTTPResponse:
+        headers = {"Accept": f"{_JSON}, */*", **({"Content-Type": kind} if body is not None else {})}
+        request = used.param_serialize(
+            method,
+            path,
+            query_params=list(query.items()),
+            header_params=headers,
+            body=body,
+            auth_settings=["BearerToken"],
+        )
+        try:
+            answer: urllib3.HTTPResponse = used.call_api(*request, _request_timeout=timeout).response
+        except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:
+            raise ClusterGoneError(self._silent(error)) from error
+        return answer
+
+    def _has_others(self, refused: client.ApiClient) -> bool:
+        """Whether the files have other credentials, perhaps, than those that were just refused: they are read anew.
+
+        Tokens of service accounts last for an hour, and new ones are put into the same file; so is a kubeconfig
+        replaced whose certificate runs out.
+        """
+        with self._lock:
+            if self._client is not refused:
+                return True  # another thread was here
+            if time.monotonic() - self._opened_at < _RENEW_S:
+                return False
+            self._opened_at = time.monotonic()
+            try:
+                self._client = _client(self._options)
+            except RuntimeFailure as error:
+                log.warning("%s", error)
+                return False
+            return True
 
     def _silent(self, error: Exception) -> str:
         return f"the API server {self._where} does not answer: {_cause(error)}"
@@ -234,6 +274,12 @@ def _cause(error: Exception) -> str:
     return text[:300] or type(error).__name__
 
 
+def _is_stranger(status: int, said: Document) -> bool:
+    """Whether the API server does not know us."""
+    anonymous = status == HTTPStatus.FORBIDDEN and _STRANGER in str(said.get("message"))
+    return status == HTTPStatus.UNAUTHORIZED or anonymous
+
+
 def refusal(status: int, said: Document, asked: str, expired: Callable[[], str]) -> RuntimeFailure:
     """What an answer means that is no success.
 
@@ -244,7 +290,7 @@ def refusal(status: int, said: Document, asked: str, expired: Callable[[], str])
         expired: What of our credentials has expired; empty: nothing.
     """
     message, reason = str(said.get("message") or f"{asked}: HTTP {status}"), str(said.get("reason", ""))
-    if status == HTTPStatus.UNAUTHORIZED or (status == HTTPStatus.FORBIDDEN and _STRANGER in message):
+    if _is_stranger(status, said):
         why = expired() or "the token or certificate is wrong or expired"
         return RefusedError(f"the API server does not know us: {why}", status, reason)
     if status == HTTPStatus.FORBIDDEN and _LACKS.search(message):
@@ -272,6 +318,17 @@ def _read(answer: urllib3.HTTPResponse, most: int = _MOST) -> bytes:
     return bytes(data)
 
 
+def _client(options: KubernetesOptions) -> client.ApiClient:
+    """With the credentials that the files have now."""
+    settings = _settings(options)
+    settings.connection_pool_maxsize = _POOL
+    settings.retries = False
+    made = client.ApiClient(settings)
+    manager: Any = made.rest_client.pool_manager
+    manager.connection_from_host = partial(hurried, manager.connection_from_host)
+    return made
+
+
 def _settings(options: KubernetesOptions) -> Any:
     settings = client.Configuration()
     try:
@@ -289,6 +346,8 @@ def _settings(options: KubernetesOptions) -> Any:
                 "the orchestrator runs in no cluster: name a file in the option 'kubeconfig'"
             ) from error
         raise RuntimeFailure(f"kubeconfig {options.kubeconfig}: {error}") from error
-    except (OSError, ValueError) as error:
-        raise RuntimeFailure(f"kubeconfig {options.kubeconfig}: {error}") from error
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, yaml.YAMLError) as error:
+        # The last four: what the client's loader makes of a file that is no kubeconfig.
+        said = " ".join(str(error).split())
+        raise RuntimeFailure(f"kubeconfig {options.kubeconfig} is none, or not complete: {said}") from error
     return settings
