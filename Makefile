@@ -55,6 +55,7 @@ fmt: $(READY) ## format, and mend what can be mended
 
 docs: $(READY) ## the pages that are made from the code
 	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
+	$(BIN)/python .ci/chart.py
 	for service in navigation follow-in-front; do $(BIN)/python .ci/parameters.py $$service > docs/$$service-parameters.md || exit; done
 
 licences: $(READY) ## the licences of all that requirements.lock names, as a page

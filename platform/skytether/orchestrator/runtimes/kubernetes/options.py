@@ -28,7 +28,12 @@ class KubernetesOptions(Strict):
     """How a robot reaches a service: at a UDP port of the pod's node, out of ``ports``; at one that the cluster chooses
     (a Service of type NodePort); at the address that the cluster's load balancer gives a Service of the instance; at
     the pod's own address, where that is routable; or by way of a relay."""
-    relay: Annotated[tuple[str, ...], BeforeValidator(lambda told: (told,) if isinstance(told, str) else told)] = ()
+    relay: Annotated[
+        tuple[str, ...],
+        BeforeValidator(
+            lambda told: (told,) if isinstance(told, str) else told, json_schema_input_type=str | tuple[str, ...]
+        ),
+    ] = ()
     """``HOST:PORT`` of the relay as robots reach it; of several, its session's id chooses one for each robot."""
     ports: tuple[Port, Port] = (20_000, 29_999)
     """First and last UDP port of nodes that instances may have; for ``hostport``."""
