@@ -148,7 +148,7 @@ def test_who_names_a_site_gets_it_and_one_that_runs_there_is_good_enough(bench: 
     fail(b.site.fitness, new_record(), b.clock.steady())
     record = new_record()
     assert b.reconciler.weigh(record).site is None
-    assert b.reconciler.weigh(record, (), runs=True).site == "lab"
+    assert b.reconciler.weigh(record, {}, runs=True).site == "lab"
     assert b.reconciler.weigh(new_record(pinned="lab")).site == "lab"
 
 

@@ -27,6 +27,7 @@ from skytether.orchestrator.runtimes.kubernetes.objects import (
     usual_port,
 )
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
+from skytether.orchestrator.runtimes.kubernetes.pods import Pods
 from skytether.orchestrator.runtimes.kubernetes.relayed import routes_of
 from skytether.orchestrator.runtimes.kubernetes.seen import Seen, observation, parse
 
@@ -352,3 +353,16 @@ def test_quantities_are_read_as_kubernetes_writes_them() -> None:
 def test_options_that_cannot_be_are_refused_by_name(given: dict[str, Any], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         options(**given)
+
+
+def test_pods_are_found_by_their_instance_and_forgotten_with_it() -> None:
+    one, two, other = seen(), replace(seen(), name="p2", attempt=2), replace(seen(), name="p3", instance="i2")
+    pods = Pods([two, one, other])
+    assert [pod.attempt for pod in pods.of("i1")] == [1, 2]
+    pods.put(replace(one, version="9"))
+    assert pods.get(one.name) == replace(one, version="9")
+    assert len(pods.all()) == 3
+    pods.drop(one.name)
+    pods.drop("p3")
+    assert [pod.name for pod in pods.of("i1")] == ["p2"]
+    assert pods.of("i2") == []

@@ -68,9 +68,10 @@ class Bench:
         asked = SiteCreate(name="lab", tier="edge", runtime="fake")
         site = Site(asked, self.runtime, self.reconciler.site_step, Timing(site_silent=1e9))
         self._let_know(site)
-        weigh, catalogue = self.reconciler.weigh, Catalogue(self.store)
-        sites = self.reconciler.sites
-        self.reconciler.moves = Moves(self.store, catalogue, lambda: sites, weigh, self.clock, Timing(), Weights())
+        reconciler, catalogue, sites = self.reconciler, Catalogue(self.store), self.reconciler.sites
+        reconciler.moves = Moves(
+            self.store, catalogue, lambda: sites, reconciler.weigh, reconciler.promised, self.clock, Timing(), Weights()
+        )
         return site
 
     def _let_know(self, *sites: Site) -> None:

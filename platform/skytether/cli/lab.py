@@ -15,6 +15,7 @@ from .lab_legs import legs
 from .lab_navigation import localisation, mapping, navigation
 from .lab_run import app as run_app
 from .lab_safety import safety
+from .lab_scale import scale
 from .lab_world import world
 from .output import console, fail, print_json, silenced
 
@@ -25,6 +26,7 @@ app.add_typer(run_app, name="run")
 app.command("world")(world)
 bench.command("safety")(safety)
 bench.command("hostile")(hostile)
+bench.command("scale")(scale)
 bench.command("authentication")(authentication)
 bench.command("mapping")(mapping)
 bench.command("localisation")(localisation)

@@ -134,6 +134,7 @@ class Orchestrator:
             self.catalogue,
             lambda: self.sites,
             self.reconciler.weigh,
+            self.reconciler.promised,
             clock,
             settings.timing,
             settings.weights,

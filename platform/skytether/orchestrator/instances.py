@@ -123,10 +123,10 @@ class Instances:
             params=asked.params,
             measurements=self._of_known_sites(asked.measurements),
         )
-        decision = self._reconciler.weigh(record, ())  # whether it could ever run does not depend on what is there
+        decision = self._reconciler.weigh(record, {})  # whether it could ever run does not depend on what is there
         if decision.hopeless:
             self._sites.refresh()  # one may have been added at another orchestrator a moment ago
-            decision = self._reconciler.weigh(record, ())
+            decision = self._reconciler.weigh(record, {})
         if decision.hopeless:
             raise self._no_site(record, decision)
         return record

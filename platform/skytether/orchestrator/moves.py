@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from skytether.api.rest import Measurement, Refusal, Report, State
 from .catalogue import Catalogue
 from .errors import InvalidError
 from .placement import UNSTARTED, Decision
+from .promises import Sums
 from .records import Record, new_record
 from .settings import Timing, Weights
 from .sites import Sites
@@ -36,9 +37,15 @@ _SETTLED = 30.0
 
 
 class Weigh(Protocol):
-    """Where a record would run, beside others; ``runs``: it need not be started, which some sites cannot at present."""
+    """Where a record would run, beside what is promised; ``runs``: it need not be started, which not all sites can."""
 
-    def __call__(self, record: Record, placed: Sequence[Record], runs: bool = False) -> Decision: ...
+    def __call__(self, record: Record, promised: Sums, runs: bool = False) -> Decision: ...
+
+
+class Promised(Protocol):
+    """What sites have promised to all instances, or to all but some."""
+
+    def __call__(self, without: Iterable[Record] = ()) -> Sums: ...
 
 
 class Moves:
@@ -50,6 +57,7 @@ class Moves:
         catalogue: Catalogue,
         sites: Callable[[], Sites],
         weigh: Weigh,
+        promised: Promised,
         clock: Callable[[], float],
         timing: Timing,
         weights: Weights,
@@ -59,6 +67,7 @@ class Moves:
         self._catalogue = catalogue
         self._sites = sites
         self._weigh = weigh
+        self._promised = promised
         self._clock = clock
         self._timing = timing
         self._weights = weights
@@ -95,7 +104,7 @@ class Moves:
         same = [spare for spare in self._store.spares(record.service) if _alike(spare, record)]
         if not same:
             return []
-        others = [other for other in self._store.live() if other not in same]
+        others = self._promised(same)
         scores = {score.site: score.total_ms for score in self._weigh(record, others, runs=True).scores}
         cold = (score.total_ms for score in self._weigh(record, others).scores)
         limit = min(cold, default=math.inf) + self._weights.migrate_ms
@@ -149,7 +158,7 @@ class Moves:
             lease_expires_at=FOREVER,
             spare=True,
         )
-        if self._weigh(spare, self._store.live()).site is not None:  # robots come first: a spare does not wait for room
+        if self._weigh(spare, self._promised()).site is not None:  # robots come first: a spare does not wait for room
             self._store.add(spare, "", None, "")
 
     def _end(self, spare: Record, now: float) -> None:
@@ -186,7 +195,7 @@ class Moves:
             if not self._reachable(record):
                 self.fail_over(record, f"site {record.site} does not answer")
             elif why := self._leaving(record):
-                self._evacuate(record, why, live, now)
+                self._evacuate(record, why, now)
             elif record.reason:
                 self._store.change(record, now, reason="")  # it need not leave any more
         reports = self._store.reports(_BY_ITSELF)
@@ -194,16 +203,16 @@ class Moves:
         self._bad_since = {i: self._bad_since.get(i, now) for i in bad}
         for record in live:
             if now - self._bad_since.get(record.id, now) >= self._timing.replace_after:
-                self._replace(record, Report.model_validate(reports[record.id]), live, now)
+                self._replace(record, Report.model_validate(reports[record.id]), now)
 
-    def _evacuate(self, record: Record, why: str, live: Sequence[Record], now: float) -> None:
+    def _evacuate(self, record: Record, why: str, now: float) -> None:
         """Move what its site is about to end; it stays where nothing else takes it, and says so."""
         self.fail_over(record, why)
         if self._store.successor(record.id) is not None:
             reason = f"{why}: its robot is handed over"
         else:
             wanted = self.successor_of(record)
-            decision = self._weigh(wanted, [other for other in live if other is not record])
+            decision = self._weigh(wanted, self._promised([record]))
             if decision.site is not None:
                 self._store.add(wanted, "", None, "")
                 log.warning(
@@ -216,11 +225,11 @@ class Moves:
         if reason != record.reason:
             self._store.change(record, now, reason=reason)
 
-    def _replace(self, record: Record, report: Report, live: Sequence[Record], now: float) -> None:
+    def _replace(self, record: Record, report: Report, now: float) -> None:
         if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
             return
         wanted = self.successor_of(record)
-        others = [other for other in live if other is not record]
+        others = self._promised([record])
         best = next(iter(self._weigh(wanted, others).scores), None)
         rtt_ms = None if report.rtt_s is None else report.rtt_s * 1000
         here = {record.site or "": Measurement(rtt_ms=rtt_ms).model_dump(exclude_none=True)}

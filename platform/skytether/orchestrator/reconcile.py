@@ -8,7 +8,6 @@ import math
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any
@@ -22,10 +21,11 @@ from .db import GONE
 from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
 from .moves import Moves, told
-from .placement import NOTHING, UNSTARTED, Decision, place
+from .placement import UNSTARTED, Decision, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
+from .promises import NOTHING, Promises, Sums
 from .records import Record
-from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
+from .runtimes.base import Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .security import SecretFileError, Secrets
 from .service_events import ServiceEvents
 from .settings import Limits, Timing, Weights
@@ -49,6 +49,10 @@ _UNSETTLED = 2.0
 """Seconds after the clock was set in which another orchestrator may still date leases by what it was before."""
 _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
+_SHARE = 0.1
+"""Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
+_PROMISES_AGE = 3.0
+"""Seconds for which sums are good enough for a request at an orchestrator that does not lead."""
 
 
 class Reconciler:
@@ -101,8 +105,12 @@ class Reconciler:
         """How often the clock was set: what was read before the last time is dated by another one."""
         self._settles_at = -math.inf
         """Steady seconds: leases that others dated until then count anew, and none runs out before."""
-        self._placed_at = -math.inf
-        """Steady seconds: when the placer's last whole pass ended."""
+        self._place_due = -math.inf
+        """Steady seconds: when the placer's next whole pass is due."""
+        self._promises = Promises()
+        """As of the last whole pass of the placer, and what this orchestrator has changed since."""
+        self._promises_until = -math.inf
+        """Steady seconds."""
         self._pruned_at = -_PRUNE
         self._database_gone = False
         self._owes_leases = False
@@ -113,7 +121,7 @@ class Reconciler:
 
     def place_turn(self) -> float:
         """As much of a pass of the placer as is due: woken between two whole ones, it places what waits only."""
-        due = self._placed_at + self._timing.place - self._steady()
+        due = self._place_due - self._steady()
         if due <= 0:
             return self.place_step()
         return min(due, self.place_step(whole=False))
@@ -129,13 +137,18 @@ class Reconciler:
         often; as long as the runtime finds it as it was, and nobody called, the database is not asked.
         """
         now = self._steady()
-        due, look = site.passed_at + _WHOLE - now, site.watched_at + self._timing.observe - now
+        due = site.passed_at + _rest(_WHOLE, site.pass_took) - now
+        look = site.watched_at + _rest(self._timing.observe, site.look_took) - now
         if called := site.called:
             site.called = False  # before the look, and only what was seen: no call is lost
-        if due <= 0 or (look <= 0 and not _all_as_it_was(site)):
+        if due > 0 >= look:
+            began = time.thread_time()
+            as_it_was = _all_as_it_was(site)
+            site.watched_at, site.look_took = now, time.thread_time() - began
+        if due <= 0 or (look <= 0 and not as_it_was):
             return self.site_step(site)
         if look <= 0:
-            site.watched_at, look = now, self._timing.observe
+            look = self._timing.observe
             called |= bool(site.awaited)  # how long it has been so may matter by now
         if called or not _as_it_was(site):
             return min(due, look, self.site_step(site, whole=False))
@@ -208,38 +221,48 @@ class Reconciler:
         if whole:
             self.sites.refresh()
         if not self._leads():
+            self._place_due = -math.inf  # who leads next, or again, begins with a look at all
             return self._timing.place
-        if not whole and not self._store.waits():  # woken for a standby, or for room that nobody waits for
-            if self.moves.warms:
-                self.moves.keep_spares()
-            return self._timing.place
-        times_set = self._times_set
-        live = self._store.live()
+        began, times_set = time.thread_time(), self._times_set
+        live = self._store.live() if whole else self._store.waiting()
         now = self._now()
         if times_set != self._times_set:
             return 0.0  # what was read is dated by another clock
-        waiting = [record for record in live if record.site is None]
-        placed = [record for record in live if record.site is not None]
         if whole:
-            self._give_up_siteless(placed, now)
-        for action in plan(waiting, {}, (), now, self._timing):
+            self._promise_anew(live)
+            rest = _rest(self._timing.place, time.thread_time() - began)
+            self._give_up_siteless([record for record in live if record.site is not None], now)
+        for action in plan([record for record in live if record.site is None], {}, (), now, self._timing):
             if isinstance(action, Place):
-                chosen = self._place(action.record, placed)
-                if chosen is not None:
-                    placed.append(chosen)
+                self._place(action.record)
             elif isinstance(action, Expire):
                 self._expire(action.record)
         if whole or self.moves.warms:
             self.moves.keep_spares()
         if not whole:
             return self._timing.place
-        self.sites.end_drained({record.site for record in placed}, self._metrics.forget_site)
+        self.sites.end_drained(
+            {name for name, sum_ in self._promises.sums().items() if sum_.instances}, self._metrics.forget_site
+        )
         self.moves.watch(live)
         if self._steady() - self._pruned_at >= _PRUNE:
             self._pruned_at = self._steady()
             self._prune(now)
-        self._placed_at = self._steady()
-        return self._timing.place
+        self._place_due = self._steady() + rest
+        return rest
+
+    def _promise_anew(self, live: Iterable[Record]) -> None:
+        self._promises = Promises(live)
+        self._promises_until = self._steady() + _PROMISES_AGE
+
+    def promised(self, without: Iterable[Record] = ()) -> Sums:
+        """What sites have promised, to all but these and what they are about to end.
+
+        As whoever leads knows it, at others some seconds old at most.
+        """
+        if not self._lead.leads and self._steady() >= self._promises_until:  # only the placer replaces what it adds to
+            self._promise_anew(self._store.live())
+        return self._promises.sums({record.id for record in without} | self._leaving())
 
     def _give_up_siteless(self, placed: Sequence[Record], now: float) -> None:
         """End what was placed at a site in the moment when that was deleted: nobody else looks at it ever again."""
@@ -250,20 +273,21 @@ class Reconciler:
                 to = State.STOPPED if record.state is State.STOPPING else State.FAILED
                 self._store.change(record, now, state=to, reason=f"site '{record.site}' was deleted: ask again")
 
-    def weigh(self, record: Record, placed: Sequence[Record] | None = None, runs: bool = False) -> Decision:
-        """Where it would run now, beside what is placed; looks only. ``runs``: it need not be started any more."""
-        others = self._store.live() if placed is None else placed
+    def weigh(self, record: Record, promised: Sums | None = None, runs: bool = False) -> Decision:
+        """Where it would run now, beside what is promised; looks only. ``runs``: it need not be started any more.
+
+        Without ``promised``, beside all that is stored.
+        """
+        if promised is None:
+            promised = Promises(self._store.live()).sums(self._leaving())
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
-        leaving = self._leaving()
-        used = _used([other for other in others if other.id not in leaving] if leaving else others)
-        there = Counter(other.site for other in others)
         allowed = [site for site in self.sites.all() if self._allows(record, site)]
         tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
         now = self._steady()
         sites = [
             site.candidate(
                 record.spec,
-                used.get(site.name, NOTHING),
+                promised.get(site.name, NOTHING).capacity,
                 tried.get(site.name),
                 None if record.pinned else site.fitness.objection(record, now),
             )
@@ -274,8 +298,8 @@ class Reconciler:
             full = self._stored.full()
             sites = [replace(s, full=full[s.name]) if s.name in full else s for s in sites]
         sites = [
-            replace(s, full=f"{there[s.name]} instances are there, and {most} may be (quotas.site_instances)")
-            if there[s.name] >= most
+            replace(s, full=f"{there} instances are there, and {most} may be (quotas.site_instances)")
+            if (there := promised.get(s.name, NOTHING).instances) >= most
             else s
             for s in sites
         ]
@@ -299,11 +323,12 @@ class Reconciler:
         """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
         return 0 < record.start_at - self._clock() <= self._timing.backoff_max
 
-    def _place(self, record: Record, placed: Sequence[Record]) -> Record | None:
-        decision = self.weigh(record, placed)
+    def _place(self, record: Record) -> None:
+        promised = self.promised()
+        decision = self.weigh(record, promised)
         untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
         if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
-            decision = self.weigh(replace(record, refused=untried), placed)  # it may have been mended
+            decision = self.weigh(replace(record, refused=untried), promised)  # it may have been mended
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
             self._metrics.refused(record.service, decision.refused)
@@ -311,20 +336,26 @@ class Reconciler:
             reason = f"waiting for a site: {told(record, decision.refused)}"
             if reason != record.reason or record.state is not State.PENDING:
                 self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
-            return None
-        moving = self._store.change(record, self._clock(), state=State.PLACING, reason="", refused=refused)
-        if moving is None:
-            return None
+            return
         now = self._clock()
-        scores = [score.model_dump() for score in decision.scores]
-        chosen = self._store.change(moving, now, state=State.STARTING, site=decision.site, scores=scores, start_at=0.0)
+        chosen = self._store.change(
+            record,
+            now,
+            through=State.PLACING if record.state is State.PENDING else None,
+            state=State.STARTING,
+            reason="",
+            site=decision.site,
+            refused=refused,
+            scores=[score.model_dump() for score in decision.scores],
+            start_at=0.0,
+        )
         if chosen is not None:
+            self._promises.add(chosen)
             self._metrics.phase(chosen, "placing", now - record.created_at)
             site = self.sites.find(decision.site)
             if site is not None:
                 site.fitness.placed(chosen, self._steady(), now)
                 site.wake()
-        return chosen
 
     def _prune(self, now: float) -> None:
         limits = self._limits
@@ -336,7 +367,7 @@ class Reconciler:
     # What is at a site
 
     def _site_pass(self, site: Site, whole: bool) -> float:
-        times_set = self._times_set
+        began, times_set = time.thread_time(), self._times_set
         site.awaited = None  # whatever ends this pass early, or is left to do
         if whole:
             site.passed_at = -math.inf
@@ -383,6 +414,8 @@ class Reconciler:
         looked = self._bounded(site, live, looked) if whole else looked
         live = self._service_events.keep(live, looked, now)
         actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
+        if whole:
+            site.pass_took = time.thread_time() - began
         done = [action for action in actions if self._act(site, action)]
         if due:
             site.tidied_at = time.monotonic()
@@ -434,6 +467,7 @@ class Reconciler:
                 case End(record):
                     site.runtime.stop(record.id, force=True)  # what its main process left behind
                     if self._store.change(record, self._clock(), state=State.STOPPED):
+                        self._promises.remove(record)
                         self._wake_placer()  # there is room for another
                         return True
                 case Stop(instance, force):
@@ -483,8 +517,8 @@ class Reconciler:
     def _ready(self, site: Site, record: Record, host: str | None, port: int | None) -> bool:
         now = self._clock()
         running_at = record.running_at if record.state is State.RUNNING else now
-        changes = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at, "reason": ""}
-        if self._store.change(record, now, **changes) is None:
+        changes: dict[str, Any] = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at}
+        if self._store.change(record, now, reason="", **changes) is None:
             return False
         if record.state is State.STARTING:
             site.fitness.started(record)
@@ -505,6 +539,7 @@ class Reconciler:
             self._store.count(after, [of_instance(after)])
         self.moves.fail_over(after, after.reason)
         if after.site is None or after.state.final:
+            self._promises.remove(after)
             if after.state.final and after.spare:
                 self.moves.spare_failed(after)
             self._wake_placer()
@@ -520,7 +555,7 @@ class Reconciler:
         if not site.runtime.blocked():
             site.fitness.failed(record, crash.why, self._steady(), self._clock())
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
-        decision = self.weigh(replace(record, refused=refused))
+        decision = self.weigh(replace(record, refused=refused), self.promised())
         if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
             several = gives_up and len(decision.refused) > 1
             return {"reason": f"no site can start it: {told(record, decision.refused)}"} if several else {}
@@ -594,11 +629,6 @@ def _ended(
     return ended
 
 
-def _used(records: Sequence[Record]) -> dict[str, Capacity]:
-    """What the instances at each site asked for."""
-    sums: dict[str, tuple[float, int, int]] = {}
-    for record in records:
-        if record.site is not None:
-            needs, (cpu, memory_mb, gpu) = record.spec.needs, sums.get(record.site, (0.0, 0, 0))
-            sums[record.site] = cpu + needs.cpu, memory_mb + needs.memory_mb, gpu + needs.gpu
-    return {site: Capacity(*sum_) for site, sum_ in sums.items()}
+def _rest(usual: float, took: float) -> float:
+    """Seconds from one look at all until the next, for one that took so many of a processor's."""
+    return max(usual, took / _SHARE)

@@ -129,6 +129,8 @@ class Site:
         to do, or not at all."""
         self.watched_at = -math.inf
         """The same of the last look at all that is here."""
+        self.pass_took = self.look_took = 0.0
+        """Seconds of a processor that both took."""
         self.tidied_at = -math.inf
         self.ender: threading.Thread | None = None
         """Deletes it, once it is drained."""

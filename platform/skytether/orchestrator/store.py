@@ -47,7 +47,7 @@ from .records import Record, check_move
 
 _FINAL = [state for state in State if state.final]
 _REASON_LENGTH = 1024
-_SEEN = 4096
+_SEEN = 65_536
 """Records that are remembered, of what has not ended, so that looking at many again and again reads only those that
 changed."""
 _FETCHED = 500
@@ -162,7 +162,7 @@ _LIVE_OF = _versions(_LIVE, instances.c.robot == bindparam("robot"))
 _COUNT_LIVE = select(func.count()).where(_LIVE, instances.c.service == bindparam("service"))
 _LIVE_AT = _versions(_LIVE, instances.c.site == bindparam("site"))
 _CHANGING_AT = _versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
-_WAITING = select(instances.c.id).where(instances.c.state.in_([State.PENDING, State.PLACING])).limit(1)
+_WAITING = _versions(instances.c.state.in_([State.PENDING, State.PLACING]))
 _LIVE_SPARES = _versions(_LIVE, instances.c.spare)
 _SPARES = _versions(instances.c.spare, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
 
@@ -269,10 +269,9 @@ class Store(Database):
         """All at one site that has not ended, oldest first; with ``changing`` only what is starting or stopping."""
         return self._look(_CHANGING_AT if changing else _LIVE_AT, site=site)
 
-    def waits(self) -> bool:
-        """Whether anything has no site yet."""
-        with self._reader.connect() as connection:
-            return connection.scalar(_WAITING) is not None
+    def waiting(self) -> list[Record]:
+        """All that has no site yet, oldest first."""
+        return self._look(_WAITING)
 
     def live_spares(self) -> list[Record]:
         """Those that are nobody's and have not ended, oldest first."""
@@ -287,8 +286,8 @@ class Store(Database):
         with self._reader.connect() as connection:
             return set(connection.scalars(select(instances.c.id).where(instances.c.id.in_(list(ids)))))
 
-    def change(self, record: Record, now: float, **changes: Any) -> Record | None:
-        """Change an instance if it is still as it was seen.
+    def change(self, record: Record, now: float, *, through: State | None = None, **changes: Any) -> Record | None:
+        """Change an instance if it is still as it was seen; ``through``: a state that it passes at once.
 
         Returns:
             The record as it is now; None if somebody else changed it meanwhile.
@@ -297,13 +296,17 @@ class Store(Database):
             IllegalMoveError: The move of state is not in the table.
         """
         state, reason = changes.get("state", record.state), changes.get("reason", record.reason)[:_REASON_LENGTH]
-        check_move(record.state, state)
+        passed = record.after({"state": through, "reason": "", "updated_at": now}) if through else record
+        check_move(record.state, passed.state)
+        check_move(passed.state, state)
         told = state is not record.state or reason != record.reason
         changes |= {"version": record.version + 1, "reason": reason, "updated_at": now if told else record.updated_at}
         new = record.after(changes)
         with self._writing() as connection:
             if connection.execute(_CHANGE, {**changes, **_as_seen(record)}).rowcount == 0:
                 return None
+            if passed is not record:
+                _add_event(connection, passed)
             if told:
                 _add_event(connection, new)
         self._remember(new)

@@ -26,6 +26,7 @@ from ..base import RuntimeFailure, SiteSilentError
 from ..whole_answer import hurried, original
 from .credentials import expired
 from .options import KubernetesOptions
+from .pace import Pace
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,10 @@ OLDEST = 1, 20
 """Version of Kubernetes: startup probes, immutable Secrets and server-side apply are there."""
 _POOL = 16
 """Connections that are kept."""
+_PER_S, _BURST = 300.0, 100
+"""Calls: never more than 400 in a second, however many instances there are."""
+_AGAIN_S = 1.0
+"""Until the next call, where the API server has too much to do and does not say for how long."""
 _MERGE = "application/merge-patch+json"
 _APPLY = "application/apply-patch+yaml"
 _MANAGER = {"fieldManager": "skytether"}
@@ -76,6 +81,7 @@ class Cluster:
         self._client = _client(options)
         self._opened_at = time.monotonic()
         self._where = self._client.configuration.host
+        self._pace = Pace(_PER_S, _BURST)
         if not self._client.configuration.verify_ssl:
             log.warning("kubeconfig %s: the API server's certificate is not checked, as it says", options.kubeconfig)
             urllib3.disable_warnings(urllib3.exceptions.InsecureRequestWarning)  # once is enough
@@ -225,11 +231,19 @@ class Cluster:
             body=body,
             auth_settings=["BearerToken"],
         )
-        try:
-            answer: urllib3.HTTPResponse = used.call_api(*request, _request_timeout=timeout).response
-        except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:
-            raise ClusterGoneError(self._silent(error)) from error
-        return answer
+        patient_until = time.monotonic() + self._options.timeout_s
+        while True:
+            self._pace.wait()
+            try:
+                answer: urllib3.HTTPResponse = used.call_api(*request, _request_timeout=timeout).response
+            except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:
+                raise ClusterGoneError(self._silent(error)) from error
+            wanted = answer.headers.get("Retry-After", "")
+            wait_s = float(wanted) if wanted.isdecimal() else _AGAIN_S
+            if answer.status != HTTPStatus.TOO_MANY_REQUESTS or time.monotonic() + wait_s > patient_until:
+                return answer
+            answer.close()
+            self._pace.hold(wait_s)  # it has too much to do: nobody asks meanwhile
 
     def _has_others(self, refused: client.ApiClient) -> bool:
         """Whether the files have other credentials, perhaps, than those that were just refused: they are read anew.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
 from skytether.api.usage import NO_USAGE, Usage, pull_usage
@@ -17,6 +17,7 @@ from ..base import RuntimeFailure
 from ..now_and_then import NowAndThen
 from .cluster import Cluster
 from .objects import HEALTH_PORT
+from .pace import Pace
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +27,8 @@ _TIMEOUT_S = 2.0
 """Of one pod's answer."""
 _REST = 20
 """A pod is left alone for so many times as long as its answer took: it has a twentieth of the time that all share."""
+_PER_S = 100.0
+"""Pods that are asked in a second, at most: of ten thousand each has its turn every two minutes."""
 
 _Told = tuple[tuple[ServiceReport, ...], Usage]
 _NOTHING: _Told = (), NO_USAGE
@@ -44,7 +47,8 @@ class ReportReader:
         self._closing = False
         self._rest_until: dict[str, float] = {}
         """By pod, by the monotonic clock [s]."""
-        self._known: Mapping[str, _Told] = {}
+        self._pace = Pace(_PER_S, 1)
+        self._known: dict[str, _Told] = {}
 
     def of(self, pod: str) -> tuple[ServiceReport, ...]:
         """What it reported, as read last."""
@@ -62,22 +66,24 @@ class ReportReader:
         self._closing = True
 
     def _look(self) -> None:
-        found: dict[str, _Told] = {}
         rest_until: dict[str, float] = {}
         try:
             for pod in self._running():
                 if self._closing:
                     return
-                before = time.monotonic()
                 rest = self._rest_until.get(pod, 0.0)
-                found[pod] = self._ask(pod) if rest <= before else self._known.get(pod, _NOTHING)
-                after = time.monotonic()
-                rest_until[pod] = max(rest, after + _REST * (after - before))
+                if rest <= time.monotonic():
+                    self._pace.wait()
+                    before = time.monotonic()
+                    self._known[pod] = self._ask(pod)
+                    after = time.monotonic()
+                    rest = after + _REST * (after - before)
+                rest_until[pod] = rest
         except RuntimeFailure as error:
             log.debug("reports of services are not read: %s", error)
             return
         self._rest_until = rest_until
-        self._known = found
+        self._known = {pod: told for pod, told in self._known.items() if pod in rest_until}
 
     def _ask(self, pod: str) -> _Told:
         path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")

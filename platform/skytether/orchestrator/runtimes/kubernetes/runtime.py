@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
@@ -268,8 +268,21 @@ class KubernetesRuntime(Runtime):
         self._policy_at, self._blocked = time.monotonic(), ""
 
     def observe(self) -> Mapping[str, Observation]:
+        with self._lock:
+            unrun = dict(self._unrun)
+        return self._observed(self._watch.seen(self._options.timeout_s), unrun)
+
+    @override
+    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+        there = [seen for instance in instances for seen in self._watch.of(instance, self._options.timeout_s)]
+        with self._lock:
+            unrun = {instance: self._unrun[instance] for instance in instances if instance in self._unrun}
+        return self._observed(there, unrun)
+
+    def _observed(self, there: Iterable[Seen], unrun: Mapping[str, Observation]) -> Mapping[str, Observation]:
+        """The newest run of each instance."""
         newest: dict[str, Seen] = {}
-        for seen in self._watch.seen(self._options.timeout_s):
+        for seen in there:
             if seen.removed:
                 continue
             if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
@@ -288,10 +301,9 @@ class KubernetesRuntime(Runtime):
             )
             for instance, seen in newest.items()
         }
-        with self._lock:
-            for instance, told in self._unrun.items():
-                if instance not in found or found[instance].attempt <= told.attempt:
-                    found[instance] = told
+        for instance, told in unrun.items():
+            if instance not in found or found[instance].attempt <= told.attempt:
+                found[instance] = told
         return found
 
     def _over(self, seen: Seen) -> bool:

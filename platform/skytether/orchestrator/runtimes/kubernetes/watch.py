@@ -14,6 +14,7 @@ import urllib3
 
 from ..base import RuntimeFailure
 from .cluster import Cluster, ClusterGoneError, RefusedError, cut
+from .pods import Pods
 from .seen import Seen, parse
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class Watch:
         self.changed = threading.Event()
         """Set whenever another thing may be known than before; whoever waits for it clears it."""
         self._lock = threading.Lock()
-        self._seen: dict[str, Seen] = {}
+        self._pods = Pods()
         self._gone: dict[str, str] = {}
         """By their uid, names of pods that were forgotten: a late event or list does not bring them back."""
         self._lingers_since: dict[str, float] = {}
@@ -74,16 +75,21 @@ class Watch:
         Raises:
             RuntimeFailure: The API server does not answer, or refuses.
         """
+        self._must_know(timeout_s)
+        with self._lock:
+            return self._pods.all()
+
+    def of(self, instance: str, timeout_s: float) -> list[Seen]:
+        """The pods of one instance, the newest run last; raises as ``seen``."""
+        self._must_know(timeout_s)
+        with self._lock:
+            return self._pods.of(instance)
+
+    def _must_know(self, timeout_s: float) -> None:
         self._looked.wait(timeout_s)
         failure = self._failure
         if failure is not None:
             raise type(failure)(*failure.args) if not isinstance(failure, RefusedError) else failure
-        with self._lock:
-            return list(self._seen.values())
-
-    def of(self, instance: str, timeout_s: float) -> list[Seen]:
-        """The pods of one instance, the newest run last; raises as ``seen``."""
-        return sorted((s for s in self.seen(timeout_s) if s.instance == instance), key=lambda seen: seen.attempt)
 
     def lingered_s(self, seen: Seen) -> float:
         """For how long a pod has been on the point of ending [s]; 0: it is not."""
@@ -115,9 +121,9 @@ class Watch:
     def forget(self, seen: Seen) -> None:
         """It was removed: no event that is late brings it back."""
         with self._lock:
-            there = self._seen.get(seen.name)
+            there = self._pods.get(seen.name)
             if there is not None and there.uid == seen.uid:
-                del self._seen[seen.name]
+                self._pods.drop(seen.name)
             self._gone[seen.uid] = seen.name
         self.changed.set()
 
@@ -130,9 +136,9 @@ class Watch:
             self.forget(seen)
             return
         with self._lock:
-            before = self._seen.get(seen.name)
+            before = self._pods.get(seen.name)
             if seen.uid not in self._gone and (before is None or _is_newer(seen, before)):
-                self._seen[seen.name] = seen
+                self._pods.put(seen)
         self.changed.set()
 
     def _run(self) -> None:
@@ -175,14 +181,14 @@ class Watch:
         with self._lock:
             # What an answer has told meanwhile may be newer than the list.
             for name, seen in found.items():
-                before = self._seen.get(name)
+                before = self._pods.get(name)
                 if before is not None and before.uid == seen.uid and not _is_newer(seen, before):
                     found[name] = before
             at = _number(meta["resourceVersion"])
-            newer = {n: s for n, s in self._seen.items() if n not in found and _number(s.version) > at}
-            self._seen = {n: s for n, s in found.items() if s.uid not in self._gone} | newer
+            newer = [s for s in self._pods.all() if s.name not in found and _number(s.version) > at]
+            self._pods = Pods([*(s for s in found.values() if s.uid not in self._gone), *newer])
             self._gone = {uid: name for uid, name in self._gone.items() if name in found}
-            there = {seen.uid for seen in self._seen.values()}
+            there = {seen.uid for seen in self._pods.all()}
             self._lingers_since = {uid: at for uid, at in self._lingers_since.items() if uid in there}
             self._ill_since = {uid: at for uid, at in self._ill_since.items() if uid in there}
             self._well &= there
