@@ -36,7 +36,7 @@ def ask(served: Any, **changes: Any) -> Any:
 def two(served: Any) -> Any:
     """Two sites, ``near`` and ``far``."""
     for name in ("near", "far"):
-        served.site(name)
+        served.site(name, cpu=20)
     served.running = lambda i: (found := served.operator.get_instance(i)).state is State.RUNNING and found
     return served
 
@@ -162,7 +162,7 @@ def test_a_robot_that_drives_by_itself_for_long_is_moved_where_it_is_better(
 ) -> None:
     served = served_with(timing=Timing(**QUICK, replace_after=0.2, replace_pause=0.1))
     for name in ("near", "far"):
-        served.site(name)
+        served.site(name, cpu=20)
     served.running = lambda i: (found := served.operator.get_instance(i)).state is State.RUNNING and found
     first = ask(served, measurements=MEASURED)
     assert first.placement.site == "near"
@@ -179,7 +179,7 @@ def test_a_robot_that_drives_by_itself_for_long_is_moved_where_it_is_better(
 def test_a_bad_link_alone_moves_nothing(served_with: Callable[..., Any]) -> None:
     served = served_with(timing=Timing(**QUICK, replace_after=0.05, replace_pause=0.01))
     for name in ("near", "far"):
-        served.site(name)
+        served.site(name, cpu=20)
     served.running = lambda i: (found := served.operator.get_instance(i)).state is State.RUNNING and found
     first = ask(served, measurements=MEASURED)
     limit = time.monotonic() + 0.5
@@ -204,7 +204,7 @@ def successor(served: Any, instance: str) -> Any:
 
 
 def test_what_its_site_is_about_to_end_is_moved_and_its_site_may_have_another_place(two: Any, manifest: Any) -> None:
-    put(two, manifest, cpu=40)  # twice that is more than a site has
+    put(two, manifest, cpu=12)  # twice that is more than a site has
     first = ask(two, measurements=MEASURED)
     leaves(two, first.id)
     moving = successor(two, first.id)
