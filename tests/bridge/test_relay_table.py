@@ -93,6 +93,19 @@ def test_a_target_may_move_and_its_sessions_go_on():
     assert not relay.down(leg, data(7), SERVICE, 1.0)
 
 
+def test_a_route_of_one_session_moves_its_newcomers_and_nobody_else():
+    relay = table(("*", SERVICE))
+    newcomer, other, admitted = relay.up(packet(7), ROBOT, 0.0), relay.up(packet(8), ROBOT, 0.0), admit(relay, 9)
+    relay.add(Prefix.parse(f"{7:016x}"), OTHER, 0.0)
+    assert list(relay.closed) == [newcomer]
+    assert relay.up(packet(7), ROBOT, 0.0).route.target == OTHER
+    relay.remove(Prefix.parse(f"{7:016x}"))
+    assert len(relay.closed) == 2
+    assert relay.up(packet(7), ROBOT, 0.0).route.target == SERVICE
+    assert relay.up(packet(8), ROBOT, 0.0) is other
+    assert relay.up(packet(9), ROBOT, 0.0) is admitted
+
+
 def test_a_new_route_takes_its_sessions_and_a_removed_one_ends_them():
     relay = table()
     first, second = admit(relay, 7), admit(relay, 8)
