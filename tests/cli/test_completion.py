@@ -8,9 +8,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from skytether.cli import names
 from skytether.lab.embedded import EmbeddedOrchestrator
 
 pytestmark = pytest.mark.slow
@@ -49,6 +52,17 @@ def test_bash_completes_verbs_options_and_names(shell: Ask) -> None:
     with EmbeddedOrchestrator() as orchestrator:
         told = shell(bash, "-c", pressed, SKYTETHER_URL=orchestrator.url, SKYTETHER_TOKEN=orchestrator.operator_token)
     assert told.splitlines() == ["instance", "migrate", "recorder", ""]
+
+
+@pytest.mark.parametrize("word", ["1\\$(touch x)", "1`x`", "1'; x; '", "1\n2", "1\x1b[2J", "1\u202e"])
+def test_no_word_that_others_wrote_reaches_a_shell_that_evaluates_it(
+    word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SKYTETHER_URL", "http://127.0.0.1:1")
+    monkeypatch.setenv("SKYTETHER_TOKEN", "token")
+    complete = names._complete(lambda _: [("toy", f"version {word}"), (word, "version 1"), ("tool", "version 1.2+3")])
+    asked: Any = SimpleNamespace(params={})
+    assert complete(asked, "") == [("tool", "version 1.2+3")]
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,22 @@
 """The command as a program: what it says, where, and with which exit status."""
 
+import io
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
 
 import pytest
+from rich.progress import Progress, TextColumn
 from typer.testing import CliRunner
 
 from skytether.cli import main as entry
 from skytether.cli.app import app
 from skytether.cli.demo import _told
-from skytether.cli.output import log_to_console, print_foreign, print_table
+from skytether.cli.output import SafeConsole, log_to_console, print_foreign, print_table
+from skytether.cli.robot_check import Finding, show
 from skytether.robot.arbiter import Reason
 from skytether.robot.command import Source
 from skytether.robot.driver import Transition
@@ -88,3 +92,21 @@ def test_a_terminal_gets_no_codes_of_a_service(
 def test_a_table_gets_no_codes_and_no_markup_of_who_filled_it(capsys: pytest.CaptureFixture[str]) -> None:
     print_table(("service", "version"), [("toy", "1\x1b]0;title\x07 [red][/x]")])
     assert "1\\x1b]0;title\\x07 [red][/x]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_whatever_is_shown_to_people_gets_no_codes_of_who_wrote_it(terminal: bool) -> None:
+    out = io.StringIO()
+    shown = SafeConsole(file=out, force_terminal=terminal, width=60, highlight=False)
+    evil = "a\x1b]52;c;ZXZpbA==\x07\x1b]8;;http://x\x1b\\b\x9b2J\u202ec\r"
+    shown.print(f"error: {evil}", style="red", markup=False, soft_wrap=True)
+    with Progress(TextColumn("{task.description}", markup=False), console=shown) as bar:
+        bar.add_task(evil, total=None)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", out.getvalue().replace("\r\x1b", "\x1b"))  # but for rich's own
+    assert not set(text) & set("\x1b\x07\x9b\u202e\r")
+    assert "a\\x1b]52;c;ZXZpbA==" in text
+
+
+def test_what_others_publish_in_the_graph_is_no_markup(capsys):
+    assert show([Finding("ok", "scan", "/scan", "sensor_msgs/[/x]", "[red]")])
+    assert "sensor_msgs/[/x]" in capsys.readouterr().out

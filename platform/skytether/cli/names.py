@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 _PATIENCE_S = 1.0
 """Whoever pressed the key is waiting."""
+_PLAIN = re.compile(r"[\w.,+() -]*", re.ASCII)
+"""What is left of an orchestrator's words: zsh evaluates what it is told."""
 Names = Callable[[Context, str], list[tuple[str, str]]]
 
 
@@ -31,7 +34,7 @@ def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
             file = given.get("token_file") or os.environ.get("SKYTETHER_TOKEN_FILE")
             token = local_token(Path(file) if file else None)
             with Client(url or local_url(), token, timeout=_PATIENCE_S, **transport(url)) as client:
-                return [row for row in ask(client) if row[0].startswith(incomplete)]
+                return [row for row in ask(client) if row[0].startswith(incomplete) and all(map(_PLAIN.fullmatch, row))]
         except (Exception, SystemExit):  # a key that was pressed must not be answered with a complaint
             return []
 

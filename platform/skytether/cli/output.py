@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.segment import Segment
+from typing_extensions import override
 
 from skytether.api.printable import printable
 
@@ -23,7 +25,19 @@ if TYPE_CHECKING:
 _WIDE = 10_000
 """Columns of a table that goes to a pipe or a file: more than any row has."""
 _PRIVATE = {"session": {"key"}}
-console = Console(stderr=True, highlight=False)
+
+
+class SafeConsole(Console):
+    """A terminal gets no codes but rich's own, wherever the text is from that is among its output."""
+
+    @override
+    def _render_buffer(self, buffer: Iterable[Segment]) -> str:
+        return super()._render_buffer(
+            segment if segment.control else segment._replace(text=printable(segment.text)) for segment in buffer
+        )
+
+
+console = SafeConsole(stderr=True, highlight=False)
 """For people: progress, tables, notes. Standard output is kept for what programs read."""
 
 
@@ -104,9 +118,9 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
     for row in rows:
         table.add_row(*(cell(value) for value in row))
-    out = Console(highlight=False)
+    out = SafeConsole(highlight=False)
     # A program that reads lines must not find one row on two of them.
-    out.print(table) if out.is_terminal else Console(highlight=False, width=_WIDE).print(table)
+    out.print(table) if out.is_terminal else SafeConsole(highlight=False, width=_WIDE).print(table)
 
 
 def log_to_console() -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .connection import TokenFile, connected
-from .output import console, fail, print_json
+from .output import SafeConsole, cell, console, fail, print_json
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
@@ -154,10 +154,9 @@ def _ms(seconds: float) -> float | None:
 
 
 def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{config.bag.name} to {config.service}, {result.seconds:.1f} s")
+    table = Table(title=cell(f"{config.bag.name} to {config.service}, {result.seconds:.1f} s"))
     table.add_column("topic")
     table.add_column("type")
     for name in ("messages", "sent", "delivered", "lost", "p50 ms", "p99 ms"):
@@ -166,9 +165,12 @@ def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) 
         counts = (topic.messages, topic.sent, topic.delivered, topic.lost)
         delays = (_ms(topic.delay_p50_s), _ms(topic.delay_p99_s))
         table.add_row(
-            topic.topic, topic.type, *map(str, counts), *("-" if ms is None else f"{ms:.2f}" for ms in delays)
+            cell(topic.topic),
+            cell(topic.type),
+            *map(str, counts),
+            *("-" if ms is None else f"{ms:.2f}" for ms in delays),
         )
-    out = Console(highlight=False)
+    out = SafeConsole(highlight=False)
     out.print(table)
     for path in files:
         out.print(f"written: {path}", markup=False, soft_wrap=True)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from rich.console import Console
 from rich.table import Table
 
 from skytether.api.client import ApiError, Client, Unreachable
@@ -25,7 +24,7 @@ from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.services import CallRefusedError
 from skytether.ros.ros1.subscription import Listener
 
-from .output import console
+from .output import SafeConsole, cell, console
 from .robot_config import RobotConfig
 from .robot_gate import ASSUMED, NO_GATE
 
@@ -87,8 +86,8 @@ def show(findings: Sequence[Finding]) -> bool:
     for head in ("", "what", "in the graph", "type", "found"):
         table.add_column(head, overflow="fold")
     for f in findings:
-        table.add_row("ok" if f.good else "!!", f.what, f.where, f.kind, f.says)
-    Console(highlight=False).print(table, markup=False)
+        table.add_row("ok" if f.good else "!!", *map(cell, (f.what, f.where, f.kind, f.says)))
+    SafeConsole(highlight=False).print(table)
     wrong = sum(not f.good for f in findings)
     console.print("all is there" if not wrong else f"{wrong} to mend, marked !!", markup=False)
     return not wrong
