@@ -1,4 +1,4 @@
-"""Builds the container images: ``make images``, or ``python images/build.py [NAME ...]``.
+"""Builds the container images: ``make images``, or ``python images/build.py [NAME ...]``; ``--push`` to a registry.
 
 Wheels are made and fetched here, outside, with the hashes of ``requirements.lock``; a build copies them in and asks no
 package index. Debian's own packages come from its archive, within the build.
@@ -10,6 +10,7 @@ import argparse
 import hashlib
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -18,13 +19,19 @@ import tarfile
 import time
 import tomllib
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from urllib.parse import quote
+from tempfile import TemporaryDirectory
 
 import docker
 import pip
+import yaml
 from docker.errors import DockerException
+from image_bill import bill, packages, write_bill
+from image_push import Pushed, Pusher, values
+from image_registry import RegistryError
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -44,11 +51,30 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Images with wheels of their own, and the extras that these are; all but the base's, which they are built on."""
 _NUMERICAL = ("numpy", "numpy.libs")
+MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
+"""By architecture, as images name it: what wheels call it."""
 _FETCH_TIMEOUT = 600
 
 
 class BuildError(Exception):
     """One sentence that says what to do."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What images are built for.
+
+    Attributes:
+        platform: As images name it: ``linux/arm64``.
+        machine: As wheels name it: ``aarch64``.
+        debian: The image of Debian for it.
+        suffix: Of tags on the engine; none for the engine's own architecture.
+    """
+
+    platform: str
+    machine: str
+    debian: str
+    suffix: str
 
 
 @dataclass(frozen=True)
@@ -121,9 +147,9 @@ def fetch(group: str, machine: str) -> None:
     if group != "base":
         rows = {name: row for name, row in rows.items() if name not in requirements((), machine)}
     text = "\n".join(rows[name] for name in sorted(rows)) + "\n"
-    listed, folder = WORK / f"{group}.txt", WORK / "wheels" / group
+    listed, folder = WORK / f"{group}-{machine}.txt", WORK / "wheels" / machine / group
     note = folder / ".complete"
-    digest = hashlib.sha256(f"{machine}\n{text}".encode()).hexdigest()
+    digest = hashlib.sha256(text.encode()).hexdigest()
     if note.exists() and note.read_text() == digest:
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -175,14 +201,14 @@ def known() -> set[str]:
     return {path.parent.name for path in IMAGES.glob("*/Dockerfile")}
 
 
-def context(name: str) -> bytes:
+def context(name: str, machine: str) -> bytes:
     """What an image is built from, as a tar file: its folder, its wheels. Times are left out, for the cache."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
         tar.add(IMAGES / name, ".", filter=_plain)
         if name in EXTRAS:
-            tar.add(WORK / f"{name}.txt", f"{name}.txt", filter=_plain)
-            tar.add(WORK / "wheels" / name, f"wheels/{name}", filter=_plain)
+            tar.add(WORK / f"{name}-{machine}.txt", f"{name}.txt", filter=_plain)
+            tar.add(WORK / "wheels" / machine / name, f"wheels/{name}", filter=_plain)
             tar.add(Path(pip.__file__).parent, "pip/pip", filter=_plain)
         if name == "base":
             tar.add(WORK / "wheels" / "project", "wheels/project", filter=_plain)
@@ -197,23 +223,31 @@ def _plain(entry: tarfile.TarInfo) -> tarfile.TarInfo | None:
 
 
 def labels(name: str) -> dict[str, str]:
-    """The labels that the Open Container Initiative names."""
+    """The labels that the Open Container Initiative names; the same for the same commit."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    git = shutil.which("git") or "git"
-    asked = [git, "-C", str(ROOT), "log", "-1", "--format=%H %cI"]
-    revision, _, created = (
-        subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip().partition(" ")
-    )
+    made_at = os.environ.get("SOURCE_DATE_EPOCH") or _git("log", "-1", "--format=%ct")
+    remote = _git("config", "--get", "remote.origin.url")
     said = {
         "title": f"skytether {name}",
         "description": project["description"],
         "version": project["version"],
         "licenses": project["license"],
         "vendor": project["authors"][0]["name"],
-        "revision": revision,
-        "created": created,
+        "revision": _git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"),
+        "created": f"{datetime.fromtimestamp(int(made_at), UTC):%Y-%m-%dT%H:%M:%SZ}" if made_at else "",
+        # Any other address is of use to one person only, or has a password in it.
+        "source": remote if remote.startswith("https://") and "@" not in remote else "",
     }
     return {f"org.opencontainers.image.{key}": value for key, value in said.items() if value}
+
+
+def _git(*arguments: str) -> str:
+    """What git says of this clone; nothing where it is none."""
+    command = [shutil.which("git") or "git", "-C", str(ROOT), *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    except OSError:
+        return ""
 
 
 def needs(name: str, what: str) -> bool:
@@ -221,34 +255,80 @@ def needs(name: str, what: str) -> bool:
     return f"ARG {what}" in (IMAGES / name / "Dockerfile").read_text()
 
 
-def source_tag(name: str, debian_id: str) -> str:
+def source_tag(name: str, debian_id: str, machine: str) -> str:
     """A tag that says what an image is made from: the same for the same files, wheels and image of Debian."""
-    parts = [context(name), debian_id.encode() if needs(name, "DEBIAN") else b""]
-    parts += [source_tag("base", debian_id).encode()] if needs(name, "BASE") else []
-    return "s-" + hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
+    parts = [context(name, machine), debian_id.encode() if needs(name, "DEBIAN") else b""]
+    parts += [source_tag("base", debian_id, machine).encode()] if needs(name, "BASE") else []
+    return _source(hashlib.sha256(part).digest() for part in parts)
 
 
-def tags(client: docker.DockerClient, names: Iterable[str], tag: str, debian: str) -> dict[str, str]:
-    """By image, its tag."""
-    if tag != SOURCE:
-        return dict.fromkeys(names, tag)
-    debian_id = str(client.api.inspect_image(debian)["Id"])
-    return {name: source_tag(name, debian_id) for name in names}
+def _source(parts: Iterable[bytes]) -> str:
+    return "s-" + hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
-def build(client: docker.DockerClient, name: str, prefix: str, tagged: dict[str, str], debian: str) -> Built:
+def sources(client: docker.DockerClient, names: Iterable[str], target: Target) -> dict[str, str]:
+    """By image, the tag that says what it is made from."""
+    debian_id = str(client.api.inspect_image(target.debian)["Id"])
+    return {name: source_tag(name, debian_id, target.machine) for name in names}
+
+
+def targets(client: docker.DockerClient, platforms: str, debian: str) -> list[Target]:
+    """What to build for; the engine's own architecture where nothing is asked for.
+
+    Raises:
+        BuildError: The engine has no Debian of such a kind, or cannot run it.
+    """
+    machine = str(client.info()["Architecture"])
+    own = f"linux/{dict(zip(MACHINES.values(), MACHINES, strict=True)).get(machine, machine)}"
+    found = []
+    for platform in dict.fromkeys(platforms.split(",") if platforms else [own]):
+        if platform == own:
+            found.append(Target(platform, machine, debian, ""))
+            continue
+        architecture = platform.removeprefix("linux/")
+        if platform != f"linux/{architecture}" or architecture not in MACHINES:
+            known = ", ".join(f"linux/{name}" for name in MACHINES)
+            raise BuildError(f"nothing can be built for '{platform}': there are {known}")
+        name = f"{debian.replace('@sha256:', ':')}-{architecture}"
+        _have_foreign(client, debian, name, platform)
+        found.append(Target(platform, MACHINES[architecture], name, f"-{architecture}"))
+    return found
+
+
+def _have_foreign(client: docker.DockerClient, debian: str, name: str, platform: str) -> None:
+    """Have Debian for another architecture, under a name of its own: the engine keeps one for each name."""
+    if not client.images.list(name):
+        own = client.api.inspect_image(debian)["Id"] if client.images.list(debian) else None
+        try:
+            client.images.pull(debian, platform=platform).tag(name)
+        except DockerException as error:
+            raise BuildError(f"{debian} for {platform} is not on the engine, and cannot be pulled: {error}") from error
+        finally:
+            if own:
+                client.api.tag(own, debian)
+    try:
+        client.containers.run(name, ["/bin/true"], remove=True, network_disabled=True)
+    except DockerException as error:
+        raise BuildError(
+            f"the engine cannot run {platform}: install qemu-user-static on its machine, or build for {platform} on "
+            f"an engine of that kind (DOCKER_HOST), which adds it to the same tags ({error})"
+        ) from error
+
+
+def build(client: docker.DockerClient, name: str, prefix: str, tagged: dict[str, str], target: Target) -> Built:
     """Build one image; what it is built on is there."""
     image = f"{prefix}{name}:{tagged[name]}"
     begun = time.monotonic()
-    arguments = {"DEBIAN": debian, "BASE": f"{prefix}base:{tagged.get('base', '')}"}
+    arguments = {"DEBIAN": target.debian, "BASE": f"{prefix}base:{tagged.get('base', '')}"}
     used = {key: value for key, value in arguments.items() if needs(name, key)}
     lines: list[str] = []
     for line in client.api.build(
-        fileobj=io.BytesIO(context(name)),
+        fileobj=io.BytesIO(context(name, target.machine)),
         custom_context=True,
         tag=image,
         buildargs=used,
         labels=labels(name),
+        platform=target.platform if target.suffix else None,
         rm=True,
         forcerm=True,
         decode=True,
@@ -269,75 +349,116 @@ def _numerical(client: docker.DockerClient, image: str) -> int:
     return sum(int(line.split()[0]) for line in said.decode().splitlines())
 
 
-_LISTED = """
-dpkg-query -W -f 'deb\\t${Package}\\t${Version}\\t${Architecture}\\n'
-[ ! -x /app/bin/python ] || /app/bin/python -c '
-from importlib.metadata import distributions
-for one in distributions(): print("pypi", one.name, one.version, sep="\\t")'
-"""
-"""Says a row of an image's every package: its kind, name, version, architecture."""
-
-
-def bill(image: str, image_id: str, listed: str) -> dict[str, object]:
-    """What an image is made of, as CycloneDX 1.5 wants it (https://cyclonedx.org): the same text for the same image."""
-    components = []
-    for kind, name, version, *architecture in sorted({tuple(line.split("\t")) for line in listed.splitlines() if line}):
-        where = "deb/debian" if kind == "deb" else kind
-        known = name if kind == "deb" else canonicalize_name(name)
-        purl = f"pkg:{where}/{quote(known)}@{quote(version, safe='~')}"
-        purl += f"?arch={architecture[0]}" if architecture else ""
-        components.append({"type": "library", "name": name, "version": version, "purl": purl, "bom-ref": purl})
-    about = {"type": "container", "name": image, "version": image_id}
-    return {
-        "bomFormat": "CycloneDX",
-        "specVersion": "1.5",
-        "version": 1,
-        "metadata": {"component": about},
-        "components": components,
-    }
-
-
-def write_bill(client: docker.DockerClient, image: str, folder: Path) -> None:
-    """List an image's packages, by its own package managers, into a file beside those of the other images."""
-    said = client.containers.run(image, ["-c", _LISTED], entrypoint="/bin/sh", remove=True, network_disabled=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    document = bill(image, client.api.inspect_image(image)["Id"], said.decode())
-    name = re.sub(r"[^A-Za-z0-9.-]", "_", image)
-    (folder / f"{name}.cdx.json").write_text(json.dumps(document, indent=1) + "\n")
-
-
-def main() -> int:
-    """The command."""
+def arguments() -> argparse.Namespace:
+    """What was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("name", nargs="*", help="default: all of them")
-    parser.add_argument("--prefix", default="skytether/", help="before each name, such as REGISTRY/skytether/")
+    parser.add_argument("--prefix", default="skytether/", help="before each name on the engine")
     parser.add_argument("--tag", default=TAG, help=f"{SOURCE}: one for each that says what it is made from")
     parser.add_argument("--debian", default="debian:bookworm-slim", help="what the base is built from")
     parser.add_argument("--sbom", type=Path, help="write a list of each image's packages (CycloneDX) into this folder")
-    parser.add_argument("--json", action="store_true", help="print rows `image, seconds, size_mb, numerical_mb`")
+    parser.add_argument(
+        "--push",
+        metavar="HOST[:PORT]/FOLDER",
+        help="push to this registry, with the lists of packages; tags: --tag, the version, the one of its source",
+    )
+    parser.add_argument(
+        "--platform", default="", help="linux/amd64,linux/arm64; default: the engine's own; others are emulated"
+    )
+    parser.add_argument(
+        "--digests", type=Path, metavar="FILE", help="write values that give the chart these images, by digest"
+    )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print rows `image, seconds, size_mb, numerical_mb`; "
+        "with --push rows `image, tags, digest, platforms, replaced`",
+    )
     asked = parser.parse_args()
-    rows = []
-    try:
-        names = order(asked.name)
-        client = docker.from_env(timeout=_FETCH_TIMEOUT)
-        machine = str(client.info()["Architecture"])
+    if asked.digests and not asked.push:
+        parser.error("--digests says where images were pushed to: give --push, too")
+    return asked
+
+
+def run(asked: argparse.Namespace, client: docker.DockerClient, pusher: Pusher | None) -> None:
+    """Build, and push."""
+    names = order(asked.name)
+    if pusher:
+        pusher.check(names)
+    rows: list[Built] = []
+    made_from: dict[str, list[str]] = {name: [] for name in names}
+    if "base" in names:
+        make_wheel()
+    for target in targets(client, asked.platform, asked.debian):
         for group in EXTRAS:
             if group in names:
-                fetch(group, machine)
-        if "base" in names:
-            make_wheel()
-        tagged = tags(client, names, asked.tag, asked.debian)
+                fetch(group, target.machine)
+        source = sources(client, names, target) if pusher or asked.tag == SOURCE else {}
+        tagged = {name: f"{source[name] if asked.tag == SOURCE else asked.tag}{target.suffix}" for name in names}
+        debian = client.api.inspect_image(target.debian)["RootFS"]["Layers"] if pusher else []
         for name in names:
-            rows.append(build(client, name, asked.prefix, tagged, asked.debian))
+            rows.append(build(client, name, asked.prefix, tagged, target))
             if asked.sbom:
                 write_bill(client, rows[-1].image, asked.sbom)
             if not asked.json:
                 print(_line(rows[-1]), flush=True)
-    except (BuildError, subprocess.TimeoutExpired, DockerException) as error:
+            if pusher:
+                made = pusher.push(name, rows[-1].image, debian)
+                listed = bill(pusher.image(name), made.digest, packages(client, rows[-1].image))
+                pusher.attach(name, made, target.platform, listed)
+                made_from[name].append(source[name])
+    if pusher is None:
+        if asked.json:
+            print(json.dumps([asdict(row) for row in rows], indent=2))
+        return
+    pushed = [pusher.tag(name, _tags(asked.tag, made_from[name])) for name in names]
+    if asked.digests:
+        asked.digests.write_text(yaml.safe_dump(values(pushed), sort_keys=False))
+    _tell(pushed, as_json=asked.json)
+
+
+def _tags(asked: str, made_from: list[str]) -> list[str]:
+    """Where an image is found in the registry."""
+    source = made_from[0] if len(made_from) == 1 else _source(tag.encode() for tag in sorted(made_from))
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    return {SOURCE: [source], TAG: [TAG, version, source]}.get(asked, [asked, source])
+
+
+def _tell(pushed: list[Pushed], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps([asdict(row) for row in pushed], indent=2))
+    for row in pushed:
+        if not as_json:
+            print(f"{row.image}@{row.digest}  {', '.join(row.tags)}  {', '.join(row.platforms)}")
+        if row.replaced:
+            gone = ", ".join(row.replaced)
+            print(f"note: {row.image}:{row.tags[0]} had {gone}, of another commit, and has it no more", file=sys.stderr)
+    missing = [f"linux/{name}" for name in MACHINES if any(f"linux/{name}" not in row.platforms for row in pushed)]
+    if missing:
+        print(
+            f"note: nothing was pushed for {', '.join(missing)}: --platform, or the same commit built on an engine of "
+            "that kind (DOCKER_HOST), adds it to these tags",
+            file=sys.stderr,
+        )
+
+
+def main() -> int:
+    """The command."""
+    asked = arguments()
+    WORK.mkdir(parents=True, exist_ok=True)
+    try:
+        with ExitStack() as stack:
+            client = docker.from_env(timeout=_FETCH_TIMEOUT)
+            stack.callback(client.close)
+            pusher = None
+            if asked.push:
+                folder = Path(stack.enter_context(TemporaryDirectory(dir=WORK)))
+                pusher = Pusher(client, asked.push, folder)
+                stack.callback(pusher.close)
+            run(asked, client, pusher)
+    except (BuildError, RegistryError, subprocess.TimeoutExpired, DockerException, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    if asked.json:
-        print(json.dumps([asdict(row) for row in rows], indent=2))
     return 0
 
 

@@ -63,6 +63,7 @@ TOGETHER = (
     "orchestrator/test_faults.py",
     "orchestrator/test_faults_engine.py",
     "orchestrator/test_follow_image.py",
+    "orchestrator/test_image_push.py",
     "orchestrator/test_images.py",
     "orchestrator/test_left_behind.py",
     "orchestrator/test_migrations.py",
@@ -325,6 +326,15 @@ def sshd() -> str:
     program = shutil.which("sshd", path=f"{os.environ['PATH']}:/usr/sbin")
     if program is None:
         require("docker", "the program 'sshd' is missing: install openssh-server")
+    return program
+
+
+@pytest.fixture(scope="session")
+def registry_program() -> str:
+    """The program of a registry of images."""
+    program = shutil.which("docker-registry")
+    if program is None:
+        require("registry", "the program 'docker-registry' is missing: install docker-registry")
     return program
 
 

@@ -616,12 +616,14 @@ def test_a_tag_says_what_an_image_is_made_from(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "wheels" / "project").mkdir(parents=True)
 
     def made() -> list[str]:
-        return [build.source_tag(name, "sha256:ab") for name in ("base", "trail", "guard")]
+        return [build.source_tag(name, "sha256:ab", "x86_64") for name in ("base", "trail", "guard")]
 
     before = made()
     assert made() == before
     assert len(set(before)) == 3
-    assert build.source_tag("trail", "sha256:cd") != before[1], "what it is built on is built on another Debian"
+    assert build.source_tag("trail", "sha256:cd", "x86_64") != before[1], (
+        "what it is built on is built on another Debian"
+    )
     (tmp_path / "wheels" / "project" / "skytether.whl").write_bytes(b"other code")
     base, trail, guard = made()
     assert base != before[0]

@@ -1,4 +1,4 @@
-"""``images/build.py`` as a module: it is a script, and part of no package."""
+"""``images/build.py`` as a module: it is a script, and part of no package; what it imports is beside it."""
 
 from __future__ import annotations
 
