@@ -78,7 +78,7 @@ class PodRoutes:
             self._watch.changed.wait(_LOOK_S)
             self._watch.changed.clear()
             try:
-                wanted = routes_of(self._watch.seen(0))
+                wanted = routes_of(seen for seen in self._watch.seen(0) if not self._watch.over(seen))
                 self._follow(wanted)
             except RuntimeFailure as error:
                 log.debug("routes stay as they are: %s", error)

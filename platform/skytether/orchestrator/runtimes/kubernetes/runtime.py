@@ -35,7 +35,6 @@ from .logs import PodLog
 from .nodes import Nodes
 from .objects import (
     FAILURE,
-    GRACE_S,
     OWNER,
     claim,
     free_port,
@@ -60,8 +59,6 @@ _KEPT = 2
 _NETWORKING = "networking.k8s.io/v1"
 _POLICY_S = 10.0
 """Seconds between two looks whether pods are still closed off."""
-_LINGERS_S = GRACE_S + 1.0
-"""After so many seconds nothing of a pod that lingers runs any more."""
 _UNBEGUN_S = 30.0
 """A pod that has no Secret after so many seconds was made by an orchestrator that was killed then."""
 
@@ -308,7 +305,7 @@ class KubernetesRuntime(Runtime):
 
     def _over(self, seen: Seen) -> bool:
         """Whether nothing of it runs any more."""
-        return seen.ended or self._watch.lingered_s(seen) > _LINGERS_S
+        return self._watch.over(seen)
 
     def stop(self, instance: str, *, force: bool) -> None:
         there = self._watch.of(instance, self._options.timeout_s)

@@ -14,6 +14,7 @@ import urllib3
 
 from ..base import RuntimeFailure
 from .cluster import Cluster, ClusterGoneError, RefusedError, cut
+from .objects import GRACE_S
 from .pods import Pods
 from .seen import Seen, parse
 
@@ -28,6 +29,8 @@ _AGAIN_S = 1.0
 """Between two attempts to reach an API server that does not answer."""
 _ILL_S = 1.5
 """A service is first asked of its health up to a second after it has said that it is ready."""
+_LINGERS_S = GRACE_S + 1.0
+"""After so many seconds nothing of a pod that lingers runs any more."""
 _PAGE = 500
 """Pods of one answer."""
 _MOST_EVENT = 4 << 20
@@ -91,12 +94,12 @@ class Watch:
         if failure is not None:
             raise type(failure)(*failure.args) if not isinstance(failure, RefusedError) else failure
 
-    def lingered_s(self, seen: Seen) -> float:
-        """For how long a pod has been on the point of ending [s]; 0: it is not."""
-        if not seen.lingers:
-            return 0.0
+    def over(self, seen: Seen) -> bool:
+        """Whether nothing of it runs any more."""
+        if seen.ended or not seen.lingers:
+            return seen.ended
         now = time.monotonic()
-        return now - self._lingers_since.setdefault(seen.uid, now)
+        return now - self._lingers_since.setdefault(seen.uid, now) > _LINGERS_S
 
     def ill(self, seen: Seen) -> bool:
         """Whether the health check of a service that is up fails, and not only has not been done yet."""
