@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from skytether.api.manifest import TopicSpec
-from skytether.bridge import CallError, CallFailedError, CallTimeoutError, topics_from_api
+from skytether.bridge import CallError, CallFailedError, CallTimeoutError, calls, topics_from_api
 from skytether.wire.topic import Role
 
 TOPICS = topics_from_api(
@@ -71,6 +71,24 @@ def test_failures_are_told_in_a_sentence(ends):
     service.answer("plan", lambda request: bytes(17 * 2**20))
     with pytest.raises(CallFailedError, match="more than a message may have"):
         robot.call("plan", b"", 5)
+
+
+def test_large_calls_that_wait_fill_no_memory(ends, monkeypatch):
+    monkeypatch.setattr(calls, "MAX_WORKING_BYTES", 1_000_000)
+    service, robot = ends.pair(topics=TOPICS)
+    go, at_work = threading.Event(), threading.Semaphore(0)
+    service.answer("plan", lambda request: (at_work.release(), go.wait(20), b"done")[2])
+    with ThreadPoolExecutor(4) as pool:
+        waiting = [pool.submit(robot.call, "plan", bytes(300_000), 20) for _ in range(3)]
+        for _ in waiting:
+            assert at_work.acquire(timeout=10)
+        with pytest.raises(CallFailedError, match="too many calls to answer"):
+            robot.call("plan", bytes(300_000), 5)
+        small = pool.submit(robot.call, "plan", bytes(1000), 20)
+        assert at_work.acquire(timeout=10)  # there is room for it
+        go.set()
+        assert [answer.result(10) for answer in (*waiting, small)] == [b"done"] * 4
+    assert robot.call("plan", bytes(900_000), 5) == b"done"
 
 
 def test_names_that_are_no_calls_of_this_end(ends):

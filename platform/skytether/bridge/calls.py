@@ -27,6 +27,8 @@ MAX_PENDING = 1000
 """Calls of this end that may wait for an answer."""
 MAX_WORKING = 64
 """Calls of the peer that may be worked on or wait for it."""
+MAX_WORKING_BYTES = 64 << 20
+"""Of them all together: a compressed call of half a kilobyte may grow to 16 MiB."""
 WORKERS = 16
 """Handlers that run at the same time; the result of an action of ROS 2 is a call that waits as long as the action."""
 
@@ -79,7 +81,7 @@ class Calls:
         self._lock = threading.Lock()
         self._pending: dict[int, concurrent.futures.Future[bytes]] = {}
         self._handlers: dict[str, Handler] = {}
-        self._working = 0
+        self._working = self._working_bytes = 0
         self._closed = False
         self._workers: concurrent.futures.ThreadPoolExecutor | None = None
 
@@ -171,8 +173,10 @@ class Calls:
             self._respond(name, number, _FAILED, b"nobody answers it at the other end")
             return
         with self._lock:
-            busy = self._working >= MAX_WORKING
-            self._working += not busy
+            busy = self._working >= MAX_WORKING or self._working_bytes + len(data) > MAX_WORKING_BYTES
+            if not busy:
+                self._working += 1
+                self._working_bytes += len(data)
         if busy:
             self._respond(name, number, _FAILED, b"the other end has too many calls to answer; try again later")
             return
@@ -193,6 +197,7 @@ class Calls:
         finally:
             with self._lock:
                 self._working -= 1
+                self._working_bytes -= _REQUEST.size + len(payload)
         self._respond(name, number, outcome, answer)
 
     def _respond(self, name: str, number: int, outcome: int, answer: bytes) -> None:
