@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from skytether.lab.bench.scale import bench_scale
+from skytether.lab.bench.scale_plot import plot_scale
 
 
 @pytest.mark.slow
-def test_each_level_is_measured_and_a_crowd_is_placed():
+def test_each_level_is_measured_and_a_crowd_is_placed(tmp_path: Path):
     found = bench_scale((4, 8), 6, 400, start_s=0.2, idle_s=1.5, asking=3)
     assert [row.instances for row in found.rows] == [4, 8]
     for row in found.rows:
@@ -22,3 +25,5 @@ def test_each_level_is_measured_and_a_crowd_is_placed():
         assert 0 < row.warm_p50_s <= row.warm_p99_s < 30
     assert found.placements_per_s > 0
     assert found.refused_calls == 0
+    plot_scale(found, tmp_path / "scale.png")
+    assert (tmp_path / "scale.png").read_bytes()[:4] == b"\x89PNG"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -19,6 +20,9 @@ def scale(
     database: Annotated[
         str | None, typer.Option(metavar="URL", help="PostgreSQL with an empty database, instead of SQLite.")
     ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a PNG of the costs over the number of instances.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one document.")] = False,
 ) -> None:
     """Thousands of instances at a Kubernetes site whose API server is made up: what they cost, how long robots wait.
@@ -33,6 +37,8 @@ def scale(
 
     if replicas > 1 and database is None:
         raise typer.BadParameter("several orchestrators need one database: give --database postgresql://USER@HOST/NAME")
+    if plot is not None and not plot.parent.is_dir():
+        raise typer.BadParameter(f"there is no folder {plot.parent}")
     levels = [*(level for level in _LEVELS if level < robots), robots]
     try:
         with console.status("starting ...") as line:
@@ -41,6 +47,10 @@ def scale(
             )
     except (BenchError, EmbeddedError) as error:
         fail(str(error))
+    if plot is not None:
+        from skytether.lab.bench.scale_plot import plot_scale
+
+        plot_scale(found, plot)
     if json:
         print_json(found.document())
         return

@@ -59,6 +59,7 @@ class HostileRow:
         renew_p50_ms: Their median time, from when it was due until all of the answer was read.
         renew_p99_ms: 99th percentile.
         renew_max_ms: The slowest.
+        quarters_p99_ms: 99th percentile in each quarter of the time: whether it grows.
         served_p99_ms: 99th percentile of what the orchestrator itself says of them (``skytether_renewal_seconds``): the
             rest is the network's and the measuring client's, which shares the processors with it.
         quiet_p99_ms: 99th percentile before the attack.
@@ -78,6 +79,7 @@ class HostileRow:
     renew_p50_ms: float
     renew_p99_ms: float
     renew_max_ms: float
+    quarters_p99_ms: tuple[float, ...]
     served_p99_ms: float
     quiet_p99_ms: float
     failed: int
@@ -150,6 +152,9 @@ def bench_hostile(
         renew_p50_ms=spread.p50_ms,
         renew_p99_ms=spread.p99_ms,
         renew_max_ms=spread.max_ms,
+        quarters_p99_ms=tuple(
+            Spread.of(part.tolist()).p99_ms for part in np.array_split([o.seconds for o in under_attack], 4)
+        ),
         served_p99_ms=round(1e3 * quantile(served, 0.99), 1),
         quiet_p99_ms=Spread.of([one.seconds for one in quiet]).p99_ms,
         failed=sum(not one.good for one in under_attack),

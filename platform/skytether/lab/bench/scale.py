@@ -59,6 +59,7 @@ class ScaleRow:
         pass_ms: The longest pass over the site that looks at all of them [ms].
         pass_us_each: The same for each instance [us].
         placer_ms: The longest pass of the placer [ms].
+        placer_us_each: The same for each instance [us].
         cpu: Cores that the orchestrator kept busy with nobody asking.
         memory_mb: Of the orchestrator, resident [MiB].
         calls_per_s: Of the API server, with nobody asking.
@@ -74,6 +75,7 @@ class ScaleRow:
     pass_ms: float
     pass_us_each: float
     placer_ms: float
+    placer_us_each: float
     cpu: float
     memory_mb: float
     calls_per_s: float
@@ -206,13 +208,14 @@ class _Bench:
         self._say(f"{instances} instances run, some robots ask")
         cold = self._wait_for(_SERVICE)
         warm = self._warm()
-        pass_ms = max(passes[f"site-{_SITE}"])
+        pass_ms, placer_ms = max(passes[f"site-{_SITE}"]), max(passes["placer"])
         return ScaleRow(
             instances=instances,
             started_per_s=round(asked, 1),
             pass_ms=round(pass_ms, 1),
             pass_us_each=round(1e3 * pass_ms / instances, 1),
-            placer_ms=round(max(passes["placer"]), 1),
+            placer_ms=round(placer_ms, 1),
+            placer_us_each=round(1e3 * placer_ms / instances, 1),
             cpu=round(cpu, 3),
             memory_mb=round(memory, 1),
             calls_per_s=round((_sum(after) - _sum(before)) / self._idle_s, 1),
