@@ -6,6 +6,7 @@ import pytest
 from docker_site import Images
 
 from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.pods import kubectl
 from skytether.lab.bench.start import bench_start
 
 
@@ -14,7 +15,7 @@ def docker(*arguments: str) -> list[str]:
 
 
 def test_a_runtime_that_is_none_is_refused():
-    with pytest.raises(BenchError, match="no runtime 'dokker' to measure; there are process, docker"):
+    with pytest.raises(BenchError, match="no runtime 'dokker' to measure; there are process, docker, kubernetes"):
         bench_start(1, ["dokker"])
 
 
@@ -40,3 +41,17 @@ def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_l
     assert owner.startswith("bench-")
     assert docker("network", "ls", "-q", "--filter", f"name={owner}") == []
     assert docker("volume", "ls", "-q", "--filter", f"name={owner}") == []
+
+
+@pytest.mark.slow
+@pytest.mark.docker
+@pytest.mark.kubernetes
+def test_pods_are_started_cold_and_warm_and_their_namespace_goes(
+    docker_images: Images, kubeconfig: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("KUBECONFIG", kubeconfig)
+    rows = bench_start(1, ["kubernetes"], docker_images.prefix)
+    assert [(row.runtime, row.standby, row.n) for row in rows] == [("kubernetes", 0, 1), ("kubernetes", 1, 1)]
+    assert all(0 < row.p50_s == row.p99_s for row in rows)
+    said = kubectl(kubeconfig, "get", "namespaces", "--no-headers").splitlines()
+    assert all("Terminating" in line for line in said if line.startswith("skytether-bench-"))

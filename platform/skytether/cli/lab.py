@@ -81,7 +81,7 @@ def handover(
 def start(
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Starts to measure.")] = 20,
     runtime: Annotated[
-        list[str] | None, typer.Option(help="process or docker; may be repeated. Default: process.")
+        list[str] | None, typer.Option(help="process, docker or kubernetes; may be repeated. Default: process.")
     ] = None,
     service: Annotated[str, typer.Option(help="virtual-trail, or navigation (extra `lab`).")] = "virtual-trail",
     prefix: Annotated[str, typer.Option(help="Of the images' names.")] = "skytether/",
@@ -96,6 +96,8 @@ def start(
 
     With docker, the images must be there (`make images`), and `docker run` of the same image is timed in turn, until
     its service listens; each after three seconds of rest.
+
+    With kubernetes, the nodes of the cluster of KUBECONFIG have the images; pods are in a namespace that is removed.
     """
     from rich.table import Table
 

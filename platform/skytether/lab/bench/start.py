@@ -13,6 +13,7 @@ from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, State
 from skytether.lab.bench.containers import docker_run, docker_site
 from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.pods import kubernetes_site
 from skytether.lab.bench.start_robots import ROBOTS, Asking, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.robot.agent import Agent, AgentConfig
@@ -62,8 +63,8 @@ def bench_start(
 
     Args:
         n: Starts of each kind.
-        runtimes: ``process``, ``docker``. Beside the latter, in turn with it, ``docker run`` of the same image is timed
-            until its service listens: no robot, no orchestrator, no limits.
+        runtimes: ``process``, ``docker``, ``kubernetes``. Beside ``docker``, in turn, ``docker run`` of the same
+            image is timed until its service listens: no robot, no orchestrator, no limits.
         prefix: Of the images' names.
         on_start: Called with the row and the time of each start [s].
         service: One of `ROBOTS`.
@@ -111,15 +112,25 @@ def _docker(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Star
                 yield "docker run", 0, docker_run(image), math.nan
 
 
-_STARTS = {"process": _process, "docker": _docker}
+def _kubernetes(service: str, asking: Asking, n: int, prefix: str) -> Iterator[_Start]:
+    with (
+        EmbeddedOrchestrator() as orchestrator,
+        kubernetes_site(orchestrator, prefix, service),
+        Client(orchestrator.url, orchestrator.operator_token) as operator,
+    ):
+        for standby, took, moving in _starts(operator, orchestrator.url, service, asking, n, _REST_S, bind="0.0.0.0"):  # noqa: S104 (its peer is a node)
+            yield "kubernetes", standby, took, moving
+
+
+_STARTS = {"process": _process, "docker": _docker, "kubernetes": _kubernetes}
 
 
 def _starts(
-    operator: Client, url: str, service: str, asking: Asking, n: int, rest_s: float = 0.0
+    operator: Client, url: str, service: str, asking: Asking, n: int, rest_s: float = 0.0, bind: str = "127.0.0.1"
 ) -> Iterator[tuple[int, float, float]]:
     """Cold starts, each after a rest, then as many with an instance kept warm."""
     token = operator.create_robot(RobotCreate(name=ROBOT, services=(service,))).token
-    config = AgentConfig(ROBOT, url, service, token, params=asking.params, bind=("127.0.0.1", 0))
+    config = AgentConfig(ROBOT, url, service, token, params=asking.params, bind=(bind, 0))
     for standby in (0, 1):
         manifest = operator.get_service(service)
         needs = manifest.spec.needs.model_copy(update={"standby": standby})
