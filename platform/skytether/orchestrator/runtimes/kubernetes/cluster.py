@@ -58,7 +58,11 @@ Document = Mapping[str, Any]
 
 
 class ClusterGoneError(SiteSilentError):
-    """The API server does not answer."""
+    """The API server does not answer, or says that it cannot at present."""
+
+
+class ClusterSilentError(ClusterGoneError):
+    """It does not answer at all."""
 
 
 class RefusedError(RuntimeFailure):
@@ -202,7 +206,7 @@ class Cluster:
             yield answer
             ended = True
         except (urllib3.exceptions.HTTPError, OSError) as error:
-            raise ClusterGoneError(self._silent(error)) from error
+            raise ClusterSilentError(self._silent(error)) from error
         finally:
             # What was not read to its end cannot be used again.
             answer.release_conn() if ended and answer.isclosed() else answer.close()
@@ -237,7 +241,7 @@ class Cluster:
             try:
                 answer: urllib3.HTTPResponse = used.call_api(*request, _request_timeout=timeout).response
             except (client.ApiException, urllib3.exceptions.HTTPError, OSError) as error:
-                raise ClusterGoneError(self._silent(error)) from error
+                raise ClusterSilentError(self._silent(error)) from error
             wanted = answer.headers.get("Retry-After", "")
             wait_s = float(wanted) if wanted.isdecimal() else _AGAIN_S
             if answer.status != HTTPStatus.TOO_MANY_REQUESTS or time.monotonic() + wait_s > patient_until:

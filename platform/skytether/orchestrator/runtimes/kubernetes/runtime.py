@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from ..base import (
 from ..containers import USER, kept_owner, with_owner
 from ..egress import resolve
 from .budget import Budget
-from .cluster import Cluster, RefusedError
+from .cluster import Cluster, ClusterSilentError, RefusedError
 from .fence import Fence
 from .logs import PodLog
 from .nodes import Nodes
@@ -140,7 +140,17 @@ class KubernetesRuntime(Runtime):
         self._remove_unbegun(0.0)
 
     def _must_lead(self) -> None:
-        self._fence.must_lead()
+        with self._doubting():
+            self._fence.must_lead()
+
+    @contextmanager
+    def _doubting(self) -> Iterator[None]:
+        """Around a call: if the API server is silent, the next look says so."""
+        try:
+            yield
+        except ClusterSilentError as error:
+            self._watch.doubt(error)
+            raise
 
     def start(self, launch: Launch) -> None:
         there = self._watch.of(launch.instance, self._options.timeout_s)
@@ -386,7 +396,8 @@ class KubernetesRuntime(Runtime):
     def tidy(self) -> None:
         """End what will never run, or runs beside a later run, and remove what was begun by halves."""
         if self._fence.epoch:
-            self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
+            with self._doubting():
+                self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
         there = self._watch.seen(self._options.timeout_s)
         latest: dict[str, int] = {}
         for seen in there:

@@ -72,6 +72,13 @@ class Watch:
             cut(answer)
         self._thread.join(5.0)
 
+    def doubt(self, error: RuntimeFailure) -> None:
+        """A call found the API server silent, of which a watch may tell nothing for long: so it is until it answers."""
+        self._fail(error)
+        answer = self._answer
+        if answer is not None:
+            cut(answer)
+
     def seen(self, timeout_s: float) -> list[Seen]:
         """All pods of ours; waits for the first list only, ``timeout_s`` [s] at most.
 
@@ -149,7 +156,7 @@ class Watch:
             try:
                 version = self._list()
                 until = time.monotonic() + _LIST_S
-                while version and not self._closing.is_set() and time.monotonic() < until:
+                while version and self._failure is None and not self._closing.is_set() and time.monotonic() < until:
                     version = self._watch(version)
             except RuntimeFailure as error:
                 self._fail(error)
