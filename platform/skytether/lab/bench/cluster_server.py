@@ -145,23 +145,24 @@ class MadeUpCluster:
                     pod["status"] = _ended() if pod["spec"].get("activeDeadlineSeconds") else _running()
                     self._changed("pods", pod, "MODIFIED")
 
-    async def follow(self, until: float) -> AsyncIterator[bytes]:
-        """What changes from now on, line by line, with a bookmark now and then."""
+    async def follow(self, kind: str, until: float) -> AsyncIterator[bytes]:
+        """What changes from now on, line by line, with a bookmark now and then; of anything but pods nothing does."""
         queue: asyncio.Queue[bytes | None] = asyncio.Queue()
-        self._watchers.append(queue)
+        watchers = self._watchers if kind == "pods" else []
+        watchers.append(queue)
         try:
             while (left := until - self._clock()) > 0:
                 try:
                     line = await asyncio.wait_for(queue.get(), min(left, _BOOKMARK_S))
                 except TimeoutError:
                     meta = {"resourceVersion": self.version, "creationTimestamp": None}
-                    yield json.dumps({"type": "BOOKMARK", "object": {"kind": "Pod", "metadata": meta}}).encode() + b"\n"
+                    yield json.dumps({"type": "BOOKMARK", "object": {"metadata": meta}}).encode() + b"\n"
                     continue
                 if line is None:
                     return
                 yield line
         finally:
-            self._watchers.remove(queue)
+            watchers.remove(queue)
 
 
 def _now() -> str:
@@ -251,12 +252,12 @@ class Answers:
         return _said(404, "NotFound", f'{kind} "{name}" not found') if found is None else JSONResponse(found)
 
     def _all(self, kind: str, request: Request) -> Response:
-        if kind == "nodes":
-            return JSONResponse({"items": [_node(n) for n in range(_NODES)], "metadata": {"resourceVersion": "1"}})
         asked = request.query_params
         if asked.get("watch"):
             until = time.monotonic() + float(asked.get("timeoutSeconds", "300"))
-            return StreamingResponse(self._cluster.follow(until), media_type="application/json")
+            return StreamingResponse(self._cluster.follow(kind, until), media_type="application/json")
+        if kind == "nodes":
+            return JSONResponse({"items": [_node(n) for n in range(_NODES)], "metadata": {"resourceVersion": "1"}})
         wanted = dict(part.split("=", 1) for part in asked.get("labelSelector", "").split(",") if part)
         found = [one for one in self._cluster.of(kind).values() if wanted.items() <= one["metadata"]["labels"].items()]
         first, most = int(asked.get("continue", "0")), int(asked.get("limit", "0")) or len(found)

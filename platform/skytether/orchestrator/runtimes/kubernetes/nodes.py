@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Any
@@ -149,7 +150,9 @@ class Nodes:
             try:
                 version = self._list()
                 while version and not self._closing.is_set():
+                    began = time.monotonic()
                     version = self._watch(version)
+                    self._closing.wait(began + _AGAIN_S - time.monotonic())  # a watch that ends at once is no watch
                 wait = 0.0
             except RefusedError as error:
                 wait = _FORBIDDEN_S

@@ -157,7 +157,9 @@ class Watch:
                 version = self._list()
                 until = time.monotonic() + _LIST_S
                 while version and self._failure is None and not self._closing.is_set() and time.monotonic() < until:
+                    began = time.monotonic()
                     version = self._watch(version)
+                    self._closing.wait(began + _AGAIN_S - time.monotonic())  # a watch that ends at once is no watch
             except RuntimeFailure as error:
                 self._fail(error)
             except Exception as error:
