@@ -72,6 +72,13 @@ def test_a_start_that_takes_too_long_is_a_crash(new_record: NewRecord) -> None:
     assert decide(record, STARTING, NOW, T) == Crash(record, "was not ready within 30 s")
 
 
+def test_one_of_which_nothing_ran_meanwhile_says_what_it_waited_for_and_may_go_elsewhere(new_record: NewRecord) -> None:
+    waits = "no node takes it: 0/1 nodes are available: 1 Insufficient cpu."
+    record = at_site(new_record, State.STARTING, started_at=NOW - 30.1, reason=waits)
+    waiting = Observation(record.attempt, Phase.STARTING, detail=waits, unstarted=True)
+    assert decide(record, waiting, NOW, T) == Crash(record, f"was not ready within 30 s: {waits}", unstarted=True)
+
+
 def test_a_service_that_does_not_like_its_grant_is_not_tried_again(new_record: NewRecord) -> None:
     record = at_site(new_record, State.STARTING, started_at=NOW)
     action = decide(record, seen(Phase.EXITED, exit_status=2, last_line="mass: must be above 0"), NOW, T)
