@@ -21,6 +21,8 @@ def test_each_level_is_measured_and_a_crowd_is_placed(tmp_path: Path):
         assert row.memory_mb > 10
         assert row.calls_per_s > 0, "services are asked for their reports"
         assert row.calls_per_s < 400
+        assert 0 < row.renew_p50_ms <= row.renew_p99_ms
+        assert row.renew_cpu_ms > 0
         assert 0.2 * 0.8 < row.cold_p50_s <= row.cold_p99_s < 30
         assert 0 < row.warm_p50_s <= row.warm_p99_s < 30
     assert found.placements_per_s > 0

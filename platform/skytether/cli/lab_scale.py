@@ -55,7 +55,18 @@ def scale(
         print_json(found.document())
         return
     table = Table("instances", title="An orchestrator and a cluster that is made up")
-    for heading in ("pass [ms]", "each [us]", "placer [ms]", "cores", "MiB", "calls/s", "most", "cold [s]", "warm [s]"):
+    for heading in (
+        "pass [ms]",
+        "each [us]",
+        "placer [ms]",
+        "cores",
+        "MiB",
+        "calls/s",
+        "most",
+        "renew [ms]",
+        "cold [s]",
+        "warm [s]",
+    ):
         table.add_column(heading, justify="right")
     for row in found.rows:
         table.add_row(
@@ -67,6 +78,7 @@ def scale(
             f"{row.memory_mb:.0f}",
             f"{row.calls_per_s:.0f}",
             f"{row.most_calls_per_s}",
+            f"{row.renew_p50_ms:.0f} / {row.renew_p99_ms:.0f}",
             f"{row.cold_p50_s:.2f} / {row.cold_p99_s:.2f}",
             f"{row.warm_p50_s:.2f} / {row.warm_p99_s:.2f}",
         )

@@ -33,8 +33,9 @@ from skytether.lab.embedded import EmbeddedOrchestrator
 
 from .api import passes_in
 from .observe import Spread, cpu_seconds
+from .open_loop import ask_openly
 from .pair import BenchError
-from .requests import sleeper
+from .requests import Held, renewal, sleeper
 
 _SERVICE, _WARM = "sleeper", "warm-sleeper"
 _IMAGE = "registry.invalid/sleeper:1"
@@ -42,6 +43,7 @@ _SITE = "fleet"
 _LEASE_S = 3600.0
 _ASKERS = 4
 _ASK_HZ = 4.0
+_RENEW_HZ = 100.0
 _LIMIT_S = 1200.0
 _LOOK_S = 0.25
 _SEED = 16
@@ -64,6 +66,10 @@ class ScaleRow:
         memory_mb: Of the orchestrator, resident [MiB].
         calls_per_s: Of the API server, with nobody asking.
         most_calls_per_s: In any second so far.
+        renewals_per_s: That robots made for a while, with full reports, at random times.
+        renew_p50_ms: Median time until they were answered [ms].
+        renew_p99_ms: Its 99th percentile.
+        renew_cpu_ms: Of a processor for each, at the orchestrators, with what they do anyway taken away [ms].
         cold_p50_s: From a robot's request until its new instance runs, median [s]; the cluster takes a second of that.
         cold_p99_s: Its 99th percentile.
         warm_p50_s: The same where an instance is kept warm.
@@ -80,6 +86,10 @@ class ScaleRow:
     memory_mb: float
     calls_per_s: float
     most_calls_per_s: int
+    renewals_per_s: float
+    renew_p50_ms: float
+    renew_p99_ms: float
+    renew_cpu_ms: float
     cold_p50_s: float
     cold_p99_s: float
     warm_p50_s: float
@@ -174,7 +184,8 @@ class _Bench:
         self._idle_s, self._asking = idle_s, asking
         self._orchestrators, self._clients, self._token, self._address = orchestrators, clients, token, address
         self._say = on_progress
-        self._robots = self._held = 0
+        self._robots = 0
+        self._held: list[str] = []
         self._rng = np.random.default_rng(_SEED)
 
     @cached_property
@@ -205,6 +216,10 @@ class _Bench:
         if not passes.get(f"site-{_SITE}") or not passes.get("placer"):
             raise BenchError("the reconciler made no pass")
         memory = psutil.Process(leader.pid).memory_info().rss / 2**20
+        self._say(f"{instances} instances run, robots renew")
+        busy = self._cpu()
+        renewals = self._renew()
+        renew_cpu = self._cpu() - busy - cpu * self._idle_s
         self._say(f"{instances} instances run, some robots ask")
         cold = self._wait_for(_SERVICE)
         warm = self._warm()
@@ -220,6 +235,10 @@ class _Bench:
             memory_mb=round(memory, 1),
             calls_per_s=round((_sum(after) - _sum(before)) / self._idle_s, 1),
             most_calls_per_s=max(before["most_in_a_second"], after["most_in_a_second"]),
+            renewals_per_s=_RENEW_HZ,
+            renew_p50_ms=renewals.p50_ms,
+            renew_p99_ms=renewals.p99_ms,
+            renew_cpu_ms=round(1e3 * renew_cpu / renewals.n, 2),
             cold_p50_s=round(cold.p50_ms / 1e3, 3),
             cold_p99_s=round(cold.p99_ms / 1e3, 3),
             warm_p50_s=round(warm.p50_ms / 1e3, 3),
@@ -231,35 +250,42 @@ class _Bench:
         self._robots += count
         return names
 
-    def _ask(self, names: Sequence[str], service: str = _SERVICE) -> None:
+    def _renew(self) -> Spread:
+        """How long renewals take that come at random times, from all robots in turn, asked of who leads."""
+        turns = itertools.cycle(self._held)
+        url = self._orchestrators[self._leads].url
+        asked = ask_openly(url, lambda: renewal(Held("", self._token, next(turns))), _RENEW_HZ, self._idle_s, self._rng)
+        if failed := sum(not one.good for one in asked):
+            raise BenchError(f"{failed} of {len(asked)} renewals got no good answer")
+        return Spread.of([one.seconds for one in asked])
+
+    def _ask(self, names: Sequence[str], service: str = _SERVICE) -> list[str]:
         """Each robot for an instance, as fast as they are answered."""
         turns = itertools.cycle(self._clients)
 
-        def ask(name: str) -> None:
+        def ask(name: str) -> str:
             client = next(turns)
             client.create_robot(RobotCreate(name=name))
-            client.create_instance(_request(name, service))
+            return client.create_instance(_request(name, service)).id
 
         with ThreadPoolExecutor(_ASKERS) as pool:
-            for _ in pool.map(ask, names):
-                pass
+            return list(pool.map(ask, names))
 
     def _fill(self, instances: int) -> float:
         """Instances that became ready in a second."""
         before = self._count(_SERVICE, "total")
-        missing = instances - self._held
+        missing = instances - len(self._held)
         if missing <= 0:
             return 0.0
         began = time.monotonic()
         with ThreadPoolExecutor(1) as pool:
             asking = pool.submit(self._ask, self._names(missing))
             while (up := self._count(_SERVICE, "total") - before) < missing:
-                self._say(f"{self._held + up} of {instances} instances run")
+                self._say(f"{len(self._held) + up} of {instances} instances run")
                 if time.monotonic() - began > _LIMIT_S:
                     raise BenchError(f"only {up} of {instances} instances ran within {_LIMIT_S:.0f} s")
                 time.sleep(_LOOK_S + missing / 2000)
-            asking.result()
-        self._held = instances
+            self._held += asking.result()
         return missing / (time.monotonic() - began)
 
     def _count(self, service: str, phase: str) -> int:
