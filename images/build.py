@@ -7,6 +7,7 @@ package index. Debian's own packages come from its archive, within the build.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import hashlib
 import io
 import json
@@ -448,6 +449,9 @@ def main() -> int:
     WORK.mkdir(parents=True, exist_ok=True)
     try:
         with ExitStack() as stack:
+            # Another run in this clone would take away the wheels that this one packs: it waits for its turn.
+            turn = stack.enter_context((WORK / ".lock").open("w"))
+            fcntl.flock(turn, fcntl.LOCK_EX)
             client = docker.from_env(timeout=_FETCH_TIMEOUT)
             stack.callback(client.close)
             pusher = None
