@@ -1,3 +1,5 @@
+import socket
+
 import pytest
 
 from skytether.bridge.echo import (
@@ -12,6 +14,7 @@ from skytether.bridge.echo import (
     EchoServer,
     answer,
     read_answer,
+    was_answered,
 )
 
 NONCE = b"12345678"
@@ -79,6 +82,28 @@ def test_a_doctor_is_answered_all_that_it_asks():
 
 def test_a_flooded_echo_counts_what_it_does_not_answer():
     with EchoServer("127.0.0.1", 0) as server, EchoClient(*server.address) as client:
-        for _ in range(30):
+        for _ in range(100):
             client.ask(0.02, LARGEST)
         assert server.refused
+
+
+def test_questions_in_a_robots_name_use_up_nothing_of_what_it_has():
+    with EchoServer("127.0.0.1", 0) as server, EchoClient(*server.address) as client:
+        assert client.ask(10.0) is not None
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.connect(server.address)
+            while not server.refused:  # of this address, where others ask, too
+                stranger.send(question(LARGEST))
+            for number in range(20):
+                stranger.send(question(LARGEST))
+                assert client.ask(10.0, 1200) is not None, f"question {number} is not answered"
+        assert client.ask(10.0) is not None
+
+
+def test_a_cookie_is_good_for_the_address_that_got_it():
+    mine = answer(question(), ("10.1.2.3", 4242), b"key")
+    asked = question()[:16] + mine[34:42] + question()[24:]
+    assert was_answered(asked, mine)
+    assert not was_answered(asked, answer(asked, ("10.1.2.4", 4242), b"key"))
+    assert not was_answered(asked, answer(asked, ("10.1.2.3", 4242), b"another"))
+    assert not was_answered(question(), mine)

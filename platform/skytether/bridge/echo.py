@@ -1,14 +1,18 @@
 """A UDP echo: where a robot measures round trip, loss and packet size towards a machine, and learns how it is seen.
 
-Datagrams only, no session: ``SKYECHO?``, 8 bytes that the asker chose, padding; the answer is ``SKYECHO!``, the same
-8 bytes, the address and port that the question came from (16 bytes of IPv6, IPv4 mapped into it; 2 bytes), and padding
-to the size of the question. An answer is never longer than its question, so the echo amplifies nothing; and an address
-gets so little each second that nobody is flooded by answers to questions that another sent in his name.
+Datagrams only, no session: ``SKYECHO?``, 8 bytes that the asker chose, 8 bytes of the answer before (zeros: there was
+none), padding; the answer is ``SKYECHO!``, the same 8 bytes, the address and port that the question came from (16 bytes
+of IPv6, IPv4 mapped into it; 2 bytes), 8 bytes for the next question, and padding to the size of the question. An
+answer is never longer than its question, so the echo amplifies nothing; and an address gets so little each second that
+nobody is flooded by answers to questions that another sent in his name. Whoever has had an answer, as those 8 bytes
+show, has an allowance apart, which no such questions use up.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import hmac
 import ipaddress
 import os
 import socket
@@ -29,12 +33,17 @@ LARGEST = 9000
 ADDRESS_RATE, ADDRESS_BURST = 32_000, 128_000
 """Bytes a second, and at once, to one address: several times what `skytether doctor` and a probing robot ask for."""
 RATE = 4_000_000
-"""The same to all together."""
+"""The same to all together that have had an answer, and to all others."""
 ADDRESSES = 4096
 """Addresses remembered."""
 _ASK, _ANSWER = b"SKYECHO?", b"SKYECHO!"
-_BODY = struct.Struct(">8s8s16sH")
+_BODY = struct.Struct(">8s8s16sH8s")
 _NONCE = 8
+_COOKIE = 8
+_ASKED = slice(len(_ASK) + _NONCE, len(_ASK) + _NONCE + _COOKIE)
+"""Where a question has its cookie."""
+_SAID = slice(_BODY.size - _COOKIE, _BODY.size)
+"""Where an answer has it."""
 _IPV4 = b"\0" * 10 + b"\xff\xff"
 
 
@@ -51,8 +60,8 @@ class Echo:
     seen_as: tuple[str, int]
 
 
-def answer(question: bytes, source: tuple[str, int]) -> bytes | None:
-    """What the echo says to a datagram; None: nothing."""
+def answer(question: bytes, source: tuple[str, int], key: bytes = b"") -> bytes | None:
+    """What the echo says to a datagram; None: nothing. ``key``: of its cookies."""
     if not SMALLEST <= len(question) <= LARGEST or not question.startswith(_ASK):
         return None
     try:
@@ -61,14 +70,20 @@ def answer(question: bytes, source: tuple[str, int]) -> bytes | None:
         return None
     packed = address.packed if address.version == 6 else _IPV4 + address.packed
     nonce = question[len(_ASK) : len(_ASK) + _NONCE]
-    return _BODY.pack(_ANSWER, nonce, packed, source[1]).ljust(len(question), b"\0")
+    cookie = hashlib.blake2s(packed, key=key, digest_size=_COOKIE).digest()
+    return _BODY.pack(_ANSWER, nonce, packed, source[1], cookie).ljust(len(question), b"\0")
+
+
+def was_answered(question: bytes, said: bytes) -> bool:
+    """Whether who asks has had an answer at this address before: nobody else can know its cookie."""
+    return hmac.compare_digest(question[_ASKED], said[_SAID])
 
 
 def read_answer(data: bytes, nonce: bytes) -> tuple[str, int] | None:
     """The address that an answer tells; None if it is no answer to this question."""
     if len(data) < _BODY.size:
         return None
-    kind, echoed, packed, port = _BODY.unpack_from(data)
+    kind, echoed, packed, port, _ = _BODY.unpack_from(data)
     if kind != _ANSWER or echoed != nonce:
         return None
     address = ipaddress.IPv6Address(packed)
@@ -117,7 +132,8 @@ class EchoServer:
 
     def _run(self) -> None:
         self._socket.settimeout(0.2)
-        allowance = Allowance(time.monotonic())
+        key = os.urandom(32)
+        strangers, known = Allowance(time.monotonic()), Allowance(time.monotonic())
         while not self._closing:
             try:
                 question, source = self._socket.recvfrom(LARGEST + 1)
@@ -125,9 +141,10 @@ class EchoServer:
                 continue
             except OSError:  # an ICMP answer to something sent before
                 continue
-            said = answer(question, source[:2])
+            said = answer(question, source[:2], key)
             if said is None:
                 continue
+            allowance = known if was_answered(question, said) else strangers
             if allowance.take(said, time.monotonic()):
                 with contextlib.suppress(OSError):  # larger than the way back takes: silence says so
                     self._socket.sendto(said, source)
@@ -160,6 +177,7 @@ class EchoClient:
         """
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         self._peer: Any = address
+        self._cookie = bytes(_COOKIE)
         self._socket = socket.socket(family, kind, protocol)
         _never_fragment(self._socket)
 
@@ -176,11 +194,13 @@ class EchoClient:
         nonce = os.urandom(_NONCE)
         began = time.monotonic()
         try:
-            self._socket.sendto((_ASK + nonce).ljust(size, b"\0"), self._peer)
+            self._socket.sendto((_ASK + nonce + self._cookie).ljust(size, b"\0"), self._peer)
             while (left := began + timeout - time.monotonic()) > 0:
                 self._socket.settimeout(left)
-                seen = read_answer(self._socket.recv(LARGEST), nonce)
+                data = self._socket.recv(LARGEST)
+                seen = read_answer(data, nonce)
                 if seen is not None:
+                    self._cookie = data[_SAID]
                     return Echo(time.monotonic() - began, seen)
         except OSError:  # a time-out, no route, nobody there, or "message too long"
             return None
