@@ -269,6 +269,11 @@ def test_the_notes_tell_the_next_command() -> None:
     assert f"under {script().metadata()['version']}" in files({}, upgrade=True)["NOTES.txt"]
 
 
+def test_the_notes_say_what_an_old_cluster_does_not_know() -> None:
+    assert "orchestrator.service.loadBalancerClass is left out" in files(SETS["tls"], OLDEST)["NOTES.txt"]
+    assert "is left out" not in files(SETS["tls"], NEWEST)["NOTES.txt"]
+
+
 @pytest.mark.parametrize(
     ("values", "says"),
     [

@@ -70,19 +70,7 @@ class House:
         """Be its robot until it has sent a velocity: somebody leans on the walker. Where it was reached."""
         session = self.core.instances.show(self.core.instances.get(OPERATOR, instance)).session
         assert session is not None
-        assert session.host is not None
-        assert session.port is not None
-        key = self.core.instances.claim_session(OPERATOR, instance, "0123456789abcdef").key
-        robot = Robot()
-        spec = SessionSpec.from_api(Role.ROBOT, session.id, key, session.topics)
-        with Bridge(spec, robot, bind=("0.0.0.0", 0), peer=(session.host, session.port)) as bridge:
-            deadline = time.monotonic() + PATIENCE
-            while not robot.heard.wait(0.02):
-                assert time.monotonic() < deadline
-                header = Header(Time.from_seconds(time.time()), "base_link")
-                bridge.publish("force", encode(WrenchStamped(header, Wrench(force=Vector3(x=24.0)))))
-                bridge.publish("wheels", encode(JointState(header, ("left_wheel", "right_wheel"), [0.0, 0.0])))
-                bridge.publish("odom", encode(Odometry(header)))
+        be_driven(session, self.core.instances.claim_session(OPERATOR, instance, "0123456789abcdef").key)
         return session
 
     def until(self, instance: str, state: State, good: Callable[[Record], bool] = lambda _: True) -> Record:
@@ -93,6 +81,22 @@ class House:
                 return record
             assert time.monotonic() < deadline, f"{record.state}: {record.reason}"
             time.sleep(0.02)
+
+
+def be_driven(session: Session, key: str) -> None:
+    """Be the robot of a session of ``virtual-trail`` until a velocity has come: somebody leans on the walker."""
+    assert session.host is not None
+    assert session.port is not None
+    robot = Robot()
+    spec = SessionSpec.from_api(Role.ROBOT, session.id, key, session.topics)
+    with Bridge(spec, robot, bind=("0.0.0.0", 0), peer=(session.host, session.port)) as bridge:
+        deadline = time.monotonic() + PATIENCE
+        while not robot.heard.wait(0.02):
+            assert time.monotonic() < deadline
+            header = Header(Time.from_seconds(time.time()), "base_link")
+            bridge.publish("force", encode(WrenchStamped(header, Wrench(force=Vector3(x=24.0)))))
+            bridge.publish("wheels", encode(JointState(header, ("left_wheel", "right_wheel"), [0.0, 0.0])))
+            bridge.publish("odom", encode(Odometry(header)))
 
 
 class Robot:

@@ -198,8 +198,8 @@ externalTrafficPolicy: {{ . }}
 {{- end }}
 {{- end }}
 {{- if eq .service.type "LoadBalancer" }}
-{{- with .service.loadBalancerClass }}
-loadBalancerClass: {{ . }}
+{{- if and .service.loadBalancerClass (semverCompare ">=1.24-0" .root.Capabilities.KubeVersion.Version) }}
+loadBalancerClass: {{ .service.loadBalancerClass }}
 {{- end }}
 {{- with .service.loadBalancerSourceRanges }}
 loadBalancerSourceRanges:
@@ -258,6 +258,11 @@ config.proxies is empty: behind an ingress or a gateway all robots are one addre
 {{- end }}
 {{- if and (ne .Values.orchestrator.service.type "ClusterIP") (not .Values.orchestrator.tlsSecret) }}
 orchestrator.service.type is {{ .Values.orchestrator.service.type }} without orchestrator.tlsSecret: tokens and keys of sessions can be read on the way.
+{{- end }}
+{{- range $component := list "orchestrator" "relay" "echo" }}
+{{- if and (index $.Values $component "service" "loadBalancerClass") (semverCompare "<1.24-0" $.Capabilities.KubeVersion.Version) }}
+{{ $component }}.service.loadBalancerClass is left out: this cluster is older than Kubernetes 1.24, which begins to know it.
+{{- end }}
 {{- end }}
 {{- if .Values.config.open_metrics }}
 config.open_metrics is true: whoever reaches the API reads what robots do.
