@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
+import re
+import subprocess
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,10 @@ from value_sets import CASES, SETS, UPSTREAM
 
 from skytether.api.rest import SiteCreate
 from skytether.cli.relay_config import RelayConfig
+from skytether.orchestrator.config import load
 from skytether.orchestrator.declared import read_sites, stored_as
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
-from skytether.orchestrator.security import new_token
+from skytether.orchestrator.security import Secrets, new_token
 from skytether.orchestrator.settings import Settings
 
 _OTHERS = ("monitoring.coreos.com", "gateway.networking.k8s.io")
@@ -226,6 +229,35 @@ def test_secrets_are_made_of_256_random_bits_and_never_the_same() -> None:
         for name in ("operator.token", "metrics.token"):
             assert len(one[name].strip()) == len(new_token())
             assert one[name].startswith("sky-")
+
+
+def test_a_pods_own_copies_of_secrets_are_its_own_alone_and_the_database_is_whatever_its_secret_says(
+    tmp_path: Path,
+) -> None:
+    """The script that runs before the orchestrator, with the folders that it is given in its pod."""
+    found = rendered("postgres")
+    box = at(found["Deployment/orchestrator"], "spec template spec initContainers secrets")
+    address = "postgresql://sky:it's:#\"50%25@db/sky?sslmode=require"
+    given = {
+        "from/secrets/secret.key": "k" * 64,
+        "from/secrets/operator.token": new_token(),
+        "from/secrets/metrics.token": new_token(),
+        "from/database": address,
+        "etc/skytether/orchestrator.yaml": found["ConfigMap/orchestrator"]["data"]["orchestrator.yaml"],
+    }
+    (tmp_path / "run/skytether").mkdir(parents=True)
+    for name, text in given.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    script = re.sub(r"(?<![\w/])/(from|etc|run)/", rf"{tmp_path}/\1/", box["args"][0])
+    for _ in range(2):  # a container may be started again
+        subprocess.run([*box["command"], script], check=True)
+    made = tmp_path / "run/skytether"
+    assert load(made / "orchestrator.yaml", {}, {}).database_url == address
+    assert made.joinpath("orchestrator.yaml").stat().st_mode & 0o777 == 0o600
+    held = Secrets(made / "secrets")
+    assert held.is_operator(given["from/secrets/operator.token"])
+    assert held.may_measure(given["from/secrets/metrics.token"])
 
 
 def test_nothing_secret_is_in_an_argument_or_a_variable() -> None:
