@@ -41,6 +41,29 @@ def test_a_request_becomes_a_running_instance(bench: Any, new_record: NewRecord)
     assert launch.grant.session_key not in repr(launch)
 
 
+def test_of_a_crowd_those_that_are_ready_do_not_wait_until_the_last_ones_are_started(
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench(SlowRuntime)
+    b.step()
+    start = b.runtime.start
+
+    def takes_a_second(launch: Any) -> None:
+        b.clock.forward(1.0)
+        start(launch)
+
+    monkeypatch.setattr(b.runtime, "start", takes_a_second)
+    names = [f"i{number}" for number in range(45)]
+    for name in names:
+        add(b, new_record(name, lease_expires_at=b.clock() + 1000.0))
+    b.reconciler.place_step()
+    for _ in range(60):
+        b.reconciler.site_step(b.site)
+    assert {(b.record(name).state, b.record(name).attempt) for name in names} == {(State.RUNNING, 1)}
+    waited = [(record := b.record(name)).running_at - record.started_at for name in names]
+    assert max(waited) <= 10, "they were looked at meanwhile"
+
+
 def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, new_record: NewRecord) -> None:
     b = bench(SlowRuntime)
     add(b, new_record())

@@ -49,6 +49,8 @@ _UNSETTLED = 2.0
 """Seconds after the clock was set in which another orchestrator may still date leases by what it was before."""
 _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
+_ACTING = 0.5
+"""Seconds for which a pass over a site acts, at most: of a crowd some are ready before the last ones are started."""
 _SHARE = 0.1
 """Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
 _PROMISES_AGE = 3.0
@@ -416,7 +418,7 @@ class Reconciler:
         actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
         if whole:
             site.pass_took = time.thread_time() - began
-        done = [action for action in actions if self._act(site, action)]
+        done = self._act_on(site, actions)
         if due:
             site.tidied_at = time.monotonic()
             try:
@@ -449,6 +451,16 @@ class Reconciler:
         """Those that have ended of what is at a site and not expected there; of some that is known already."""
         unknown = strangers - ended
         return frozenset(strangers & ended | (self._store.known(unknown) if unknown else set()))
+
+    def _act_on(self, site: Site, actions: Sequence[Action]) -> list[Action]:
+        """Those that were done; of very many the last ones wait for a pass that looks at the first ones again."""
+        until, done = self._steady() + _ACTING, []
+        for action in actions:
+            if self._act(site, action):
+                done.append(action)
+            if self._steady() >= until:
+                break
+        return done
 
     def _act(self, site: Site, action: Action) -> bool:
         """Do it; False: the next pass has to see what comes of it, or to try again."""

@@ -273,14 +273,14 @@ class _Bench:
 
     def _fill(self, instances: int) -> float:
         """Instances that became ready in a second."""
-        before = self._count(_SERVICE, "total")
+        before = self._count(_SERVICE, "starting")
         missing = instances - len(self._held)
         if missing <= 0:
             return 0.0
         began = time.monotonic()
         with ThreadPoolExecutor(1) as pool:
             asking = pool.submit(self._ask, self._names(missing))
-            while (up := self._count(_SERVICE, "total") - before) < missing:
+            while (up := self._count(_SERVICE, "starting") - before) < missing:
                 self._say(f"{len(self._held) + up} of {instances} instances run")
                 if time.monotonic() - began > _LIMIT_S:
                     raise BenchError(f"only {up} of {instances} instances ran within {_LIMIT_S:.0f} s")
