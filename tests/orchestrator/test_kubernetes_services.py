@@ -150,6 +150,20 @@ def test_one_that_somebody_removed_is_made_again_and_one_of_nobody_goes() -> Non
         scene.services.look({"i1"}, {"i1"})
 
 
+def test_one_of_an_instance_that_has_ended_goes_though_its_pods_stay_for_their_logs() -> None:
+    scene = Scene()
+    for instance in ("ended", "crashed"):
+        scene.services.make(instance)
+    scene.now += 60
+    scene.services.look({"ended", "crashed"}, set(), idle={"ended", "crashed"})
+    assert len(scene.cluster.there) == 2  # the next run of one that has crashed is reached as the one before
+    scene.now += 30
+    scene.services.look({"ended", "crashed"}, {"crashed"}, idle={"ended"})
+    scene.now += 30
+    scene.services.look({"ended", "crashed"}, {"crashed"}, idle={"ended"})
+    assert list(scene.cluster.there) == ["services/skytether-o1-crashed"]
+
+
 def test_one_that_is_being_removed_is_not_taken_for_the_next() -> None:
     scene = Scene()
     scene.services.make("i1")

@@ -319,15 +319,16 @@ class KubernetesRuntime(Runtime):
 
     def stop(self, instance: str, *, force: bool) -> None:
         there = self._watch.of(instance, self._options.timeout_s)
+        left = [seen for seen in there if not self._over(seen) and not (seen.stops and (seen.running or not force))]
+        if not left:
+            return  # it is asked again and again until all has ended: the API server is not
         self._must_lead()  # after the look: nothing of it was begun by a later leader
-        for seen in there:
-            if self._over(seen) or (seen.stops and not force):
-                continue
-            if not seen.running:
+        for seen in left:
+            if seen.running:
+                self._end(seen)
+            else:
                 self._delete(seen)
                 self._leave(seen, "was stopped before it ran")
-            elif not seen.stops:
-                self._end(seen)
 
     def _leave(self, seen: Seen, detail: str, *, unstarted: bool = False) -> None:
         """Remember how a run ended of which nothing is left."""
@@ -422,7 +423,8 @@ class KubernetesRuntime(Runtime):
         """Those to which no load balancer passes on."""
         up = [seen for seen in there if seen.running and seen.started and not seen.stops and not self._over(seen)]
         ready = {seen.instance: seen for seen in up}
-        for instance in self._services.look({seen.instance for seen in there}, ready):
+        all_, live = {seen.instance for seen in there}, {seen.instance for seen in there if not self._over(seen)}
+        for instance in self._services.look(all_, ready, all_ - live):
             self._must_lead()
             self._delete(ready[instance])
             within = f"{self._options.load_balancer_timeout_s:g} s"

@@ -42,6 +42,8 @@ class Services:
         """Of load balancers, by instance."""
         self._waits_since: dict[str, float] = {}
         """Instances whose pod is ready and whose load balancer has given no address, by the clock [s]."""
+        self._idle_since: dict[str, float] = {}
+        """Instances of which nothing runs, by the clock [s]."""
 
     def make(self, instance: str) -> int | None:
         """Have the instance's Service, as it was made before or anew; its port of the nodes, None: it has none.
@@ -72,12 +74,14 @@ class Services:
             f"'kubectl -n {self._cluster.namespace} describe service {service_name(self._owner, instance)}' says why"
         )
 
-    def look(self, there: Collection[str], ready: Collection[str]) -> list[str]:
+    def look(self, there: Collection[str], ready: Collection[str], idle: Collection[str] = ()) -> list[str]:
         """See which addresses were given, remove what is left of others, and make again what somebody has removed.
 
         Args:
             there: Instances that have pods.
             ready: Those of them whose service is up.
+            idle: Those of them of which nothing runs: they have ended, or wait for their next run. That is begun within
+                a minute, or else at another port or address.
 
         Returns:
             Those of ``ready`` that have waited for an address for too long.
@@ -94,8 +98,10 @@ class Services:
             return []
         self._swept_at = now
         found = {one["metadata"]["labels"].get(INSTANCE, ""): one for one in self._list()}
+        self._idle_since = {instance: self._idle_since.get(instance, now) for instance in idle if instance in found}
+        left = {instance for instance, since in self._idle_since.items() if now - since >= _SWEEP_S}
         for instance, one in found.items():
-            if instance not in there and "deletionTimestamp" not in one["metadata"]:
+            if (instance not in there or instance in left) and "deletionTimestamp" not in one["metadata"]:
                 self._must_lead()
                 self._cluster.delete(self._cluster.path("services", one["metadata"]["name"]))
         if not self._balanced:
