@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,11 +10,11 @@ from typing import Any
 
 import pytest
 from orchestrator_program import until
-from unruly_cluster import UnrulyCluster, kubeconfig_of
+from unruly_cluster import CALM, Regime, UnrulyCluster, kubeconfig_of
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes.base import Launch, Phase
+from skytether.orchestrator.runtimes.base import Launch, Phase, SiteSilentError
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 
@@ -62,3 +63,52 @@ def test_while_an_instance_ends_the_api_server_is_asked_once(cluster: UnrulyClus
         time.sleep(0.01)
     site.stop("i1", force=True)
     assert [what for _, what in list(cluster.calls)[before:]] == ["GET configmaps", "PATCH pods"]
+
+
+def test_a_pod_of_the_same_run_that_is_not_gone_yet_is_waited_for_and_not_taken_for_begun(
+    cluster: UnrulyCluster, open_site: Open
+) -> None:
+    site = open_site()
+    site.lead(7)
+    site.start(launch("i1"))
+    until(lambda: site.observe()["i1"].phase is Phase.RUNNING)
+    pod = cluster.objects("pods")[0]["metadata"]
+    cluster.do(lambda: cluster.hold(pod["uid"]))
+    site.remove("i1")
+    assert "i1" not in site.observe()
+    with pytest.raises(SiteSilentError, match="not gone yet"):
+        site.start(launch("i1"))
+    cluster.do(lambda: cluster.let_go(pod["uid"]))
+
+    def begun() -> bool:
+        with contextlib.suppress(SiteSilentError):
+            site.start(launch("i1"))
+            return True
+        return False
+
+    until(begun)
+    until(lambda: site.observe()["i1"].phase is Phase.RUNNING)
+    assert cluster.doubles == []
+
+
+def test_a_pod_that_was_made_while_its_answer_was_lost_does_not_cost_its_robot_half_a_minute(
+    cluster: UnrulyCluster, open_site: Open
+) -> None:
+    site = open_site()
+    site.lead(7)
+    cluster.regime = Regime(cut_after=1.0, only="POST pods")
+    with pytest.raises(SiteSilentError):
+        site.start(launch("i1"))
+    cluster.regime = CALM
+    until(lambda: "i1" in site.observe())
+
+    def runs() -> bool:  # as the orchestrator goes about it
+        time.sleep(0.05)
+        site.tidy()
+        with contextlib.suppress(SiteSilentError):
+            if "i1" not in site.observe():
+                site.start(launch("i1"))
+        return "i1" in site.observe() and site.observe()["i1"].phase is Phase.RUNNING
+
+    until(runs, patience=10)
+    assert cluster.doubles == []

@@ -11,7 +11,7 @@ from reconcile_bench import add
 
 from skytether.api.rest import State
 from skytether.orchestrator.records import Record
-from skytether.orchestrator.runtimes.base import Phase
+from skytether.orchestrator.runtimes.base import Phase, SiteSilentError
 from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.store import Store
 from skytether.orchestrator.strain import HOLD
@@ -72,6 +72,23 @@ def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, n
     while b.record().state is not State.RUNNING:
         assert b.step() == timing.observe_changing
     assert b.step() == timing.observe
+
+
+def test_a_site_that_is_seen_and_does_not_act_is_asked_again_a_second_later(
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench()
+    add(b, new_record())
+    start = b.runtime.start
+
+    def unwell(_: Any) -> None:
+        raise SiteSilentError("the API server is busy or unwell")
+
+    monkeypatch.setattr(b.runtime, "start", unwell)
+    assert [b.step(), b.step()] == [Timing().place] * 2
+    monkeypatch.setattr(b.runtime, "start", start)
+    b.step(2)
+    assert (b.record().state, b.record().attempt) == (State.RUNNING, 1)
 
 
 def test_a_full_site_makes_it_wait_with_the_number_and_an_end_makes_room(bench: Any, new_record: NewRecord) -> None:

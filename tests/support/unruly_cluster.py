@@ -36,6 +36,8 @@ class Regime:
     """How it misbehaves. Chances are of each call, but for those of a watch, which are of each event."""
 
     name: str = "calm"
+    only: str = ""
+    """With which calls begin that bear the chances: ``POST pods``."""
     cut_before: float = 0.0
     """The connection is cut, and nothing was done."""
     cut_after: float = 0.0
@@ -123,6 +125,8 @@ class UnrulyCluster:
         self._watchers: list[_Watcher] = []
         self._writers: set[asyncio.StreamWriter] = set()
         self._loop = asyncio.new_event_loop()
+        self._held: dict[str, asyncio.Event] = {}
+        """Pods whose nodes hang."""
         self.port = 0
         self._server: asyncio.Server
 
@@ -188,6 +192,13 @@ class UnrulyCluster:
                 self._delete(ns, kind, name, {} if grace_s is None else {"gracePeriodSeconds": grace_s})
 
         self.do(remove)
+
+    def hold(self, uid: str) -> None:
+        """The node of this pod hangs: what it is told to end goes on until it is let go."""
+        self._held[uid] = asyncio.Event()
+
+    def let_go(self, uid: str) -> None:
+        self._held.pop(uid).set()
 
     def begun(self) -> dict[str, list[Run]]:
         """What runs, or will as soon as it can, by instance."""
@@ -327,6 +338,8 @@ class UnrulyCluster:
         run.ending = run.ending or time.monotonic()
 
         async def stop() -> None:
+            if held := self._held.get(uid):
+                await held.wait()
             takes = 0.0 if run.over else self._rng.choice([min(within_s, 0.2), within_s])
             await asyncio.sleep(takes + self._rng.uniform(0.05, 0.4))
             self._ended(namespace, name, uid, reason)
@@ -477,6 +490,8 @@ class UnrulyCluster:
             (time.monotonic(), " ".join([method, "/".join([kind, *rest]), *(["watch"] if watches else [])]))
         )
         regime, rng = self.regime, self._rng
+        if not self.calls[-1][1].startswith(regime.only):
+            regime = CALM
         if regime.dead or rng.random() < regime.cut_before:
             return False
         if rng.random() < regime.refuses:

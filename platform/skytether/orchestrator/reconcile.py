@@ -425,6 +425,8 @@ class Reconciler:
                 site.runtime.tidy()
             except RuntimeFailure as error:
                 log.warning("site %s: %s", site.name, error)
+        if site.balked:
+            return self._timing.place  # it is not asked again and again what it does not do
         changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
         changing -= {action.record.id for action in done if isinstance(action, Ready | End)}
         if len(done) == len(actions):
@@ -455,6 +457,7 @@ class Reconciler:
     def _act_on(self, site: Site, actions: Sequence[Action]) -> list[Action]:
         """Those that were done; of very many the last ones wait for a pass that looks at the first ones again."""
         until, done = self._steady() + _ACTING, []
+        site.balked = False
         for action in actions:
             if self._act(site, action):
                 done.append(action)
@@ -494,6 +497,7 @@ class Reconciler:
         except RuntimeFailure as error:
             # The next pass sees what is still to be done.
             log.warning("site %s: %s", site.name, error)
+            site.balked |= isinstance(error, SiteSilentError | OvertakenError)
         return False
 
     def _start(self, site: Site, record: Record) -> None:

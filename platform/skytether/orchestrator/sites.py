@@ -109,6 +109,8 @@ class Site:
         """Share of its processors that is busy; None: not known."""
         self.failure = ""
         """Why the last look failed; empty: it did not."""
+        self.balked = False
+        """The last pass looked, and was then not answered, or overtaken, when it acted."""
         self.observed: Mapping[str, Observation] = {}
         self.looked_at = -math.inf
         """Monotonic seconds of the last look that did not fail."""

@@ -59,8 +59,6 @@ _KEPT = 2
 _NETWORKING = "networking.k8s.io/v1"
 _POLICY_S = 10.0
 """Seconds between two looks whether pods are still closed off."""
-_UNBEGUN_S = 30.0
-"""A pod that has no Secret after so many seconds was made by an orchestrator that was killed then."""
 
 
 class KubernetesRuntime(Runtime):
@@ -137,7 +135,7 @@ class KubernetesRuntime(Runtime):
     def lead(self, epoch: int) -> None:
         self._fence.lead(epoch)
         self._watch.catch_up()  # after that: what the leader before has begun is in it
-        self._remove_unbegun(0.0)
+        self._remove_unbegun()
 
     def _must_lead(self) -> None:
         with self._doubting():
@@ -190,8 +188,11 @@ class KubernetesRuntime(Runtime):
             made = self._cluster.create(self._cluster.path("pods"), body)
         except RefusedError as error:
             if error.reason == "AlreadyExists":
-                self._watch.catch_up()  # another orchestrator has begun this very run
-                return
+                self._watch.catch_up()
+                there = self._watch.of(launch.instance, self._options.timeout_s)
+                if not any(seen.attempt == launch.attempt for seen in there):
+                    raise SiteSilentError("a pod of this run was removed, and is not gone yet") from error
+                return  # another orchestrator has begun this very run
             raise RuntimeFailure(refused(str(error))) from error
         try:
             self._must_lead()  # now that it is there for a later leader to see
@@ -411,7 +412,7 @@ class KubernetesRuntime(Runtime):
                 self._must_lead()
                 self._delete(seen)
         self._give_other_ports(there)
-        self._remove_unbegun(_UNBEGUN_S)
+        self._remove_unbegun()
         self._give_up_unbalanced(there)
         if there and time.monotonic() - (self._policy_at or 0.0) >= _POLICY_S:
             with suppress(RefusedError):  # which blocks the site; what runs is looked after all the same
@@ -431,11 +432,10 @@ class KubernetesRuntime(Runtime):
             why = f"the cluster's load balancer has given its Service no address within {within} (option 'reach')"
             self._leave(ready[instance], f"could not be started: {why}", unstarted=True)
 
-    def _remove_unbegun(self, older_than_s: float) -> None:
-        """Pods that have no Secret: who made them was killed, or another one leads by now."""
+    def _remove_unbegun(self) -> None:
+        """Pods that have no Secret: who made them was killed, had no answer, or does not lead any more."""
         for seen in self._watch.seen(self._options.timeout_s):
-            young = time.time() - seen.made_at < older_than_s
-            if not (self._over(seen) or seen.running or young or self._is_begun(seen)):
+            if not (self._over(seen) or seen.running or self._is_begun(seen)):
                 self._must_lead()
                 self._delete(seen)
         self._begun &= {seen.uid for seen in self._watch.seen(self._options.timeout_s)}
