@@ -46,6 +46,7 @@ _ASK_HZ = 4.0
 _RENEW_HZ = 100.0
 _LIMIT_S = 1200.0
 _LOOK_S = 0.25
+_RARELY_S = 3.0
 _SEED = 16
 _LEADS = re.compile(r"^skytether_leader_epoch (\S+)$", re.MULTILINE)
 _UNBOUNDED = {"QUOTAS_SITE_INSTANCES": "1000000", "QUOTAS_SERVICE_INSTANCES": "1000000", "LOGS_LEVEL": "debug"}
@@ -347,19 +348,21 @@ class _Bench:
         self._say(f"{count} robots wait for room")
         self._operator.put_service("crowd", _manifest("crowd", tiers=["cloud"]))
         self._operator.create_site(_site("small", kubeconfig, tier="cloud", cpu=0.001))  # one has room
-        self._ask(self._names(count), "crowd")
+        made = self._ask(self._names(count), "crowd")
         self._say(f"{count} instances are given a site")
         self._operator.create_site(_site("large", kubeconfig, tier="cloud"))
-        first, began = None, time.monotonic()
+        began = time.monotonic()
         while (placed := self._count("crowd", "placing")) < count:
-            now = time.monotonic()
-            if placed and first is None:
-                first = now, placed
-            if now - began > _LIMIT_S:
+            if time.monotonic() - began > _LIMIT_S:
                 raise BenchError(f"only {placed} of {count} instances were given a site within {_LIMIT_S:.0f} s")
-            time.sleep(_LOOK_S)
-        began, before = first or (began, 0)
-        return (count - before) / (time.monotonic() - began)
+            time.sleep(_RARELY_S)  # each look at the metrics takes a while of the orchestrator, too
+        with ThreadPoolExecutor(_ASKERS) as pool:
+            times = sorted(pool.map(self._placed_at, made))[1:]  # the first one has filled the small site
+        return (len(times) - 1) / (times[-1] - times[0])
+
+    def _placed_at(self, instance: str) -> float:
+        """Seconds since the epoch."""
+        return next(e.at for e in self._operator.watch(instance) if e.state is State.STARTING).timestamp()
 
 
 def _request(robot: str, service: str) -> InstanceCreate:
