@@ -14,7 +14,7 @@ from unruly_cluster import CALM, Regime, UnrulyCluster, kubeconfig_of
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes.base import Launch, Phase, SiteSilentError
+from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, SiteSilentError
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 
@@ -112,3 +112,28 @@ def test_a_pod_that_was_made_while_its_answer_was_lost_does_not_cost_its_robot_h
 
     until(runs, patience=10)
     assert cluster.doubles == []
+
+
+def test_who_was_overtaken_in_a_start_begins_nothing_though_what_tells_of_it_was_removed(
+    cluster: UnrulyCluster, open_site: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a leader that is frozen just before it makes a pod."""
+    before, after = open_site(), open_site()
+    before.lead(7)
+    make = before._cluster.create
+
+    def frozen(path: str, body: Any) -> Any:
+        if body["kind"] == "Pod":
+            after.lead(8)
+            run(after, "i1", attempt=2)
+            cluster.remove_one("configmaps")
+        return make(path, body)
+
+    monkeypatch.setattr(before._cluster, "create", frozen)
+    with pytest.raises(SiteSilentError, match="somebody has removed the ConfigMap skytether-o1-leader"):
+        before.start(launch("i1"))
+    assert cluster.doubles == []
+    after.tidy()
+    run(after, "i2")
+    with pytest.raises(OvertakenError):
+        before.start(launch("i3"))

@@ -13,7 +13,7 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Any
 
-from ..base import OvertakenError
+from ..base import OvertakenError, SiteSilentError
 from .cluster import Cluster, RefusedError
 from .objects import leader
 
@@ -62,10 +62,16 @@ class Fence:
 
         Raises:
             OvertakenError: One of a later epoch.
+            SiteSilentError: Nobody can tell: what tells of it was removed. Whoever leads makes it again (``lead``).
             RuntimeFailure: The API server does not answer.
         """
         epoch = self.epoch
-        if epoch and (found := _epoch(self._there())) > epoch:
+        if not epoch:
+            return
+        there = self._there()
+        if there is None:
+            raise SiteSilentError(f"somebody has removed the ConfigMap {self._name}; it is made again within seconds")
+        if (found := _epoch(there)) > epoch:
             raise OvertakenError.by_leader(f"the ConfigMap {self._name}", found)
 
     def clear(self) -> None:
