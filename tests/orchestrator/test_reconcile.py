@@ -74,21 +74,28 @@ def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, n
     assert b.step() == timing.observe
 
 
-def test_a_site_that_is_seen_and_does_not_act_is_asked_again_a_second_later(
+def test_a_site_that_is_seen_and_does_not_act_is_asked_again_a_second_later_and_not_for_all(
     bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     b = bench()
-    add(b, new_record())
-    start = b.runtime.start
+    names = [f"i{number}" for number in range(12)]
+    for name in names:
+        add(b, new_record(name))
+    start, asked, unwell = b.runtime.start, [], set(names)
 
-    def unwell(_: Any) -> None:
-        raise SiteSilentError("the API server is busy or unwell")
+    def answer(launch: Any) -> None:
+        asked.append(launch.instance)
+        if launch.instance in unwell:
+            raise SiteSilentError("the API server is busy or unwell")
+        start(launch)
 
-    monkeypatch.setattr(b.runtime, "start", unwell)
+    monkeypatch.setattr(b.runtime, "start", answer)
     assert [b.step(), b.step()] == [Timing().place] * 2
-    monkeypatch.setattr(b.runtime, "start", start)
-    b.step(2)
-    assert (b.record().state, b.record().attempt) == (State.RUNNING, 1)
+    assert len(asked) == 2 * 5
+    unwell -= set(names[4:])
+    b.step(10)
+    assert {b.record(name).state for name in names[:4]} == {State.STARTING}
+    assert {(b.record(name).state, b.record(name).attempt) for name in names[4:]} == {(State.RUNNING, 1)}
 
 
 def test_a_full_site_makes_it_wait_with_the_number_and_an_end_makes_room(bench: Any, new_record: NewRecord) -> None:

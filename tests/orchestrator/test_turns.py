@@ -10,6 +10,7 @@ from reconcile_bench import Bench, add
 
 from skytether.api.rest import State
 from skytether.orchestrator.records import Record
+from skytether.orchestrator.runtimes.base import SiteSilentError
 from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.sites import Site
 from skytether.testing.runtimes import FakeRuntime, NeverReadyRuntime, SlowRuntime, StubbornRuntime
@@ -199,3 +200,27 @@ def test_a_woken_placer_places_what_waits_and_leaves_the_rest_to_its_period(
     b.clock.forward(TIMING.place)
     b.reconciler.place_turn()
     assert watched == [2]
+
+
+def test_a_site_that_answers_nothing_rests_though_others_call(
+    running: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b, _ = running()
+    for number in range(12):
+        add(b, new_record(f"n{number}", lease_s=1000, lease_expires_at=b.clock() + 1000))
+    start, asked = b.runtime.start, []
+
+    def unwell(launch: Any) -> None:
+        asked.append(launch.instance)
+        raise SiteSilentError("the API server is busy or unwell")
+
+    monkeypatch.setattr(b.runtime, "start", unwell)
+    b.reconciler.place_turn()
+    for _ in range(20):
+        turn(b, 0.01)
+        b.site.wake()
+    assert len(asked) == 5
+    monkeypatch.setattr(b.runtime, "start", start)
+    turn(b, TIMING.place)
+    turn(b)
+    assert {b.record(f"n{number}").state for number in range(12)} == {State.RUNNING}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import logging
 import math
+import random
 import sys
 import threading
 import time
@@ -51,6 +52,8 @@ _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
 _ACTING = 0.5
 """Seconds for which a pass over a site acts, at most: of a crowd some are ready before the last ones are started."""
+_BALKS = 5
+"""Acts in a row that a site did not answer, after which a pass asks it for nothing more: nor would it answer that."""
 _SHARE = 0.1
 """Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
 _PROMISES_AGE = 3.0
@@ -139,6 +142,8 @@ class Reconciler:
         often; as long as the runtime finds it as it was, and nobody called, the database is not asked.
         """
         now = self._steady()
+        if now < site.rests_until:
+            return site.rests_until - now
         due = site.passed_at + _rest(_WHOLE, site.pass_took) - now
         look = site.watched_at + _rest(self._timing.observe, site.look_took) - now
         if called := site.called:
@@ -456,48 +461,56 @@ class Reconciler:
 
     def _act_on(self, site: Site, actions: Sequence[Action]) -> list[Action]:
         """Those that were done; of very many the last ones wait for a pass that looks at the first ones again."""
-        until, done = self._steady() + _ACTING, []
+        until, done, in_a_row = self._steady() + _ACTING, [], 0
+        if site.balked:  # those that it never does do not always come first
+            actions = random.sample(actions, len(actions))
         site.balked = False
         for action in actions:
-            if self._act(site, action):
-                done.append(action)
+            if in_a_row >= _BALKS and isinstance(action, Start | Stop | End | Remove):
+                continue
+            try:
+                if self._act(site, action):
+                    done.append(action)
+                in_a_row = 0
+            except RuntimeFailure as error:
+                # The next pass sees what is still to be done.
+                log.warning("site %s: %s", site.name, error)
+                if isinstance(error, SiteSilentError | OvertakenError):
+                    site.balked, in_a_row = True, in_a_row + 1
+                    if in_a_row >= _BALKS:
+                        site.rests_until = self._steady() + self._timing.place
             if self._steady() >= until:
                 break
         return done
 
     def _act(self, site: Site, action: Action) -> bool:
-        """Do it; False: the next pass has to see what comes of it, or to try again."""
-        try:
-            match action:
-                case Start(record):
-                    self._start(site, record)
-                case Progress(record, detail):
-                    self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
-                case Ready(record, host, port):
-                    return self._ready(site, record, host, port)
-                case Crash():
-                    self._crash(site, action)
-                case Expire(record):
-                    self._expire(record)
-                case End(record):
-                    site.runtime.stop(record.id, force=True)  # what its main process left behind
-                    if self._store.change(record, self._clock(), state=State.STOPPED):
-                        self._promises.remove(record)
-                        self._wake_placer()  # there is room for another
-                        return True
-                case Stop(instance, force):
-                    site.runtime.stop(instance, force=force)
+        """Do it; False: the next pass has to see what comes of it. Raises RuntimeFailure: it has to try again."""
+        match action:
+            case Start(record):
+                self._start(site, record)
+            case Progress(record, detail):
+                self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
+            case Ready(record, host, port):
+                return self._ready(site, record, host, port)
+            case Crash():
+                self._crash(site, action)
+            case Expire(record):
+                self._expire(record)
+            case End(record):
+                site.runtime.stop(record.id, force=True)  # what its main process left behind
+                if self._store.change(record, self._clock(), state=State.STOPPED):
+                    self._promises.remove(record)
+                    self._wake_placer()  # there is room for another
                     return True
-                case Remove(instance):
-                    log.info("site %s: removing %s, which nobody wants there", site.name, instance)
-                    site.runtime.remove(instance)
-                    return True
-                case Place():
-                    raise TypeError("what is at a site is placed already")
-        except RuntimeFailure as error:
-            # The next pass sees what is still to be done.
-            log.warning("site %s: %s", site.name, error)
-            site.balked |= isinstance(error, SiteSilentError | OvertakenError)
+            case Stop(instance, force):
+                site.runtime.stop(instance, force=force)
+                return True
+            case Remove(instance):
+                log.info("site %s: removing %s, which nobody wants there", site.name, instance)
+                site.runtime.remove(instance)
+                return True
+            case Place():
+                raise TypeError("what is at a site is placed already")
         return False
 
     def _start(self, site: Site, record: Record) -> None:

@@ -111,6 +111,8 @@ class Site:
         """Why the last look failed; empty: it did not."""
         self.balked = False
         """The last pass looked, and was then not answered, or overtaken, when it acted."""
+        self.rests_until = -math.inf
+        """Steady seconds: it answered nothing, and whoever calls meanwhile does not have it asked again."""
         self.observed: Mapping[str, Observation] = {}
         self.looked_at = -math.inf
         """Monotonic seconds of the last look that did not fail."""
