@@ -19,7 +19,7 @@ TIMING = {
     "max_failures": 1000,
     "backoff": 0.2,
     "backoff_max": 2,
-    "start_timeout": 20,
+    "start_timeout": 8,
     "stop_grace": 3,
     "site_silent": 5,
 }
