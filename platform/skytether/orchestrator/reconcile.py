@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import logging
 import math
-import random
 import sys
 import threading
 import time
@@ -430,7 +429,7 @@ class Reconciler:
                 site.runtime.tidy()
             except RuntimeFailure as error:
                 log.warning("site %s: %s", site.name, error)
-        if site.balked:
+        if site.balks:
             return self._timing.place  # it is not asked again and again what it does not do
         changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
         changing -= {action.record.id for action in done if isinstance(action, Ready | End)}
@@ -461,10 +460,10 @@ class Reconciler:
 
     def _act_on(self, site: Site, actions: Sequence[Action]) -> list[Action]:
         """Those that were done; of very many the last ones wait for a pass that looks at the first ones again."""
-        until, done, in_a_row = self._steady() + _ACTING, [], 0
-        if site.balked:  # those that it never does do not always come first
-            actions = random.sample(actions, len(actions))
-        site.balked = False
+        until, done, in_a_row, balked = self._steady() + _ACTING, [], 0, False
+        if site.balks:  # those that it never does do not always come first
+            first = _BALKS * site.balks % max(1, len(actions))
+            actions = [*actions[first:], *actions[:first]]
         for action in actions:
             if in_a_row >= _BALKS and isinstance(action, Start | Stop | End | Remove):
                 continue
@@ -476,11 +475,12 @@ class Reconciler:
                 # The next pass sees what is still to be done.
                 log.warning("site %s: %s", site.name, error)
                 if isinstance(error, SiteSilentError | OvertakenError):
-                    site.balked, in_a_row = True, in_a_row + 1
+                    balked, in_a_row = True, in_a_row + 1
                     if in_a_row >= _BALKS:
                         site.rests_until = self._steady() + self._timing.place
             if self._steady() >= until:
                 break
+        site.balks = site.balks + 1 if balked else 0
         return done
 
     def _act(self, site: Site, action: Action) -> bool:

@@ -109,8 +109,8 @@ class Site:
         """Share of its processors that is busy; None: not known."""
         self.failure = ""
         """Why the last look failed; empty: it did not."""
-        self.balked = False
-        """The last pass looked, and was then not answered, or overtaken, when it acted."""
+        self.balks = 0
+        """Passes in a row that looked, and were then not answered, or overtaken, when they acted."""
         self.rests_until = -math.inf
         """Steady seconds: it answered nothing, and whoever calls meanwhile does not have it asked again."""
         self.observed: Mapping[str, Observation] = {}
