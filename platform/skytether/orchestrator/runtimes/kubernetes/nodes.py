@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from http import HTTPStatus
-from typing import Any
 
-import urllib3
+from typing_extensions import override
 
 from ..base import Capacity, RuntimeFailure
-from .cluster import Cluster, ClusterGoneError, RefusedError, cut
+from .cluster import Cluster, RefusedError
+from .follow import AGAIN_S, Document, Follower
 from .objects import capacity, external_address, tolerated
 from .options import KubernetesOptions
-from .watch import events
 
 log = logging.getLogger(__name__)
 
-Document = Mapping[str, Any]
-_PATH = "/api/v1/nodes"
-_PAGE = 500
-_WATCH_S = 60
-_SILENCE_S = _WATCH_S + 15.0
-_AGAIN_S = 1.0
-"""Between two attempts to reach an API server that does not answer."""
 _FORBIDDEN_S = 30.0
 """Between two attempts where the account may not; and between two lists where it may list and not watch."""
 _CORDONED = "is cordoned (kubectl uncordon {node} lets it take pods again)"
@@ -94,27 +84,12 @@ def _slim(node: Document) -> Document:
     }
 
 
-class Nodes:
+class Nodes(Follower):
     """Follows a cluster's nodes, in a thread of its own. Safe from any thread."""
 
     def __init__(self, cluster: Cluster) -> None:
-        self._cluster = cluster
+        super().__init__(cluster, "/api/v1/nodes", "kubernetes-nodes")
         self._nodes: dict[str, Document] = {}
-        self._failure: RuntimeFailure | None = ClusterGoneError("the API server has not answered yet")
-        self._looked = threading.Event()
-        self._closing = threading.Event()
-        self._answer: urllib3.HTTPResponse | None = None
-        self._thread = threading.Thread(target=self._run, name="kubernetes-nodes", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def close(self) -> None:
-        self._closing.set()
-        answer = self._answer
-        if answer is not None:
-            cut(answer)
-        self._thread.join(5.0)
 
     def offered(self, options: KubernetesOptions) -> tuple[Capacity, str]:
         """See :func:`offered`; waits for the first list only.
@@ -150,18 +125,16 @@ class Nodes:
             try:
                 version = self._list()
                 while version and not self._closing.is_set():
-                    began = time.monotonic()
-                    version = self._watch(version)
-                    self._closing.wait(began + _AGAIN_S - time.monotonic())  # a watch that ends at once is no watch
+                    version = self._follow(version)
                 wait = 0.0
             except RefusedError as error:
                 wait = _FORBIDDEN_S
                 self._fail(error)
             except RuntimeFailure as error:
-                wait = _AGAIN_S
+                wait = AGAIN_S
                 self._fail(error)
             except Exception:
-                wait = _AGAIN_S
+                wait = AGAIN_S
                 log.exception("following a cluster's nodes failed")
             self._closing.wait(wait)
 
@@ -173,42 +146,29 @@ class Nodes:
 
     def _list(self) -> str:
         found: dict[str, Document] = {}
-        query: dict[str, str | int] = {"limit": _PAGE}
-        while True:
-            said = self._cluster.get(_PATH, **query)
-            found |= {node["metadata"]["name"]: _slim(node) for node in said["items"]}
-            if not said["metadata"].get("continue"):
-                break
-            query["continue"] = said["metadata"]["continue"]
+
+        def take(node: Document) -> None:
+            found[node["metadata"]["name"]] = _slim(node)
+
+        version = self._read(take)
         self._nodes, self._failure = found, None
         self._looked.set()
-        return str(said["metadata"]["resourceVersion"])
+        return version
 
+    @override
+    def _take(self, document: Document, *, gone: bool) -> None:
+        name = document["metadata"]["name"]
+        if gone:
+            self._nodes = {n: one for n, one in self._nodes.items() if n != name}
+        else:
+            self._nodes = {**self._nodes, name: _slim(document)}
+
+    @override
     def _watch(self, version: str) -> str:
-        """Follow from one version on; the version it came to, empty: the list is to be read anew."""
-        query: dict[str, str | int] = {
-            "watch": "true",
-            "allowWatchBookmarks": "true",
-            "resourceVersion": version,
-            "timeoutSeconds": _WATCH_S,
-        }
         try:
-            with self._cluster.stream(_PATH, _SILENCE_S, **query) as answer:
-                self._answer = answer
-                for event in events(answer):
-                    kind, node = event.get("type"), event.get("object") or {}
-                    if kind == "ERROR" or self._closing.is_set():
-                        return ""
-                    version = str(node["metadata"].get("resourceVersion", version))
-                    if kind == "DELETED":
-                        self._nodes = {n: one for n, one in self._nodes.items() if n != node["metadata"]["name"]}
-                    elif kind in ("ADDED", "MODIFIED"):
-                        self._nodes = {**self._nodes, node["metadata"]["name"]: _slim(node)}
+            return super()._watch(version)
         except RefusedError as error:
             if error.status != HTTPStatus.FORBIDDEN:
                 raise
             self._closing.wait(_FORBIDDEN_S)  # it may list: so that is how it is seen
             return ""
-        finally:
-            self._answer = None
-        return version

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from http import HTTPStatus
+from collections.abc import Mapping
 from typing import Any
 
-import urllib3
+from typing_extensions import override
 
 from ..base import RuntimeFailure
-from .cluster import Cluster, ClusterGoneError, RefusedError, cut
+from .cluster import Cluster, RefusedError
+from .follow import AGAIN_S, Document, Follower
 from .objects import GRACE_S
 from .pods import Pods
 from .seen import Seen, parse
@@ -22,28 +21,18 @@ log = logging.getLogger(__name__)
 
 _LIST_S = 300.0
 """Seconds until all are listed anew: should an event ever have been missed."""
-_WATCH_S = 60
-"""The API server ends a watch after this, so that one that is dead is noticed."""
-_SILENCE_S = _WATCH_S + 15.0
-_AGAIN_S = 1.0
-"""Between two attempts to reach an API server that does not answer."""
 _ILL_S = 1.5
 """A service is first asked of its health up to a second after it has said that it is ready."""
 _LINGERS_S = GRACE_S + 1.0
 """After so many seconds nothing of a pod that lingers runs any more."""
-_PAGE = 500
-"""Pods of one answer."""
-_MOST_EVENT = 4 << 20
-"""Bytes."""
 
 
-class Watch:
+class Watch(Follower):
     """Follows pods, in a thread of its own."""
 
     def __init__(self, cluster: Cluster, selector: str) -> None:
         """``selector``: of the labels that they have."""
-        self._cluster = cluster
-        self._selector = selector
+        super().__init__(cluster, cluster.path("pods"), "kubernetes-watch", labelSelector=selector)
         self.changed = threading.Event()
         """Set whenever another thing may be known than before; whoever waits for it clears it."""
         self._lock = threading.Lock()
@@ -56,28 +45,11 @@ class Watch:
         """By uid, since when a pod whose service is up has not been ready yet."""
         self._well: set[str] = set()
         """Uids of pods that were ready."""
-        self._failure: RuntimeFailure | None = ClusterGoneError("the API server has not answered yet")
-        self._looked = threading.Event()
-        self._closing = threading.Event()
-        self._answer: urllib3.HTTPResponse | None = None
-        self._thread = threading.Thread(target=self._run, name="kubernetes-watch", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def close(self) -> None:
-        self._closing.set()
-        answer = self._answer
-        if answer is not None:
-            cut(answer)
-        self._thread.join(5.0)
 
     def doubt(self, error: RuntimeFailure) -> None:
         """A call found the API server silent, of which a watch may tell nothing for long: so it is until it answers."""
         self._fail(error)
-        answer = self._answer
-        if answer is not None:
-            cut(answer)
+        self._cut()
 
     def seen(self, timeout_s: float) -> list[Seen]:
         """All pods of ours; waits for the first list only, ``timeout_s`` [s] at most.
@@ -157,16 +129,14 @@ class Watch:
                 version = self._list()
                 until = time.monotonic() + _LIST_S
                 while version and self._failure is None and not self._closing.is_set() and time.monotonic() < until:
-                    began = time.monotonic()
-                    version = self._watch(version)
-                    self._closing.wait(began + _AGAIN_S - time.monotonic())  # a watch that ends at once is no watch
+                    version = self._follow(version)
             except RuntimeFailure as error:
                 self._fail(error)
             except Exception as error:
                 log.exception("following a cluster failed")
                 self._fail(RuntimeFailure(f"the API server's answer is not understood: {error}"))
             if self._failure is not None:
-                self._closing.wait(_AGAIN_S)
+                self._closing.wait(AGAIN_S)
 
     def _fail(self, error: RuntimeFailure) -> None:
         if self._closing.is_set():
@@ -179,24 +149,20 @@ class Watch:
     def _list(self) -> str:
         """The version of the list."""
         found: dict[str, Seen] = {}
-        query: dict[str, str | int] = {"labelSelector": self._selector, "limit": _PAGE}
-        while True:
-            said = self._cluster.get(self._cluster.path("pods"), **query)
-            for document in said["items"]:
-                seen = parse(document)
-                if seen is not None:
-                    found[seen.name] = seen
-            meta = said["metadata"]
-            if not meta.get("continue"):
-                break
-            query["continue"] = meta["continue"]
+
+        def take(document: Document) -> None:
+            seen = parse(document)
+            if seen is not None:
+                found[seen.name] = seen
+
+        version = self._read(take)
         with self._lock:
             # What an answer has told meanwhile may be newer than the list.
             for name, seen in found.items():
                 before = self._pods.get(name)
                 if before is not None and before.uid == seen.uid and not _is_newer(seen, before):
                     found[name] = before
-            at = _number(meta["resourceVersion"])
+            at = _number(version)
             newer = [s for s in self._pods.all() if s.name not in found and _number(s.version) > at]
             self._pods = Pods([*(s for s in found.values() if s.uid not in self._gone), *newer])
             self._gone = {uid: name for uid, name in self._gone.items() if name in found}
@@ -207,46 +173,11 @@ class Watch:
         self._failure = None
         self._looked.set()
         self.changed.set()
-        return str(meta["resourceVersion"])
-
-    def _watch(self, version: str) -> str:
-        """Follow from one version on; the version it came to, empty: the list is to be read anew."""
-        query: dict[str, str | int] = {
-            "labelSelector": self._selector,
-            "watch": "true",
-            "allowWatchBookmarks": "true",
-            "resourceVersion": version,
-            "timeoutSeconds": _WATCH_S,
-        }
-        with self._cluster.stream(self._cluster.path("pods"), _SILENCE_S, **query) as answer:
-            self._answer = answer
-            try:
-                for event in events(answer):
-                    if self._closing.is_set():
-                        return ""
-                    kind, document = event.get("type"), event.get("object") or {}
-                    if kind == "ERROR":
-                        if document.get("code") != HTTPStatus.GONE:
-                            log.info("a watch has ended: %s", document.get("message"))
-                        return ""
-                    version = str(document.get("metadata", {}).get("resourceVersion", version))
-                    if kind in ("ADDED", "MODIFIED", "DELETED"):
-                        self.take(document, gone=kind == "DELETED")
-            finally:
-                self._answer = None
         return version
 
-
-def events(answer: urllib3.HTTPResponse) -> Iterator[Any]:
-    """The lines of a watch, as documents."""
-    rest = b""
-    for piece in answer.stream(1 << 16):
-        *lines, rest = (rest + piece).split(b"\n")
-        if len(rest) > _MOST_EVENT:
-            raise RuntimeFailure(f"the API server tells of an object of more than {_MOST_EVENT >> 20} MiB")
-        for line in lines:
-            if line.strip():
-                yield json.loads(line)
+    @override
+    def _take(self, document: Document, *, gone: bool) -> None:
+        self.take(document, gone=gone)
 
 
 def _is_newer(seen: Seen, before: Seen) -> bool:
