@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 from orchestrator_program import until
-from unruly_cluster import CALM, Regime, UnrulyCluster, kubeconfig_of
+from unruly_cluster import CALM, Regime, UnrulyCluster
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
+from skytether.lab.bench.scale import kubeconfig_of
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, SiteSilentError
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions

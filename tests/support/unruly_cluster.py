@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http import HTTPStatus
-from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl, urlsplit
 
@@ -632,17 +631,3 @@ def _node(number: int) -> Document:
         "spec": {},
         "status": {**status, "addresses": [address]},
     }
-
-
-def kubeconfig_of(folder: Path, address: str) -> Path:
-    document: dict[str, Any] = {
-        "apiVersion": "v1",
-        "kind": "Config",
-        "clusters": [{"name": "made-up", "cluster": {"server": address}}],
-        "users": [{"name": "anybody", "user": {}}],
-        "contexts": [{"name": "made-up", "context": {"cluster": "made-up", "user": "anybody"}}],
-        "current-context": "made-up",
-    }
-    path = folder / "kubeconfig"
-    path.write_text(json.dumps(document))
-    return path
