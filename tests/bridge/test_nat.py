@@ -7,13 +7,14 @@ The cloud has no way to 10.0.1.0: what reaches the robot went through the router
 
 import contextlib
 import socket
+import subprocess
 import threading
 import time
 
 import pytest
-from networks import cable, masquerade
+from networks import cable, masquerade, nft
 
-from skytether.bridge import Relay
+from skytether.bridge import Relay, driver
 from skytether.lab.netns import Namespace
 from skytether.wire.events import Connected, Disconnected, PeerMoved
 from skytether.wire.topic import Role
@@ -210,3 +211,23 @@ def test_an_idle_session_keeps_its_binding_where_others_lose_theirs(nat, session
     assert service.publish("cmd_vel", b"later")
     robot.graph.wait(lambda port: ("cmd_vel", b"later") in port.messages)
     assert service.graph.count(PeerMoved) == 1
+
+
+def test_a_load_balancer_that_comes_later_than_the_robot_is_got_through(nat, ends, monkeypatch):
+    """Its rule is for new flows only; a robot that asks again and again from one port never is one."""
+    monkeypatch.setattr(driver, "_OTHER_PORT_S", 1.0)
+    service = ends.make(Role.SERVICE, bind=(CLOUD, 0))
+    nat.cloud.run(service.start)
+    robot = ends.make(Role.ROBOT, bind=("0.0.0.0", 0), peer=("203.0.113.50", 7600))
+    nat.robot.run(robot.start)
+    listing = ["conntrack", "-L", "--proto", "udp", "--dst", "203.0.113.50"]
+    limit = time.monotonic() + 5
+    while not nat.router.run(lambda: subprocess.run(listing, capture_output=True, check=True)).stdout:
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+    chain = "type nat hook prerouting priority dstnat; policy accept;"
+    rule = f"ip daddr 203.0.113.50 udp dport 7600 dnat to {CLOUD}:{service.address[1]}"
+    nft(nat.router, f"table ip balancer {{\nchain before {{\n{chain}\n{rule}\n}}\n}}")
+    robot.graph.wait_connected()
+    service.graph.wait_connected()
+    assert robot.graph.count(Connected) == 1

@@ -108,6 +108,7 @@ class DatagramSocket:
         family, kind, protocol, _, address = socket.getaddrinfo(
             bind[0], bind[1], type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )[0]
+        self._asked = bind, device, batches, kernel_buffer, scratch
         self._socket = socket.socket(family, kind, protocol)
         try:
             self._socket.setblocking(False)
@@ -148,6 +149,16 @@ class DatagramSocket:
     def close(self) -> None:
         """Give the port back."""
         self._socket.close()
+
+    def another(self) -> DatagramSocket | None:
+        """One like it at another port; None: it was told which port, or the system has none."""
+        bind, device, batches, kernel_buffer, scratch = self._asked
+        if bind[1] != 0:
+            return None
+        try:
+            return DatagramSocket(bind, device=device, batches=batches, kernel_buffer=kernel_buffer, scratch=scratch)
+        except OSError:  # the network is gone
+            return None
 
     def resolve(self, host: str, port: int, numeric: bool = False) -> Address:
         """Find the address of a peer that this socket can send to. May ask the name service, so it may block.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -25,6 +26,9 @@ _log = logging.getLogger(__name__)
 _TURN = 8
 """Batches (of up to 64 kB) taken from the socket before something is sent again, and bursts sent before the socket is
 looked at again: what the peer says of those before decides how the next are sent."""
+_OTHER_PORT_S = 5.0
+"""Seconds of silence after which a path of the robot's end goes on from another port. A router, firewall or load
+balancer that has noted the old one as leading nowhere keeps to that for as long as packets come from it."""
 
 
 class Driver:
@@ -53,11 +57,16 @@ class Driver:
         self._errors: Counter[str] = Counter()
         """Of sockets that are closed."""
         self._complained: set[tuple[str, type[Exception]]] = set()
+        self._silence_timer: asyncio.TimerHandle | None = None
+        self._ports_since: dict[int, float] = {}
+        """By path, when its socket took the place of another."""
 
     def begin(self) -> None:
         """First call, in the loop's thread."""
         if 0 in self._sockets:
             self._loop.add_reader(self._sockets[0], self._on_readable, 0)
+        if not self._service:
+            self._silence_timer = self._loop.call_later(_OTHER_PORT_S, self._on_silence)
         self._advance()
 
     def open_path(self, path: int, sock: DatagramSocket, cost: int, peer: Address | None) -> None:
@@ -97,6 +106,8 @@ class Driver:
         self.agreed = {}
         if self._timer is not None:
             self._timer.cancel()
+        if self._silence_timer is not None:
+            self._silence_timer.cancel()
         for path in list(self._sockets):
             self._close(path)
 
@@ -110,11 +121,28 @@ class Driver:
     def _close(self, path: int) -> None:
         sock = self._sockets.pop(path, None)
         self._unsent.pop(path, None)
+        self._ports_since.pop(path, None)
         if sock is not None:
             self._loop.remove_reader(sock)
             self._loop.remove_writer(sock)
             self._errors += sock.errors
             sock.close()
+
+    def _on_silence(self) -> None:
+        """Have the paths on which nobody answers go on from other ports."""
+        now = time.monotonic()
+        due = now + _OTHER_PORT_S
+        for path in list(self._sockets):
+            since = max(self._session.heard_at(path), self._ports_since.get(path, -math.inf))
+            if now < since + _OTHER_PORT_S:
+                due = min(due, since + _OTHER_PORT_S)
+            elif (other := self._sockets[path].another()) is not None:
+                self._close(path)
+                self._sockets[path] = other
+                self._ports_since[path] = now
+                self._loop.add_reader(other, self._on_readable, path)
+        self._silence_timer = self._loop.call_at(due, self._on_silence)
+        self._advance()
 
     def _on_readable(self, path: int) -> None:
         by = None if self._service else path

@@ -64,7 +64,8 @@ class Bridge:
     Every method may be called from any thread.
 
     Attributes:
-        address: Host and port where it is bound, once started.
+        address: Host and port where it is bound, once started. A robot's end that nobody answers for seconds goes on
+            from other ports, unless it was told which to take.
     """
 
     def __init__(

@@ -191,6 +191,11 @@ class Session:
         """The path is gone. The last one stays until another is opened."""
         self._paths.close(path, now)
 
+    def heard_at(self, path: int) -> float:
+        """When the peer was heard by a path, or it was opened; minus infinity: there is no such path."""
+        known = self._paths.get(path)
+        return known.heard_at if known is not None else -math.inf
+
     def shrink(self, path: int, size: int, now: float) -> None:
         """The system refused to send a datagram of ``size`` bytes: too large for the path."""
         known = self._paths.get(path)
