@@ -248,7 +248,7 @@ def test_a_standby_is_given_out_without_a_start_and_a_service_that_is_not_well_i
     begun = time.monotonic()
     ill = scene.until(given.id, lambda one: one.restarts == 1)
     log.info("seen after %.2f s", time.monotonic() - begun)
-    assert "is not well: its health check fails" in ill.reason or ill.state is State.RUNNING
+    assert "is not well: the service is not ready" in ill.reason or ill.state is State.RUNNING
     scene.until_run(given.id)
     scene.settled()
     scene.end(given.id)

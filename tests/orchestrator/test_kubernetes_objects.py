@@ -240,7 +240,7 @@ def test_a_run_starts_then_runs_where_robots_reach_it() -> None:
     assert observation(found, options(advertise_host="robots.example.org")).host == "robots.example.org"
     assert observation(found, options(reach="pod")).host == "10.1.0.9"
     assert observation(found, options(reach="pod")).port == 7600
-    assert observation(found, options(), ill=True).detail == "its health check fails"
+    assert observation(found, options(), trouble="its loop has hung").detail == "its loop has hung"
 
 
 def test_a_robot_is_told_the_relay_that_its_session_chooses() -> None:

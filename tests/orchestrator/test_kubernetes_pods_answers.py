@@ -1,4 +1,4 @@
-"""What a pod may answer when it is asked for its reports: it is its service's, who may be hostile."""
+"""What a pod may answer when it is asked for its reports or health: it is its service's, who may be hostile."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from itertools import chain, count, repeat
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
-from skytether.orchestrator.runtimes.kubernetes import reports
+from skytether.orchestrator.runtimes.kubernetes import health, reports
 from skytether.orchestrator.runtimes.kubernetes.cluster import Cluster
+from skytether.orchestrator.runtimes.kubernetes.health import FAILS, Health
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 from skytether.orchestrator.runtimes.kubernetes.reports import ReportReader
+from skytether.orchestrator.runtimes.kubernetes.seen import Seen
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
 CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
@@ -159,3 +163,64 @@ def test_nobody_is_asked_whom_a_pod_names(cluster: Callable[..., Cluster]) -> No
         with pytest.raises(BlockingIOError):
             elsewhere.accept()
     reader.close()
+
+
+def pod(name: str) -> Seen:
+    return cast(Seen, SimpleNamespace(name=name, uid=f"uid-{name}"))
+
+
+def says(**document: object) -> Answer:
+    return lambda: iter([plain(json.dumps(document).encode())])
+
+
+def test_who_is_well_although_its_node_says_otherwise_runs_on_and_who_is_not_says_why(
+    cluster: Callable[..., Cluster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(health, "_EVERY_S", 0.0)
+    monkeypatch.setattr(health, "_TIMEOUT_S", 0.2)
+    pods: dict[str, Answer] = {
+        "well": says(trouble=""),
+        "hung": says(trouble="its loop has hung for 12 s"),
+        "old": says(reports=[]),
+        "stranger": lambda: iter([b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"]),
+        "silent": lambda: drops(CHUNKED, b"1\r\n \r\n"),
+        "refused": lambda: iter([b"HTTP/1.1 503 No\r\nContent-Length: 0\r\n\r\n"]),
+        "hostile": lambda: iter([plain(b"[" * 60_000)]),
+    }
+    api = cluster(**pods)
+    told = threading.Event()
+    doubts = Health(api, told.set)
+    ill = {"hung": "its loop has hung for 12 s"} | dict.fromkeys(
+        ["old", "stranger", "silent", "refused", "hostile"], FAILS
+    )
+    until = time.monotonic() + 20
+    while (found := {name: doubts.trouble(pod(name), True) for name in pods}) != {"well": "", **ill}:
+        assert time.monotonic() < until, found
+        time.sleep(0.01)
+    assert told.is_set()
+    assert doubts.trouble(pod("hung"), False) == ""  # which its node says first
+    doubts.keep({"uid-old"})
+    doubts.close()
+    assert [doubts.trouble(pod(name), True) for name in ("old", "silent")] == [FAILS, ""]
+
+
+def test_where_the_api_server_is_silent_too_nothing_is_known(
+    cluster: Callable[..., Cluster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(health, "_EVERY_S", 0.0)
+    monkeypatch.setattr(health, "_TIMEOUT_S", 0.1)
+    asked: list[str] = []
+
+    def nothing(name: str) -> Iterator[bytes]:
+        asked.append(name)
+        yield b"HTTP/1.1 503 No\r\nContent-Length: 0\r\n\r\n"
+
+    # The empty name: what is asked of the API server itself.
+    api = cluster(silent=lambda: nothing("silent"), **{"": lambda: nothing("")})
+    doubts = Health(api, lambda: pytest.fail("something is known"))
+    until = time.monotonic() + 20
+    while asked.count("") < 2:
+        assert doubts.trouble(pod("silent"), True) == ""
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    doubts.close()

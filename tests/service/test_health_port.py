@@ -61,7 +61,8 @@ def test_it_is_well_when_it_is_ready_and_its_loop_alive(grant: Grant) -> None:
 
 def test_it_tells_what_was_reported_and_nothing_else(grant: Grant) -> None:
     with answering(grant):
-        assert ask(grant, "/reports").json().keys() == {"usage"}
+        assert ask(grant, "/reports").json().keys() == {"usage", "trouble"}
+        assert ask(grant, "/reports").json()["trouble"] == "the service is not ready: FileNotFoundError"
         report = ServiceReport(1, "no_path", "There is no way to the goal.")
         Path(str(grant.ready_file)).with_name("reports.json").write_bytes(write_reports([report]))
         assert ask(grant, "/reports").json()["reports"][0]["code"] == "no_path"

@@ -59,6 +59,17 @@ def pull_reports(document: object) -> tuple[ServiceReport, ...]:
     return tuple(found[number] for number in sorted(found))
 
 
+def pull_trouble(document: object, untold: str) -> str:
+    """What a service says is wrong with it, in a document that anybody may have written; empty: nothing.
+
+    ``untold`` stands for what it does not say, as services of the time before did not.
+    """
+    told = document.get("trouble") if isinstance(document, dict) else None
+    if not isinstance(told, str):
+        return untold
+    return printable(told[:MOST_CHARACTERS], lines=False)[:MOST_CHARACTERS]
+
+
 def _pull(row: Any) -> ServiceReport | None:
     if not isinstance(row, dict):
         return None

@@ -1,8 +1,8 @@
 """What a service answers of its health over HTTP, where its runtime cannot look at its files (Kubernetes).
 
 ``/healthz`` says 200 while the service is ready and its loop alive, 503 and one sentence otherwise; ``/reports`` gives
-what it reported (`skytether.api.service_report`) and what its container uses (`skytether.api.usage`). The cluster
-asks every second; nothing of it is secret.
+what it reported (`skytether.api.service_report`), what its container uses (`skytether.api.usage`), and that sentence
+once more. The cluster asks every second; nothing of it is secret.
 
 Whoever reaches the pod may ask, however slowly and often: each has a moment in all, and of too many at once the oldest
 gives way, so the cluster's own question is answered.
@@ -111,7 +111,8 @@ class _Answers:
             trouble = check(self._grant, time.time())
             status, body = HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, (trouble or "alive").encode()
         elif path == b"/reports":
-            told = {**self._read(), "usage": write_usage(container_usage())}
+            trouble = check(self._grant, time.time())
+            told = {**self._read(), "usage": write_usage(container_usage()), "trouble": trouble}
             status, body = HTTPStatus.OK, json.dumps(told).encode()
         return f"HTTP/1.0 {status} {status.phrase}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body
 

@@ -31,6 +31,7 @@ from ..egress import resolve
 from .budget import Budget
 from .cluster import Cluster, ClusterSilentError, RefusedError
 from .fence import Fence
+from .health import Health
 from .logs import PodLog
 from .nodes import Nodes
 from .objects import (
@@ -86,6 +87,7 @@ class KubernetesRuntime(Runtime):
         self._services = Services(self._cluster, options, self._owner, self._must_lead)
         self._reports = ReportReader(self._cluster, self._ready)
         self._meter = Meter(self._cluster, self._owner, self._reports.usage)
+        self._health = Health(self._cluster, self._watch.changed.set)
         self._lock = threading.Lock()
         self._unrun: dict[str, Observation] = {}
         """Of instances whose pod no node has taken when it was removed: nothing of it is left to be seen."""
@@ -303,7 +305,7 @@ class KubernetesRuntime(Runtime):
                 self._reports.of(seen.name),
                 self._meter.of(seen),
                 over=self._over(seen),
-                ill=self._watch.ill(seen),
+                trouble=self._health.trouble(seen, self._watch.ill(seen) and not seen.stops),
                 leaving=self._nodes.leaving(seen.node),
                 balancer=self._services.balancer(instance),
             )
@@ -417,6 +419,7 @@ class KubernetesRuntime(Runtime):
         if there and time.monotonic() - (self._policy_at or 0.0) >= _POLICY_S:
             with suppress(RefusedError):  # which blocks the site; what runs is looked after all the same
                 self._hold_policy()
+        self._health.keep({seen.uid for seen in there})
         self._reports.begin()
         self._meter.begin(there)
 
@@ -466,6 +469,7 @@ class KubernetesRuntime(Runtime):
 
     @override
     def close(self) -> None:
+        self._health.close()
         self._reports.close()
         self._watch.close()
         self._nodes.close()

@@ -195,7 +195,7 @@ def observation(
     usage: Usage = NO_USAGE,
     *,
     over: bool = False,
-    ill: bool = False,
+    trouble: str = "",
     leaving: str = "",
     balancer: tuple[str, int] | str | None = None,
 ) -> Observation:
@@ -208,7 +208,7 @@ def observation(
         reports: Of its service.
         usage: What it uses, as known last.
         over: It has lingered for as long as it could.
-        ill: Its health check fails.
+        trouble: What is wrong with its service.
         leaving: Why its node is about to be without it.
         balancer: At which a load balancer passes on to it, or why there is no such address yet; None: there is none.
     """
@@ -229,13 +229,12 @@ def observation(
         if isinstance(balancer, str):
             return Observation(seen.attempt, Phase.STARTING, detail=balancer, reports=reports)
         host, port = balancer or where(seen, options, external)
-        detail = "its health check fails" if ill and not seen.stops else ""
         return Observation(
             seen.attempt,
             Phase.RUNNING,
             host,
             port,
-            detail=detail,
+            detail=trouble,
             leaving="" if seen.stops else seen.disrupted or leaving,
             reports=reports,
             **asdict(usage),
