@@ -17,9 +17,11 @@ from docker_site import Images
 from helm_chart import OLDEST, Values, helm_python, objects
 from helm_release import PATIENCE, HelmRelease
 from kubernetes_house import be_driven
+from postgres_server import own_server
 from value_sets import SETS
 
 from skytether.api.client import ApiError
+from skytether.api.rest import InstanceCreate
 from skytether.orchestrator.catalogue import read_builtin
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
@@ -119,6 +121,47 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
         assert second.pods("skytether.io/owner=demo-cluster"), "what belongs to the other is still there"
         second.uninstall()
         assert second.left() == []
+
+
+def test_two_orchestrators_over_postgresql_lose_and_double_nothing_when_the_leader_is_killed(
+    images: Images, kubeconfig: str, postgres_programs: None
+) -> None:
+    """In the midst of starts; and what the robots have is driven all the time."""
+    values = catalogue(images) | site() | {"database": {"existingSecret": "database"}}
+    values["orchestrator"] = {"replicas": 2, "service": {"type": "NodePort"}, "resources": {"requests": {"cpu": "50m"}}}
+    release = HelmRelease(images, kubeconfig, f"skytether-chart-{secrets.token_hex(4)}", values)
+    with ExitStack() as stack:
+        release.kubectl("create", "namespace", release.namespace)
+        stack.callback(release.close)
+        server = stack.enter_context(own_server(address=release.node()))
+        release.kubectl("create", "secret", "generic", "database", f"--from-literal=url={server.url_from_outside}")
+        release.install()
+        assert len(release.pods("app.kubernetes.io/component=orchestrator")) == 2
+
+        robot = stack.enter_context(release.robot("walker"))
+        held = release.ask(robot, "walker", "trail")
+        assert held.session is not None
+        key = robot.claim_session(held.id, "0123456789abcdef")
+        be_driven(held.session, key)
+        (pod,) = release.pods("skytether.io/owner=demo-cluster")
+
+        leader = release.leader()
+        asked = [robot.create_instance(InstanceCreate(robot="walker", service="trail", lease_s=600)) for _ in range(3)]
+        release.kubectl("delete", "pod", leader, "--grace-period=0", "--force")
+        be_driven(held.session, key)
+        for one in asked:
+            assert robot.wait_running(one.id, PATIENCE).restarts == 0
+        assert release.leader() != leader
+        assert robot.get_instance(held.id).restarts == 0
+        pods = release.pods("skytether.io/owner=demo-cluster")
+        assert pod in pods
+        assert len(pods) == 4
+
+        for one in (held, *asked):
+            robot.delete_instance(one.id)
+        release.kubectl("delete", "secret", "database")  # which is ours, and not the chart's
+        release.uninstall()
+        assert release.left() == []
 
 
 def _is_as_before(release: HelmRelease, secrets_: dict[str, str], pods: list[str], robot: str) -> None:

@@ -6,6 +6,7 @@ import base64
 import json
 import subprocess
 import time
+from contextlib import suppress
 from typing import Any
 
 from docker_site import Images
@@ -89,6 +90,19 @@ class HelmRelease:
     def node(self) -> str:
         addresses = self.get("nodes")["items"][0]["status"]["addresses"]
         return next(one["address"] for one in addresses if one["type"] == "InternalIP")
+
+    def leader(self) -> str:
+        """The name of the orchestrator's pod that leads."""
+        token = self.secret("operator.token")
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            for pod in self.get("pods", "-l", "app.kubernetes.io/component=orchestrator")["items"]:
+                port = pod["spec"]["containers"][0]["ports"][0]["containerPort"]
+                where = f"http://{pod['status'].get('podIP')}:{port}"
+                with suppress(ApiError, Unreachable), Client(where, token, insecure_http=True) as one:
+                    if "\nskytether_leader_epoch 0.0\n" not in one.metrics():
+                        return str(pod["metadata"]["name"])
+        raise AssertionError("none of the orchestrators leads")
 
     def robot(self, name: str) -> Client:
         """As whom a robot asks."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import socket
 import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
@@ -20,15 +21,22 @@ from skytether.lab.netns import Namespace
 
 @dataclass(frozen=True)
 class PostgresServer:
-    """On loopback; or at all addresses of a namespace, where everybody may use it."""
+    """On loopback; or at all addresses of a namespace, where everybody may use it; or also at another ``address`` of
+    this machine, with the password ``password``."""
 
     folder: Path
     port: int
     where: Namespace | None = None
+    address: str = ""
+    password: str = field(default_factory=lambda: secrets.token_hex(16))
 
     @property
     def url(self) -> str:
         return self.url_at("127.0.0.1")
+
+    @property
+    def url_from_outside(self) -> str:
+        return f"postgresql://skytether:{self.password}@{self.address}:{self.port}/postgres"
 
     def url_at(self, host: str, database: str = "postgres") -> str:
         return f"postgresql://skytether@{host}:{self.port}/{database}"
@@ -48,7 +56,7 @@ class PostgresServer:
             self.where.run(run)
 
     def start(self) -> None:
-        addresses = "127.0.0.1" if self.where is None else "*"
+        addresses = ",".join(filter(None, ("127.0.0.1", self.address))) if self.where is None else "*"
         self.control("-o", f"-p {self.port} -c listen_addresses={addresses} -c unix_socket_directories=", "start")
 
     def stop(self, mode: str = "immediate") -> None:
@@ -68,7 +76,7 @@ def as_postgres() -> list[str]:
 
 
 @contextmanager
-def own_server(where: Namespace | None = None) -> Iterator[PostgresServer]:
+def own_server(where: Namespace | None = None, address: str = "") -> Iterator[PostgresServer]:
     """One that runs; nothing is left of it. Its programs must be installed: see ``postgres_programs``."""
     folder = Path(tempfile.mkdtemp(prefix="skytether-pg-"))
     if os.geteuid() == 0:
@@ -81,9 +89,17 @@ def own_server(where: Namespace | None = None) -> Iterator[PostgresServer]:
     if where is not None:
         with (folder / "data/pg_hba.conf").open("a") as rules:
             rules.write("host all all 0.0.0.0/0 trust\n")
-    server = PostgresServer(folder, port, where)
+    server = PostgresServer(folder, port, where, address)
+    if address:
+        with (folder / "data/pg_hba.conf").open("a") as rules:
+            rules.write("host all all 0.0.0.0/0 scram-sha-256\n")
     server.start()
     try:
+        if address:
+            import psycopg
+
+            with psycopg.connect(server.url, autocommit=True) as connection:
+                connection.execute(f"ALTER USER skytether PASSWORD '{server.password}'")
         yield server
     finally:
         server.stop()
