@@ -71,6 +71,23 @@ def test_a_robot_is_driven_by_way_of_a_load_balancer(kubernetes_site: Kubernetes
         house.until(instance, State.STOPPED)
 
 
+def test_a_robot_in_the_clusters_network_is_driven_by_way_of_the_pods_address(
+    kubernetes_site: KubernetesSite, tmp_path: Path
+) -> None:
+    with (
+        opened(tmp_path / "state", kubernetes_site, reach="pod") as house,
+        kubernetes_site.images.another("virtual-trail") as image,
+    ):
+        house.put_trail(image)
+        instance = house.ask("trail")
+        record = house.until(instance, State.RUNNING)
+        (pod,) = kubernetes_site.there("pods")
+        assert (record.host, record.port) == (pod["status"]["podIP"], 7600)
+        house.drive(instance)
+        house.core.instances.delete(OPERATOR, instance)
+        house.until(instance, State.STOPPED)
+
+
 class RelayProgram:
     """``skytether relay`` as a process, that knows of the cluster's pods what the docs' rights let it."""
 
