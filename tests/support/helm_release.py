@@ -100,7 +100,7 @@ class HelmRelease:
                 port = pod["spec"]["containers"][0]["ports"][0]["containerPort"]
                 where = f"http://{pod['status'].get('podIP')}:{port}"
                 with suppress(ApiError, Unreachable), Client(where, token, insecure_http=True) as one:
-                    if "\nskytether_leader_epoch 0.0\n" not in one.metrics():
+                    if "\nskytether_leader_epoch{} 0.0\n" not in one.metrics():
                         return str(pod["metadata"]["name"])
         raise AssertionError("none of the orchestrators leads")
 

@@ -48,7 +48,7 @@ _LIMIT_S = 1200.0
 _LOOK_S = 0.25
 _RARELY_S = 3.0
 _SEED = 16
-_LEADS = re.compile(r"^skytether_leader_epoch (\S+)$", re.MULTILINE)
+_LEADS = re.compile(r"^skytether_leader_epoch(?:\{\})? (\S+)$", re.MULTILINE)
 _UNBOUNDED = {"QUOTAS_SITE_INSTANCES": "1000000", "QUOTAS_SERVICE_INSTANCES": "1000000", "LOGS_LEVEL": "debug"}
 
 
