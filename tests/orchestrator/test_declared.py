@@ -137,3 +137,40 @@ def test_without_that_file_nobody_has_such_a_token(tmp_path: Path) -> None:
     assert core.access._secrets.is_operator((tmp_path / "state" / "operator.token").read_text().strip())
     assert Principal(None).owns_state
     core.store.close()
+
+
+GROUP = "cloud: {provider: local, max: 2, cost: 3, options: {cpu: 2}}"
+
+
+def test_a_declared_group_is_made_changed_and_otherwise_left(start: Start) -> None:
+    core = start(f"{EDGE}\n{GROUP}")
+    assert [site.name for site in core.sites.all()] == ["edge"]
+    row = core.groups.row("cloud")
+    assert (row.asked.max, row.asked.cost, row.asked.options) == (2, 3, {"cpu": 2})
+    assert "cloud" in [one.name for one in start("").groups.all()], "what the file does not name stays"
+    core = start(GROUP.replace("max: 2", "max: 5"))
+    assert core.groups.row("cloud").asked.max == 5
+    assert core.groups.row("cloud").owner == row.owner, "by it its machines are found again"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("cloud: {provider: local, max: 1, min: 2}", "cloud: min is 2 and max 1: min must not be above max"),
+        ("cloud: {provider: local, max: 1, maximum: 2}", "cloud.maximum: unknown key, did you mean 'max'?"),
+        ("cloud: {provider: local, max: 1, runtime: docker}", "a site has a runtime, a group of sites a provider"),
+        ("cloud: {provider: lokal, max: 1}", "there is no provider 'lokal'; installed are: local"),
+        ("cloud: {provider: local, max: 1, options: {cpus: 1}}", "options.cpus: unknown key, did you mean 'cpu'?"),
+        ("cloud: {provider: local}", "cloud.max: is missing"),
+    ],
+)
+def test_a_declared_group_that_is_none_is_refused_in_a_sentence(start: Start, text: str, why: str) -> None:
+    with pytest.raises(InvalidError) as caught:
+        start(text)
+    assert why in str(caught.value)
+
+
+def test_a_group_does_not_change_its_provider(start: Start) -> None:
+    start(GROUP)
+    with pytest.raises(InvalidError, match="its machines are made by 'local': delete the group first"):
+        start(GROUP.replace("local", "openstack"))

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
+from skytether.api.groups import Stage
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import Refusal, Report, TopicReport
 from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.accounts import Account, of_robot, of_run
-from skytether.orchestrator.metrics import Metrics, Running, SiteGauges
+from skytether.orchestrator.metrics import GroupGauges, Metrics, Running, SiteGauges
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Observation, Phase
 
@@ -93,6 +94,9 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "instance_network_transmit_bytes_total",
         "placement_refusals_total",
         "reconcile_pass_seconds",
+        "group_machines",
+        "group_machines_limit",
+        "group_failures",
     }
     labels = set(re.findall(r"(\w+)=\"", text))
     assert labels <= ALLOWED | STANDARD
@@ -274,3 +278,13 @@ def test_sites_tell_capacity_load_and_what_they_promised(new_record, manifest) -
     ):
         assert line in text.splitlines()
     assert 'skytether_site_cpu_cores{site="gone"}' not in text
+
+
+def test_groups_of_sites_have_all_their_stages() -> None:
+    gauges = [GroupGauges("cloud", 3, 1, [Stage.READY, Stage.READY, Stage.JOINING])]
+    text = Metrics(list, 64, groups=lambda: gauges).text().decode()
+    assert 'skytether_group_machines{group="cloud",stage="ready"} 2' in text
+    assert 'skytether_group_machines{group="cloud",stage="joining"} 1' in text
+    assert 'skytether_group_machines{group="cloud",stage="making"} 0' in text
+    assert 'skytether_group_machines_limit{group="cloud"} 3' in text
+    assert 'skytether_group_failures{group="cloud"} 1' in text

@@ -12,6 +12,7 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
+from skytether.api.groups import Stage
 from skytether.api.rest import State
 from skytether.orchestrator import migrations
 from skytether.orchestrator.db import make_engine, migrate
@@ -90,6 +91,24 @@ ROWS: dict[str, dict[str, Any]] = {
         "cost": 0.0,
         "images": ["*"],
         "draining": False,
+    },
+    "site_groups": {
+        "name": "cloud",
+        "asked": {"name": "cloud", "provider": "local", "max": 2},
+        "owner": "00aa11bb22cc",
+        "draining": False,
+        "failures": 1,
+        "retry_at": NOW,
+        "reason": "the quota is used up",
+        "told": [[NOW, "a machine was made"]],
+    },
+    "machines": {
+        "name": "cloud-1",
+        "site_group": "cloud",
+        "stage": "joining",
+        "since": NOW,
+        "provided": "vm-1",
+        "reason": "",
     },
     "events": {"instance": "i1", "at": NOW, "state": "running", "reason": "", "code": ""},
     "idempotency": {"owner": "robot:walker", "key": "k", "body_sha256": "0" * 64, "instance": "i1", "created_at": NOW},
@@ -172,6 +191,10 @@ def look_through(store: Store, counts: dict[str, int]) -> None:
     assert store.services() == {"toy": MANIFEST}
     (site,) = store.sites()
     assert (site.name, site.options, site.speed, site.images) == ("lab", {"cpu": 2}, 1.0, ("*",))
+    groups = [(row.asked.name, row.asked.max, row.failures, row.told) for row in store.site_groups()]
+    assert groups == ([("cloud", 2, 1, ((NOW, "a machine was made"),))] if "site_groups" in counts else [])
+    machines = [(row.name, row.stage, row.provided) for row in store.machines()]
+    assert machines == ([("cloud-1", Stage.JOINING, "vm-1")] if "machines" in counts else [])
     sums = [account.sums() for account in store.accounts().values()]
     assert sums == ([{("control_overruns",): 7}] if "accounts" in counts else [])
     assert [(e.id, e.state) for e in store.events("i1", 0)] == [(1, State.RUNNING)]

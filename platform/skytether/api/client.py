@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 
 from .connection import AWAY, ApiError, Connection, Unreachable, addresses, json_of, parse, strange
+from .groups import Group, GroupCreate
 from .manifest import Manifest
 from .rest import (
     CHANGE,
@@ -274,6 +275,28 @@ class Client(Connection):
         before = time.perf_counter()
         self._request("GET", _at("sites", site, "probe"))
         return time.perf_counter() - before
+
+    # Groups of sites
+
+    def groups(self) -> list[Group]:
+        """Those whose machines are made as they are needed."""
+        return self._many(Group, "/groups")
+
+    def get_group(self, name: str) -> Group:
+        """One group, with its machines and what was done last."""
+        return self._one(Group, "GET", _at("groups", name))
+
+    def create_group(self, group: GroupCreate) -> Group:
+        """Add a group; with the token in the orchestrator's state folder only."""
+        return self._one(Group, "POST", "/groups", group)
+
+    def delete_group(self, name: str, *, drain: bool = False) -> bool:
+        """Forget a group without machines; with ``drain`` it gives them back, and goes with its last one.
+
+        Returns:
+            Whether it is gone by now.
+        """
+        return self._request("DELETE", _at("groups", name) + "?drain=true" * drain).status_code != HTTPStatus.ACCEPTED
 
     # Robots
 

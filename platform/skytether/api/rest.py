@@ -74,9 +74,11 @@ class Refusal(Strict):
     """Why one site was not chosen: the number asked for and the number found."""
 
     site: str
+    """Or a group of sites, where no site was chosen."""
     reason: str
     """Bounded, for metrics: ``tier``, ``architecture``, ``image``, ``cpu``, ``memory``, ``gpu``, ``rtt``, ``loss``,
-    ``runtime``, ``draining``, ``start``, ``unfit``, ``unreachable``, ``blocked``."""
+    ``runtime``, ``draining``, ``start``, ``unfit``, ``unreachable``, ``blocked``; of a group that a machine may be
+    made: ``group``."""
     detail: str
 
 

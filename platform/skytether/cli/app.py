@@ -16,6 +16,7 @@ from . import (
     doctor,
     echo,
     gate,
+    groups,
     lab,
     orchestrator,
     relay,
@@ -44,6 +45,7 @@ resources.robot_app.command("status")(robot_status.status)
 app.add_typer(orchestrator.app, name="orchestrator")
 app.add_typer(resources.service_app, name="service")
 app.add_typer(resources.site_app, name="site")
+app.add_typer(groups.app, name="group")
 app.add_typer(resources.instance_app, name="instance")
 resources.robot_app.command("run")(robot_run.run)
 app.add_typer(resources.robot_app, name="robot")

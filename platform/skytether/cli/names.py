@@ -43,6 +43,7 @@ def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
 
 services = _complete(lambda client: [(m.metadata.name, f"version {m.metadata.version}") for m in client.services()])
 sites = _complete(lambda client: [(s.name, f"{s.tier}, {s.state}") for s in client.sites()])
+groups = _complete(lambda client: [(g.name, f"{g.provider}, {len(g.machines)} of {g.max}") for g in client.groups()])
 robots = _complete(lambda client: [(r.name, ", ".join(r.services)) for r in client.robots()])
 tokens = _complete(lambda client: [(t.id, t.name) for t in client.tokens()])
 instances = _complete(

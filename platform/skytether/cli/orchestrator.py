@@ -183,7 +183,7 @@ def dismantle_sites(
     state_dir: StateDir = None,
 ) -> None:
     """End and remove all that is at the sites of a file. For when their orchestrators are gone for good."""
-    from skytether.orchestrator.declared import read_sites
+    from skytether.orchestrator.declared import read_groups, read_sites
     from skytether.orchestrator.defaults import default_state_dir
     from skytether.orchestrator.errors import InvalidError
     from skytether.orchestrator.runtimes.base import RuntimeFailure
@@ -191,6 +191,11 @@ def dismantle_sites(
 
     try:
         declared = read_sites(file)
+        if groups := [one.name for one in read_groups(file)]:
+            text = (
+                f"machines of {', '.join(groups)} are known to the orchestrators' database only, and stay: delete them"
+            )
+            console.print(f"warning: {text} with `skytether group delete NAME --drain` while one runs", markup=False)
         dismantle(declared, (state_dir or default_state_dir()).expanduser() / "sites")
     except InvalidError as error:
         fail(str(error), 2)

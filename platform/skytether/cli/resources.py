@@ -56,7 +56,7 @@ def show_service(name: ServiceName, url: Url = None, token_file: TokenFile = Non
     """Show a service's manifest."""
     with connected(url, token_file) as client:
         found = client.get_service(name)
-    _show(found, json)
+    show(found, json)
 
 
 @service_app.command("delete")
@@ -92,7 +92,7 @@ def show_site(name: SiteName, url: Url = None, token_file: TokenFile = None, jso
     """Show one site."""
     with connected(url, token_file) as client:
         found = client.get_site(name)
-    _show(found, json)
+    show(found, json)
 
 
 @site_app.command("add")
@@ -122,7 +122,7 @@ def add_site(
         key, is_, value = entry.partition("=")
         if not is_:
             fail(f"--option {entry}: write KEY=VALUE", 2)
-        options[key] = _value(value)
+        options[key] = value_of(value)
     asked = {"name": name, "runtime": runtime, "tier": tier, "options": options, "speed": speed, "cost": cost}
     try:
         request = SiteCreate.model_validate({**asked, "images": tuple(image or ("*",))})
@@ -131,11 +131,11 @@ def add_site(
         fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
     with connected(url, token_file) as client:
         made = client.create_site(request)
-    _show(made, json)
+    show(made, json)
 
 
-def _value(text: str) -> Any:
-    """As YAML reads it; what is none is text."""
+def value_of(text: str) -> Any:
+    """A value of an option, as YAML reads it; what is none is text."""
     import yaml
 
     try:
@@ -212,7 +212,7 @@ def create_instance(
     with connected(url, token_file) as client:
         made = client.create_instance(request)
         made = until_running(client, made.id, timeout_s) if wait else made
-    _show(made, json)
+    show(made, json)
 
 
 @instance_app.command("show")
@@ -220,7 +220,7 @@ def show_instance(instance: InstanceId, url: Url = None, token_file: TokenFile =
     """Show one instance, but for its session's key."""
     with connected(url, token_file) as client:
         found = client.get_instance(instance)
-    _show(found, json)
+    show(found, json)
 
 
 @instance_app.command("logs")
@@ -266,7 +266,7 @@ def migrate_instance(
     with connected(url, token_file) as client:
         made = client.migrate_instance(instance, site)
         made = until_running(client, made.id, timeout_s) if wait else made
-    _show(made, json)
+    show(made, json)
 
 
 @instance_app.command("events")
@@ -443,7 +443,8 @@ def delete_robot(
         client.delete_robot(name)
 
 
-def _show(model: BaseModel, json: bool) -> None:
+def show(model: BaseModel, json: bool) -> None:
+    """All of one thing, as YAML or JSON on standard output."""
     import yaml
 
     if json:

@@ -19,22 +19,26 @@ from .accounts import Account
 from .catalogue import Catalogue
 from .clocks import SharedClock
 from .db import GONE
-from .declared import read_sites
+from .declared import read_groups, read_sites
+from .demand import Demand
 from .discovery import advertised, named, targets
 from .errors import OutdatedError
 from .events import Broker
 from .exchange import Exchange
 from .gates import Gates
+from .groups import Groups, load_provider
 from .instances import Instances
 from .leader import Leadership
 from .loops import Loop
-from .metrics import Metrics, Running, SiteGauges
+from .metrics import GroupGauges, Metrics, Running, SiteGauges
 from .moves import Moves
+from .providers.base import Provider
 from .quotas import Quotas
 from .reconcile import Reconciler
 from .reports import PERIOD, Reports
 from .rotation import Rotation
 from .runtimes.base import Runtime
+from .scaler import Scaler
 from .security import SecretFileError, Secrets, close_folder
 from .settings import Settings
 from .sites import Sites, load_runtime
@@ -61,6 +65,7 @@ class Orchestrator:
         settings: Settings,
         clock: Callable[[], float] | None = None,
         find_runtime: Callable[[str], type[Runtime]] = load_runtime,
+        find_provider: Callable[[str], type[Provider]] = load_provider,
     ) -> None:
         """Read or make the secrets; nothing runs before ``start``.
 
@@ -68,6 +73,7 @@ class Orchestrator:
             settings: Its state folder is made if it is not there.
             clock: Seconds since the epoch; None: the database server's, where there is one, or this machine's.
             find_runtime: Gives a runtime by its name; by entry point unless told otherwise.
+            find_provider: Likewise a provider of machines.
 
         Raises:
             SecretFileError: A file that holds a secret cannot be used, or others could read the state folder.
@@ -100,6 +106,7 @@ class Orchestrator:
             self._gates,
             self.quotas,
             lambda: self.leadership.epoch,
+            self._group_gauges,
         )
         self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
         self.catalogue = Catalogue(self.store, settings.catalog)
@@ -140,6 +147,29 @@ class Orchestrator:
             settings.weights,
         )
         self.reconciler.moves = moves
+        demand = Demand(
+            self.store,
+            lambda: self.groups,
+            lambda: self.sites,
+            self.reconciler.promised,
+            clock,
+            settings.weights,
+        )
+        self.scaler = Scaler(
+            self.store,
+            lambda: self.groups,
+            lambda: self.sites,
+            moves,
+            demand,
+            self.leadership,
+            clock,
+            wake_placer=self._wake_placer,
+            forget_site=self.metrics.forget_site,
+        )
+        self.reconciler.prospects = demand.prospects
+        self.groups = Groups(
+            settings.state_dir / "groups", self.store, self._unless_outdated(self.scaler.turn), find_provider
+        )
         self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
         self.elector = Loop("elector", self._elect, time.monotonic)
@@ -201,7 +231,8 @@ class Orchestrator:
             SecretFileError: The database belongs to orchestrators with another secret key.
         """
         self.catalogue.load(self.settings.catalogue_dir)
-        declared = read_sites(self.settings.sites_file) if self.settings.sites_file else []
+        file = self.settings.sites_file
+        declared, groups = (read_sites(file), read_groups(file)) if file else ([], [])
         self.store.migrate()
         if self._shared_clock is not None:
             self._shared_clock.look()
@@ -212,6 +243,7 @@ class Orchestrator:
         self.elector.start()
         self.elector.wait_first(_FIRST_LOOK)
         self.sites.start(self.settings.local_site, declared)
+        self.groups.start(groups)
         self.placer.start()
         self.writer.start()
         self.keeper.start()
@@ -282,6 +314,7 @@ class Orchestrator:
         self.placer.stop(timeout=1.0)  # first: each instance that ends would have it look for a place for all that wait
         if self.settings.stop_instances:
             self._stop_instances()
+        self.groups.stop()
         self.sites.stop()
         self.keeper.stop(timeout=1.0)
         self.writer.stop(timeout=1.0)
@@ -359,4 +392,13 @@ class Orchestrator:
             return []
         return [
             SiteGauges(site.name, None if site.unreachable else site.capacity, site.load) for site in self.sites.all()
+        ]
+
+    def _group_gauges(self) -> list[GroupGauges]:
+        if not self.leadership.leads:
+            return []
+        machines = self.store.machines()
+        return [
+            GroupGauges(row.name, row.asked.max, row.failures, [m.stage for m in machines if m.group == row.name])
+            for row in self.store.site_groups()
         ]

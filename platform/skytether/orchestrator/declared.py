@@ -1,4 +1,4 @@
-"""Sites that a file declares: what ``sites_file`` names, as a chart or a configuration tool writes it."""
+"""Sites and groups that a file declares: what ``sites_file`` names, as a chart or a configuration tool writes it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from skytether.api.faults import Fault
+from skytether.api.groups import GroupCreate
 from skytether.api.rest import SiteCreate
 from skytether.api.yaml import YamlError, read_yaml
 
 from .errors import InvalidError
 from .runtimes.base import Runtime
 from .validation import parse
+
+_GROUP = "provider"
+"""The key that a group has, and no site."""
 
 
 def read_sites(path: Path) -> list[SiteCreate]:
@@ -20,6 +24,27 @@ def read_sites(path: Path) -> list[SiteCreate]:
     Raises:
         InvalidError: It cannot be read, or a key is wrong; the text begins with the path.
     """
+    return [
+        parse(SiteCreate, {"name": name, **given}, str(path), (name,))
+        for name, given in _entries(path)
+        if _GROUP not in given
+    ]
+
+
+def read_groups(path: Path) -> list[GroupCreate]:
+    """The groups of sites of the same file: those with a ``provider``.
+
+    Raises:
+        InvalidError: It cannot be read, or a key is wrong; the text begins with the path.
+    """
+    return [
+        parse(GroupCreate, {"name": name, **given}, str(path), (name,))
+        for name, given in _entries(path)
+        if _GROUP in given
+    ]
+
+
+def _entries(path: Path) -> list[tuple[str, dict[str, Any]]]:
     try:
         documents = read_yaml(path)
     except YamlError as error:
@@ -27,14 +52,15 @@ def read_sites(path: Path) -> list[SiteCreate]:
     document = documents[0] if documents else {}
     if len(documents) > 1 or not isinstance(document, dict):
         raise InvalidError([Fault("", "must hold one document: the sites by their names")], str(path))
-    found = []
     for name, given in document.items():
         if not isinstance(given, dict):
             raise InvalidError(
                 [Fault(str(name), "must be what is known of the site: tier, runtime, options")], str(path)
             )
-        found.append(parse(SiteCreate, {"name": name, **given}, str(path), (str(name),)))
-    return found
+        if _GROUP in given and "runtime" in given:
+            text = "a site has a runtime, a group of sites a provider: leave one of them out"
+            raise InvalidError([Fault(str(name), text)], str(path))
+    return [(str(name), given) for name, given in document.items()]
 
 
 def stored_as(asked: SiteCreate, there: SiteCreate | None, kind: type[Runtime]) -> SiteCreate:

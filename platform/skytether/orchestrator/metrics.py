@@ -7,12 +7,13 @@ renewal, at any of several orchestrators; the one that leads exports them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 
 from skytether.api.exposition import Family, Sums, counter, exposition, gauge
+from skytether.api.groups import Stage
 from skytether.api.manifest import ANY_TOPIC
 from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, counters_of, gates_of, gauges_of
 from skytether.api.rest import GateReport, Refusal, Report
@@ -52,6 +53,18 @@ class SiteGauges:
     load: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class GroupGauges:
+    """A group of sites at the moment of a scrape."""
+
+    name: str
+    most: int
+    failures: int
+    """In a row."""
+    stages: Sequence[Stage]
+    """Of its machines."""
+
+
 class Metrics:
     """The registry of one orchestrator, and what feeds it."""
 
@@ -65,6 +78,7 @@ class Metrics:
         gates: Callable[[], Mapping[str, GateReport]] = dict,
         quotas: Quotas | None = None,
         epoch: Callable[[], int] = int,
+        groups: Callable[[], Iterable[GroupGauges]] = tuple,
     ) -> None:
         """All callables are asked at each scrape.
 
@@ -77,8 +91,10 @@ class Metrics:
             gates: What robots say of their gates now, by robot.
             quotas: What robots may have, and what was refused for that.
             epoch: As whose leader the orchestrator acts; 0: it does not lead.
+            groups: What is known of the groups of sites.
         """
         self._epoch = epoch
+        self._groups = groups
         self._quotas = quotas
         self._running = running
         self._sites = sites
@@ -189,6 +205,7 @@ class Metrics:
         yield _names(accounts, {robot for robot, _ in counted})
         yield from counters_of(used, USED)
         yield from _sites(self._sites(), running)
+        yield from _groups(self._groups())
         yield from counters_of(sums)
         yield from gates_of(self._gates())
         yield from gauges_of(
@@ -285,6 +302,18 @@ def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[
     yield gauge("site_load_ratio", "Share of the site's processors that is busy", ("site",), load)
     yield gauge("site_promised_cpu_cores", "Processors that the instances there asked for", ("site",), promised)
     yield gauge("site_instances", "Instances there that have not ended", ("site",), count)
+
+
+def _groups(groups: Iterable[GroupGauges]) -> Iterator[Family]:
+    machines, most, failures = Sums(), Sums(), Sums()
+    for group in groups:
+        for stage in Stage:
+            machines.put((group.name, stage.value), group.stages.count(stage))
+        most.put((group.name,), group.most)
+        failures.put((group.name,), group.failures)
+    yield gauge("group_machines", "Machines of the group of sites", ("group", "stage"), machines)
+    yield gauge("group_machines_limit", "Machines that the group may have", ("group",), most)
+    yield gauge("group_failures", "Machines in a row that were not made, or did not become sites", ("group",), failures)
 
 
 def _few(counts: Mapping[str, int]) -> dict[str, int]:

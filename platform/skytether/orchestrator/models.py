@@ -51,6 +51,32 @@ sites = Table(
     Column("draining", Boolean, nullable=False, server_default=false()),
 )
 
+site_groups = Table(
+    "site_groups",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("asked", JSON, nullable=False),
+    Column("owner", String(32), nullable=False, comment="Word by which its machines are found again"),
+    Column("draining", Boolean, nullable=False, server_default=false()),
+    Column("failures", Integer, nullable=False, server_default="0"),
+    Column("retry_at", Float, nullable=False, server_default="0"),
+    Column("reason", String(1024), nullable=False, server_default=""),
+    Column("told", JSON, nullable=False, server_default="[]", comment="The last events, oldest first"),
+    comment="Groups of sites, whose machines are made and destroyed as they are needed",
+)
+
+machines = Table(
+    "machines",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("site_group", String(63), ForeignKey("site_groups.name"), nullable=False, index=True),
+    Column("stage", String(16), nullable=False),
+    Column("since", Float, nullable=False, comment="Of the stage"),
+    Column("provided", String(255), comment="The provider's id; NULL: it has not said yet"),
+    Column("reason", String(1024), nullable=False, server_default=""),
+    comment="A row is there before its machine is made, and until that is destroyed",
+)
+
 robots = Table(
     "robots",
     metadata,

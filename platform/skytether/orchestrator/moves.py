@@ -225,6 +225,32 @@ class Moves:
         if reason != record.reason:
             self._store.change(record, now, reason=reason)
 
+    def displace(self, record: Record, why: str) -> None:
+        """Place anew what was lost with its site; ``why`` is a sentence."""
+        now = self._clock()
+        if record.state is State.STOPPING:
+            self._store.change(record, now, state=State.STOPPED, reason=why)
+            return
+        if record.spare:
+            self._store.change(record, now, state=State.FAILED, reason=why)
+            return
+        self.fail_over(record, why)
+        self._store.change(
+            record,
+            now,
+            through=State.STARTING if record.state is State.RUNNING else None,
+            state=State.PENDING,
+            reason=f"{why}: trying another site",
+            site=None,
+            host=None,
+            port=None,
+            attempt=record.attempt + 1,
+            restarts=record.restarts + 1,
+            start_at=0.0,
+            started_at=None,
+            running_at=None,
+        )
+
     def _replace(self, record: Record, report: Report, now: float) -> None:
         if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):
             return
@@ -252,7 +278,7 @@ class Moves:
     def _leaving(self, record: Record) -> str:
         """Why its site is about to end it; empty: it is not."""
         site = self._sites().find(record.site)
-        return site.leaving.get(record.id, "") if site is not None else ""
+        return (site.leaving.get(record.id, "") or site.emptied) if site is not None else ""
 
     def _reachable(self, record: Record) -> bool:
         site = self._sites().find(record.site)

@@ -58,6 +58,18 @@ class Candidate:
     """Of one instance, in the operator's unit."""
     images: tuple[str, ...] = ("*",)
     """Patterns of the images that may run there."""
+    fills: bool = False
+    """It is better the fuller it is, so that others like it become idle and can be given back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prospect:
+    """What a group of sites could do for an instance that no site takes."""
+
+    refusal: Refusal
+    """Under the group's name: why none of its machines could take it, or what keeps it from being made at once."""
+    hopeless: bool
+    """None could: waiting for one is no use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +124,8 @@ def score(needs: Needs, measured: Measurement, site: Candidate, weights: Weights
     cores = max(site.total.cpu, 1e-9)
     promised = (site.used.cpu + needs.cpu) / cores
     busy = min(max(promised, site.load + needs.cpu / cores), _FULLEST)
+    crowded = min(promised, 1.0)
+    spread = weights.fill_ms * (1.0 - crowded) if site.fills else weights.spread_ms * crowded
     return Score(
         site=site.name,
         rtt_ms=round(rtt, 3),
@@ -119,7 +133,7 @@ def score(needs: Needs, measured: Measurement, site: Candidate, weights: Weights
         compute_ms=round(compute, 3),
         queue_ms=round(compute * busy / (1 - busy), 3),
         cost_ms=round(weights.cost_ms * site.cost, 3),
-        spread_ms=round(weights.spread_ms * min(promised, 1.0), 3),
+        spread_ms=round(spread, 3),
     )
 
 

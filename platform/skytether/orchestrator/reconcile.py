@@ -21,7 +21,7 @@ from .db import GONE
 from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
 from .moves import Moves, told
-from .placement import UNSTARTED, Decision, place
+from .placement import UNSTARTED, Decision, Prospect, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .promises import NOTHING, Promises, Sums
 from .records import Record
@@ -59,6 +59,10 @@ _PROMISES_AGE = 3.0
 """Seconds for which sums are good enough for a request at an orchestrator that does not lead."""
 
 
+def _none_grows(_: Record) -> Sequence[Prospect]:
+    return ()
+
+
 class Reconciler:
     """Makes what is what should be, while this orchestrator leads; otherwise it looks only.
 
@@ -67,6 +71,8 @@ class Reconciler:
 
     sites: Sites
     moves: Moves
+    prospects: Callable[[Record], Sequence[Prospect]] = staticmethod(_none_grows)
+    """What groups of sites could still do for an instance that no site takes."""
 
     def __init__(
         self,
@@ -312,7 +318,15 @@ class Reconciler:
         if runs:
             sites = [replace(site, blocked=None, unfit=None) for site in sites]
         spec = record.spec
-        return place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
+        decision = place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
+        if decision.site is not None or record.pinned is not None or record.spare:
+            return decision
+        prospects = self.prospects(record)
+        return replace(
+            decision,
+            refused=(*decision.refused, *(prospect.refusal for prospect in prospects)),
+            hopeless=decision.hopeless and all(prospect.hopeless for prospect in prospects),
+        )
 
     def _allows(self, record: Record, site: Site) -> bool:
         """One that replaces another does not go where that is, unless it was told to or that one is ended there."""

@@ -76,6 +76,9 @@ class Weights(Group):
     """Delay that one unit of a site's `cost` is worth."""
     spread_ms: Weight = 2.0
     """Delay that an empty site is worth beside a full one: a few milliseconds, so that near sites fill evenly."""
+    fill_ms: Weight = 20.0
+    """The same the other way round, for machines of a group: those in use are filled, as far as waiting for a processor
+    lets them, so that the others become idle and are given back."""
     migrate_ms: Weight = 20.0
     """By how much another site must be better before a warm instance is left aside, or a running one is moved."""
     unmeasured_ms: Weight = 200.0

@@ -126,6 +126,10 @@ class Site:
         """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
         self.draining = False
         """It takes no more instances, and is deleted with its last one."""
+        self.group = ""
+        """Whose machine it is, for whoever leads; empty: of no group."""
+        self.emptied = ""
+        """Why what runs here is moved, as a sentence; empty: it stays."""
         self.called = False
         """Somebody started or ended an instance here since the last pass began."""
         self.passed_at = -math.inf
@@ -186,6 +190,7 @@ class Site:
             speed=self.asked.speed,
             cost=self.asked.cost,
             images=self.asked.images,
+            fills=bool(self.group),
         )
 
 

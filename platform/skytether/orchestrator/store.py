@@ -40,8 +40,8 @@ from skytether.api.rest import State
 from skytether.api.service_report import ServiceReport
 
 from .accounts import MOST_NAMES, Account, merge
-from .database import Database
 from .discovery import NAME
+from .group_store import GroupStore
 from .models import accounts, events, idempotency, instances, reports
 from .records import Record, check_move
 
@@ -171,7 +171,7 @@ class KeyReusedError(Exception):
     """An idempotency key came again with another body."""
 
 
-class Store(Database):
+class Store(GroupStore):
     """The database with its instances. Safe from any thread."""
 
     def __init__(self, url: str, name: str = NAME, robot_names: int = MOST_NAMES) -> None:
