@@ -175,12 +175,51 @@ Topics = Annotated[tuple[TopicSpec, ...], Field(max_length=1000)]
 """Of one service: a robot sets each of them up, and checks it, beside driving."""
 
 
+class CpuRange(Strict):
+    """Between how many cores an instance may come to have."""
+
+    min: Annotated[float, Field(gt=0, le=10_000)]
+    max: Annotated[float, Field(gt=0, le=10_000)]
+
+
+class MemoryRange(Strict):
+    """Between how much memory [MiB] an instance may come to have."""
+
+    min: Annotated[int, Field(gt=0, le=100_000_000)]
+    max: Annotated[int, Field(gt=0, le=100_000_000)]
+
+
+class Scaling(Strict):
+    """Within which bounds what an instance has follows what it takes, while it runs."""
+
+    cpu: CpuRange | None = None
+    """None: its cores stay as they are."""
+    memory_mb: MemoryRange | None = None
+    """None: its memory stays as it is."""
+    step_ms: Annotated[float, Field(gt=0, le=60_000)] | None = None
+    """Of 20 steps of the service 19 are to take no longer; else it gets more cores. None: its load alone counts."""
+
+    @model_validator(mode="after")
+    def _is_between_something(self) -> Scaling:
+        for key in ("cpu", "memory_mb"):
+            range_ = getattr(self, key)
+            if range_ is not None and range_.min > range_.max:
+                raise ValueError(f"scaling.{key}: min is {range_.min:g}, above max, {range_.max:g}")
+        if self.cpu is None and self.memory_mb is None:
+            raise ValueError("scaling: say what follows the load, cpu or memory_mb, each with min and max")
+        if self.step_ms is not None and self.cpu is None:
+            raise ValueError("scaling.step_ms: longer steps get more cores: say with scaling.cpu how many")
+        return self
+
+
 class Needs(Strict):
     """What a site and a link must offer before an instance may run there."""
 
     cpu: Annotated[float, Field(gt=0)] = 0.1
     """Cores."""
     memory_mb: Annotated[int, Field(gt=0)] = 128
+    scaling: Scaling | None = None
+    """Both are what an instance begins with, and follow what it takes; None: it keeps what it has."""
     gpu: Annotated[int, Field(ge=0)] = 0
     compute_ms: Annotated[float, Field(gt=0, le=60_000)] = 5.0
     """One step of the service on a core of its own; placement reckons delay with it."""
@@ -213,6 +252,14 @@ class Needs(Strict):
                 except ValueError as error:
                     raise ValueError(f"'{text}': {error}") from None
         return egress
+
+    @model_validator(mode="after")
+    def _begins_within_its_scaling(self) -> Needs:
+        for key in ("cpu", "memory_mb"):
+            range_, begins = getattr(self.scaling, key, None), getattr(self, key)
+            if range_ is not None and not range_.min <= begins <= range_.max:
+                raise ValueError(f"{key} is {begins:g}, and scaling.{key} goes from {range_.min:g} to {range_.max:g}")
+        return self
 
     @property
     def openings(self) -> tuple[Opening, ...]:
@@ -266,6 +313,9 @@ class ServiceSpec(Strict):
             limit, need = getattr(self.limits, key), getattr(self.needs, key)
             if limit is not None and limit < need:
                 raise ValueError(f"limits.{key} is {limit:g}, less than needs.{key}, {need:g}")
+            range_ = getattr(self.needs.scaling, key, None)
+            if limit is not None and range_ is not None and limit < range_.max:
+                raise ValueError(f"limits.{key} is {limit:g}, less than needs.scaling.{key}.max, {range_.max:g}")
         return self
 
     @field_validator("graph", mode="before")
@@ -311,6 +361,16 @@ class ServiceSpec(Strict):
             if len(shared) > 1:
                 raise ValueError(f"'{shared[0]}' and '{shared[1]}': one topic of each direction may be shared")
         return self
+
+    def sized(self, cpu: float, memory_mb: int) -> ServiceSpec:
+        """The same with other needs of cores and memory [MiB]; limits below them are raised to them."""
+        needs = self.needs.model_copy(update={"cpu": cpu, "memory_mb": memory_mb})
+        raised = {
+            key: need
+            for key, need in (("cpu", cpu), ("memory_mb", memory_mb))
+            if (limit := getattr(self.limits, key)) is not None and limit < need
+        }
+        return self.model_copy(update={"needs": needs, "limits": self.limits.model_copy(update=raised)})
 
     @property
     def robot_topics(self) -> Topics:

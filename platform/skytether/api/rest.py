@@ -7,7 +7,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, FailFast, Field
+from pydantic import AfterValidator, BeforeValidator, FailFast, Field, model_validator
 
 from .manifest import Name, Needs, Strict, Tier, Topics
 
@@ -139,6 +139,33 @@ class SessionKey(Strict):
     """32 bytes, base64."""
 
 
+class Size(Strict):
+    """What one instance may count on at its site."""
+
+    cpu: float
+    """Cores."""
+    memory_mb: int
+    """MiB."""
+
+    def __str__(self) -> str:
+        return f"{self.cpu:g} core{'' if self.cpu == 1 else 's'} and {self.memory_mb} MiB"
+
+
+class Resize(Strict):
+    """Give a running instance more or less, without a restart."""
+
+    cpu: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    """Cores; None: as many as it has."""
+    memory_mb: Annotated[int, Field(gt=0, le=100_000_000)] | None = None
+    """MiB; None: as much as it has."""
+
+    @model_validator(mode="after")
+    def _changes_something(self) -> Resize:
+        if self.cpu is None and self.memory_mb is None:
+            raise ValueError("say what it is to have: cpu, memory_mb or both")
+        return self
+
+
 class Instance(Strict):
     """One running copy of a service, for one robot."""
 
@@ -150,6 +177,10 @@ class Instance(Strict):
     """One sentence a person can act on; empty while all is well."""
     params: dict[str, Any] = {}
     placement: Placement | None = None
+    size: Size | None = None
+    """What it has: what its service needs, or what it was given since."""
+    resize: Size | None = None
+    """What it is about to have instead."""
     replaces: str | None = None
     """The instance that its robot is to let go as soon as this one runs."""
     successor: str | None = None
