@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes.base import Phase
+from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
 
 Kit = Any
 
@@ -222,3 +222,27 @@ def test_what_a_run_reports_is_seen_and_the_next_run_begins_anew(kit: Kit) -> No
             runtime.tidy()
             time.sleep(0.05)
         assert [(r.number, r.code, r.message) for r in seen.reports] == [(1, "said", f"run {attempt} is up")]
+
+
+def test_what_a_run_may_take_is_changed_while_it_runs_or_refused_as_told(kit: Kit) -> None:
+    runtime = kit.open()
+    launch = kit.launch()
+    runtime.start(launch)
+    before = kit.until(runtime, Phase.RUNNING)
+    has = launch.spec.needs
+    larger, keeps = launch.spec.sized(2 * has.cpu, 2 * has.memory_mb), runtime.keeps_size(launch.spec)
+    if keeps:
+        with pytest.raises(RuntimeFailure):
+            runtime.resize("i1", 1, larger)
+        return
+    assert not runtime.resize("i1", 2, larger), "of another run"
+    assert not runtime.resize("nobody", 1, larger)
+    for spec in (larger, larger, launch.spec, launch.spec):
+        deadline = time.monotonic() + kit.patience
+        while not runtime.resize("i1", 1, spec):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    after = kit.until(runtime, Phase.RUNNING)
+    assert (after.attempt, after.port) == (before.attempt, before.port)
+    assert runtime.logs("i1", 100).count("run 1") == 1
+    assert kit.running() == 1

@@ -27,8 +27,8 @@ from skytether.orchestrator.autoscaler import (
     Trend,
     bounded,
     decide,
-    least_memory_mb,
 )
+from skytether.orchestrator.runtimes.containers import least_memory_mb
 
 CPU = Scaling(cpu={"min": 0.25, "max": 4})
 MEMORY = Scaling(memory_mb={"min": 64, "max": 2048})

@@ -10,7 +10,7 @@ import pytest
 
 from skytether.api.groups import Stage
 from skytether.api.report_metrics import counts_of
-from skytether.api.rest import Refusal, Report, TopicReport
+from skytether.api.rest import Refusal, Report, Size, TopicReport
 from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.accounts import Account, of_robot, of_run
 from skytether.orchestrator.metrics import GroupGauges, Metrics, Running, SiteGauges
@@ -18,7 +18,19 @@ from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Observation, Phase
 
 NewRecord = Callable[..., Record]
-ALLOWED = {"robot", "service", "topic", "priority", "site", "direction", "outcome", "source", "reason", "phase"}
+ALLOWED = {
+    "robot",
+    "service",
+    "topic",
+    "priority",
+    "site",
+    "direction",
+    "outcome",
+    "source",
+    "reason",
+    "phase",
+    "resource",
+}
 STANDARD = {"le", "quantile"}
 """Prometheus' own, of histograms and summaries."""
 
@@ -53,6 +65,8 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
     metrics, report = reported(running)
     metrics.phase(record, "total", 0.4)
     metrics.refused("toy", [Refusal(site="far", reason="rtt", detail="")])
+    metrics.resized(record, Size(cpu=1, memory_mb=1), Size(cpu=2, memory_mb=1), "busy")
+    metrics.not_resized(record)
     report(
         record,
         Report(
@@ -86,6 +100,10 @@ def test_every_name_and_label_is_one_of_the_architectures(new_record: NewRecord,
         "gate_troubles",
         "robot_names",
         "instance_start_seconds",
+        "instance_promised_cpu_cores",
+        "instance_promised_memory_bytes",
+        "instance_resizes_total",
+        "instance_resize_failures_total",
         "instance_cpu_seconds_total",
         "instance_memory_bytes",
         "instance_restarts_total",

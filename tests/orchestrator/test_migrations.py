@@ -65,6 +65,8 @@ INSTANCE: dict[str, Any] = {
     "claim": None,
     "key_id": "",
     "said": 0,
+    "size": None,
+    "resize": None,
 }
 """A value for every column that a table had at any time; what a version has not is left out."""
 ROWS: dict[str, dict[str, Any]] = {

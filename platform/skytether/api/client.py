@@ -27,6 +27,7 @@ from .rest import (
     Neighbours,
     Problem,
     Renew,
+    Resize,
     Robot,
     RobotCreate,
     RobotCreated,
@@ -88,6 +89,13 @@ class Client(Connection):
     def migrate_instance(self, instance_id: str, site: str | None = None) -> Instance:
         """Move it; the answer is the instance that its robot changes to."""
         return self._one(Instance, "POST", _at("instances", instance_id, "migrate"), Migrate(site=site))
+
+    def resize_instance(self, instance_id: str, resize: Resize) -> Instance:
+        """Give it more or less while it runs; ``resize`` of the answer says so until it has it.
+
+        Where its site cannot, its robot changes to its ``successor``.
+        """
+        return self._one(Instance, "PATCH", _at("instances", instance_id), resize)
 
     def claim_session(self, instance_id: str, claim: str) -> str:
         """The key of its session [base64], which one claim gets and no other; may be called again with the same."""

@@ -11,7 +11,7 @@ import typer
 from . import names
 from .connection import Json, TokenFile, Url, connected
 from .output import console, fail, or_dash, plain, print_foreign, print_json, print_table
-from .waiting import until_running
+from .waiting import until_resized, until_running
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -267,6 +267,34 @@ def migrate_instance(
         made = client.migrate_instance(instance, site)
         made = until_running(client, made.id, timeout_s) if wait else made
     show(made, json)
+
+
+@instance_app.command("resize")
+def resize_instance(
+    instance: InstanceId,
+    cpu: Annotated[float | None, typer.Option(min=0.001, max=10_000, help="Cores.")] = None,
+    memory: Annotated[int | None, typer.Option(min=1, max=100_000_000, help="MiB.")] = None,
+    wait: Annotated[bool, typer.Option(help="Wait until it has that.")] = True,
+    timeout_s: Timeout = 90.0,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Give a running instance more or less, without a restart.
+
+    Where its site cannot, another one is started that has it, and its robot changes to that.
+    """
+    from skytether.api.rest import Resize
+
+    if cpu is None and memory is None:
+        fail("say what it is to have: --cpu, --memory or both", 2)
+    with connected(url, token_file) as client:
+        found = client.resize_instance(instance, Resize(cpu=cpu, memory_mb=memory))
+        wanted = found.resize or found.size
+        found = until_resized(client, instance, timeout_s) if wait else found
+    if wait and found.id == instance and found.size != wanted:
+        fail(f"it was not given that, and has {found.size}: `skytether instance events {instance}` says why")
+    _show(found, json)
 
 
 @instance_app.command("events")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Protocol
 
 from .output import console
@@ -9,6 +10,9 @@ from .output import console
 if TYPE_CHECKING:
     from skytether.api.client import Client
     from skytether.api.rest import Instance, InstanceEvent
+
+
+_LOOK_S = 0.1
 
 
 def until_running(client: Client, instance: str, timeout_s: float) -> Instance:
@@ -23,6 +27,32 @@ def until_running(client: Client, instance: str, timeout_s: float) -> Instance:
         return client.wait_running(instance, timeout_s, Lines().show)
     with _Bar(instance) as bar:
         return client.wait_running(instance, timeout_s, bar.show)
+
+
+def until_resized(client: Client, instance: str, timeout_s: float) -> Instance:
+    """Wait until an instance has what it is to have, or another one runs in its place that has it.
+
+    Returns:
+        Whichever of the two its robot ends up with, as it is now.
+
+    Raises:
+        NotRunning: It took too long.
+        ApiError: As of every request.
+        Unreachable: As of every request.
+    """
+    from skytether.api.client import NotRunning
+
+    until = time.monotonic() + timeout_s
+    while True:
+        found = client.get_instance(instance)
+        if found.successor is not None:
+            console.print(f"{instance}: its robot is handed over to {found.successor}", markup=False)
+            return until_running(client, found.successor, max(0.1, until - time.monotonic()))
+        if found.resize is None:
+            return found
+        if time.monotonic() >= until:
+            raise NotRunning(f"instance {instance} has {found.size} after {timeout_s:g} s, not {found.resize} yet")
+        time.sleep(_LOOK_S)
 
 
 class Display(Protocol):

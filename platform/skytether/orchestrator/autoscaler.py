@@ -188,11 +188,6 @@ def bounded(wanted: Size, has: Size, room: Size) -> Size:
     return Size(cpu=round(cpu, 3), memory_mb=memory)
 
 
-def least_memory_mb(used_bytes: int) -> int:
-    """Below which nothing that uses so much is to be brought [MiB]: the kernel would kill it."""
-    return math.ceil(max(used_bytes * 1.1, used_bytes + ROOM_MB * 2**20) / 2**20)
-
-
 def _taken_up(trend: Trend | None, size: Size, seen: Seen, now: float) -> Trend:
     if trend is None:
         return Trend(size, seen.attempt)

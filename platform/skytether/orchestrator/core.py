@@ -127,6 +127,7 @@ class Orchestrator:
             strain=self.strain,
             site_instances=settings.quotas.site_instances,
             stored=self.stored,
+            left=self.quotas.left,
         )
         self.sites = Sites(
             settings.state_dir / "sites",

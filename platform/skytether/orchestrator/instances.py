@@ -18,9 +18,11 @@ from skytether.api.rest import (
     Placement,
     Refusal,
     Renew,
+    Resize,
     Score,
     Session,
     SessionKey,
+    Size,
     State,
 )
 
@@ -37,8 +39,9 @@ from .reconcile import Reconciler
 from .records import Record, new_record
 from .reports import Reports
 from .runtimes.base import LogStream, RuntimeFailure
+from .runtimes.containers import least_memory_mb
 from .security import SecretFileError, Secrets
-from .sites import Sites
+from .sites import Site, Sites
 from .store import KeyReusedError, Store
 from .validation import check_params
 
@@ -187,6 +190,88 @@ class Instances:
         self._wake_placer()
         return added
 
+    def resize(self, principal: Principal, instance: str, asked: Resize) -> Record:
+        """Give a running instance more or less; where its site cannot, another one is started for its robot.
+
+        Raises:
+            NotFoundError: No such instance.
+            ConflictError: It does not run.
+            InvalidError: Less than it uses, or not within what its service's needs say.
+            NoSiteError: Neither its own site nor another one can give it that; it has what it had.
+            QuotaError: Its robot would have too much.
+            SilentSiteError: Its site does not answer.
+        """
+        while True:
+            record = self.get(principal, instance)
+            site = self._site_of_running(record)
+            has = record.has
+            cpu, memory_mb = asked.cpu or has.cpu, asked.memory_mb or has.memory_mb
+            wanted = Size(cpu=cpu, memory_mb=memory_mb)
+            if wanted == (record.wants or has):
+                return record
+            self._check_size(record, site, wanted)
+            why = site.runtime.keeps_size(record.spec)
+            with self._quotas.resizing(record, wanted):
+                why = why or self._reconciler.lacks(record, wanted)
+                told_ = {"reason": "asked", "why": f"{principal.owner} asked for it"}
+                resize = {**wanted.model_dump(), **told_}
+                changed = None if why else self._store.change(record, self._clock(), resize=resize)
+            if why:
+                return self._move_for_size(principal, record, wanted, why)
+            if changed is not None:  # else somebody else changed it meanwhile: look again
+                self._reconciler.note(changed)
+                site.wake()
+                return changed
+
+    def _site_of_running(self, record: Record) -> Site:
+        if record.state.final or record.state is State.STOPPING:
+            raise ConflictError(f"instance '{record.id}' is {record.state}: ask for a new one")
+        if record.spare:
+            raise ConflictError(
+                f"instance '{record.id}' is a standby, which nobody uses: it has what its service needs"
+            )
+        if record.state is not State.RUNNING:
+            raise ConflictError(f"instance '{record.id}' is {record.state}: give it another size once it runs")
+        site = self._sites.find_anew(record.site)
+        if site is None or site.unreachable:
+            why = site.unreachable if site else "it was deleted"
+            raise SilentSiteError(f"site '{record.site}' cannot be asked now: {why}")
+        return site
+
+    @staticmethod
+    def _check_size(record: Record, site: Site, wanted: Size) -> None:
+        faults, scaling = [], record.spec.needs.scaling
+        for key in ("cpu", "memory_mb"):
+            range_, value = getattr(scaling, key, None), getattr(wanted, key)
+            if range_ is not None and value != getattr(record.has, key) and not range_.min <= value <= range_.max:
+                text = f"is {value:g}, and the service's needs.scaling.{key} goes from {range_.min:g} to {range_.max:g}"
+                faults.append(Fault(key, text))
+        seen = site.observed.get(record.id)
+        used = seen.memory_bytes if seen is not None else None
+        if used is not None and wanted.memory_mb < min(record.has.memory_mb, least_memory_mb(used)):
+            text = f"is {wanted.memory_mb}, and it uses {used >> 20} MiB now: give it {least_memory_mb(used)} at least"
+            faults.append(Fault("memory_mb", text))
+        if faults:
+            raise InvalidError(faults)
+
+    def _move_for_size(self, principal: Principal, record: Record, wanted: Size, why: str) -> Record:
+        """Have another one started where it can have that; gives back the present one."""
+        if self._store.successor(record.id) is not None:
+            raise ConflictError(f"instance '{record.id}' is being moved: give the one that is coming another size")
+        successor = self._moves.successor_of(record, size=wanted)
+        decision = self._reconciler.weigh(successor)
+        if decision.site is None:
+            self._metrics.refused(record.service, decision.refused)
+            others = "; ".join(f"{r.site}: {r.detail}" for r in decision.refused if r.site != record.site)
+            text = f"instance '{record.id}' cannot have {wanted}: {record.site}: {why}{f'; {others}' if others else ''}"
+            raise NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
+        with self._quotas.admitting(successor):
+            self._store.add(successor, principal.owner, None, "")
+        text = f"is to have {wanted}, and at site {record.site} {why}: its robot is handed over"
+        self._store.change(record, self._clock(), happened=text)
+        self._wake_placer()
+        return self._store.get(record.id) or record
+
     def get(self, principal: Principal, instance: str) -> Record:
         """One instance.
 
@@ -319,6 +404,8 @@ class Instances:
             state=record.state,
             reason=record.reason,
             params=record.params,
+            size=record.has,
+            resize=record.wants,
             placement=Placement(site=record.site, refused=refused, scores=scores) if record.site else None,
             session=session,
             replaces=record.replaces,

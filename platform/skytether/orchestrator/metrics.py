@@ -16,7 +16,7 @@ from skytether.api.exposition import Family, Sums, counter, exposition, gauge
 from skytether.api.groups import Stage
 from skytether.api.manifest import ANY_TOPIC
 from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, counters_of, gates_of, gauges_of
-from skytether.api.rest import GateReport, Refusal, Report
+from skytether.api.rest import GateReport, Refusal, Report, Size
 
 from .accounts import Account, of_instance, of_run
 from .quotas import Quotas, use_by_robot
@@ -130,6 +130,19 @@ class Metrics:
             registry=self._registry,
         )
 
+        self._resizes = Counter(
+            "skytether_instance_resizes",
+            "Changes of what running instances have",
+            ("service", "site", "resource", "direction", "reason"),
+            registry=self._registry,
+        )
+        self._unresized = Counter(
+            "skytether_instance_resize_failures",
+            "Changes that a site did not make",
+            ("service", "site"),
+            registry=self._registry,
+        )
+
     def text(self) -> bytes:
         """In Prometheus' text format."""
         return generate_latest(self._registry) + exposition(self._families())
@@ -141,6 +154,17 @@ class Metrics:
     def refused(self, service: str, refusals: Iterable[Refusal]) -> None:
         for refusal in refusals:
             self._refusals.labels(service, refusal.site, refusal.reason).inc()
+
+    def resized(self, record: Record, before: Size, after: Size, reason: str) -> None:
+        """An instance has more or less than before."""
+        for resource, old, new in (("cpu", before.cpu, after.cpu), ("memory", before.memory_mb, after.memory_mb)):
+            if new != old:
+                direction = "up" if new > old else "down"
+                self._resizes.labels(record.service, record.site or "", resource, direction, reason).inc()
+
+    def not_resized(self, record: Record) -> None:
+        """It was to have more or less, and its site did not do it."""
+        self._unresized.labels(record.service, record.site or "").inc()
 
     def bounded(self, record: Record, report: Report) -> Report:
         """A robot's report on one instance, without what would make series that nobody declared."""
@@ -170,11 +194,13 @@ class Metrics:
     def forget_site(self, site: str) -> None:
         self._passes.remove_by_labels({"site": site})
         self._start.remove_by_labels({"site": site})
-        self._refusals.remove_by_labels({"site": site})
+        for counted in (self._refusals, self._resizes, self._unresized):
+            counted.remove_by_labels({"site": site})
 
     def forget_service(self, service: str) -> None:
         self._start.remove_by_labels({"service": service})
-        self._refusals.remove_by_labels({"service": service})
+        for counted in (self._refusals, self._resizes, self._unresized):
+            counted.remove_by_labels({"service": service})
 
     def _families(self) -> Iterator[Family]:
         running = list(self._running())
@@ -196,6 +222,7 @@ class Metrics:
         }
         reports = [(r.record, known[r.record.id]) for r in running if r.record.id in known]
         yield _memory(running)
+        yield from _promised(running)
         yield _states(running)
         led = Sums()
         led.put((), self._epoch())
@@ -237,6 +264,16 @@ def _memory(running: Iterable[Running]) -> Family:
             labels = (one.record.robot, one.record.service, one.record.site or "")
             memory.add(labels, one.observation.memory_bytes)
     return gauge("instance_memory_bytes", "Resident memory", INSTANCE, memory)
+
+
+def _promised(running: Iterable[Running]) -> Iterator[Family]:
+    cores, memory = Sums(), Sums()
+    for one in running:
+        labels, held = (one.record.robot, one.record.service, one.record.site or ""), one.record.holds
+        cores.add(labels, held.cpu)
+        memory.add(labels, held.memory_mb * 2.0**20)
+    yield gauge("instance_promised_cpu_cores", "Processors that are kept for it", INSTANCE, cores)
+    yield gauge("instance_promised_memory_bytes", "Memory that is kept for it", INSTANCE, memory)
 
 
 def _states(running: Iterable[Running]) -> Family:
@@ -294,7 +331,7 @@ def _sites(sites: Iterable[SiteGauges], running: Iterable[Running]) -> Iterator[
     for one in running:
         labels = (one.record.site or "",)
         if labels in up:
-            promised.add(labels, one.record.spec.needs.cpu)
+            promised.add(labels, one.record.holds.cpu)
             count.add(labels, 1)
     yield gauge("site_up", "1 while the site answers", ("site",), up)
     yield gauge("site_cpu_cores", "Processors of the site", ("site",), cores)

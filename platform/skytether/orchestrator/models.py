@@ -178,6 +178,8 @@ instances = Table(
     Column("spare", Boolean, nullable=False, server_default=false()),
     Column("claim", String(64), comment="SHA-256 of the claim that got the session's key; NULL: nobody did"),
     Column("key_id", String(32), nullable=False, server_default=""),
+    Column("size", JSON(none_as_null=True), comment="What it has; NULL: what its manifest says"),
+    Column("resize", JSON(none_as_null=True), comment="What it is to have instead; NULL: nothing else"),
     Column("said", Integer, nullable=False, server_default="0", comment="See Record.said"),
     Column("version", Integer, nullable=False),
 )

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from skytether.api.manifest import Manifest
-from skytether.api.rest import Measurement, Refusal, Report, State
+from skytether.api.rest import Measurement, Refusal, Report, Size, State
 
 from .catalogue import Catalogue
 from .errors import InvalidError
@@ -78,17 +78,20 @@ class Moves:
         self._bad_since: dict[str, float] = {}
         """By instance: since when its robot has driven by itself."""
 
-    def successor_of(self, record: Record, site: str | None = None) -> Record:
+    def successor_of(self, record: Record, site: str | None = None, size: Size | None = None) -> Record:
         """An instance like another one, for the same robot; not stored yet.
 
-        What could not start that one is not tried again, unless it is the ``site`` that was asked for.
+        What could not start that one is not tried again, unless it is the ``site`` that was asked for. It is to have
+        ``size``, or else what that one has or is about to have.
         """
+        wants = size or record.wants
         now = self._clock()
         return new_record(
             robot=record.robot,
             service=record.service,
             manifest=record.manifest,
             params=record.params,
+            size=record.size if wants is None else wants.model_dump(),
             measurements=record.measurements,
             created_at=now,
             updated_at=now,
@@ -179,7 +182,10 @@ class Moves:
             return
         wanted = self.successor_of(record)
         for spare in self.spares_for(replace(wanted, replaces=None, refused=[])):
-            robot = {"robot": record.robot, "measurements": record.measurements, "replaces": record.id}
+            robot: dict[str, Any] = {"robot": record.robot, "measurements": record.measurements, "replaces": record.id}
+            if wanted.has != spare.has:
+                as_before = {"reason": "successor", "why": f"instance {record.id} had that"}
+                robot["resize"] = {**wanted.has.model_dump(), **as_before}
             lease = {"lease_s": record.lease_s, "lease_expires_at": wanted.lease_expires_at}
             now = self._clock()
             if self._store.claim(spare, {**robot, **lease, "created_at": now}, now, "", None, ""):
@@ -250,6 +256,22 @@ class Moves:
             started_at=None,
             running_at=None,
         )
+
+    def move_for_size(self, record: Record, size: Size, why: str) -> tuple[str | None, str]:
+        """Start another one of that size where there is room, for one whose site does not give it that.
+
+        Returns:
+            Where, or None, and what came of it in words.
+        """
+        coming = self._store.successor(record.id)
+        if coming is not None:
+            return None, f"{why}; instance {coming} is to take over already"
+        wanted = self.successor_of(record, size=size)
+        decision = self._weigh(wanted, self._promised())  # both of them, for a while
+        if decision.site is None:
+            return None, f"{why}, and nothing else takes it: {told(wanted, decision.refused)}"
+        self._store.add(wanted, "", None, "")
+        return decision.site, f"{why}: its robot is handed over to another one at {decision.site}"
 
     def _replace(self, record: Record, report: Report, now: float) -> None:
         if 0 <= now - (record.running_at or now) < self._timing.replace_pause or self._store.successor(record.id):

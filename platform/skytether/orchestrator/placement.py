@@ -168,16 +168,28 @@ def _refuse(needs: Needs, measured: Measurement, site: Candidate, image: str | N
         return no("unfit", site.unfit, for_good=False)
     if site.full is not None:
         return no("instances", site.full, for_good=False)
+    lack = lacks(needs, site.total, site.used)
+    return None if lack is None else no(lack[0], lack[1], for_good=lack[2])
+
+
+def lacks(needs: Needs, total: Capacity, used: Capacity) -> tuple[str, str, bool] | None:
+    """What a site has too little of: in one word, in words for people, and whether it has so in all; None: of nothing.
+
+    Args:
+        needs: Of one instance.
+        total: What the site has.
+        used: What others have of it.
+    """
     amounts = (
-        ("cpu", "cores", needs.cpu, site.total.cpu, site.used.cpu),
-        ("memory", "MiB of memory", needs.memory_mb, site.total.memory_mb, site.used.memory_mb),
-        ("gpu", "GPUs", needs.gpu, site.total.gpu, site.used.gpu),
+        ("cpu", "cores", needs.cpu, total.cpu, used.cpu),
+        ("memory", "MiB of memory", needs.memory_mb, total.memory_mb, used.memory_mb),
+        ("gpu", "GPUs", needs.gpu, total.gpu, used.gpu),
     )
-    for reason, unit, needed, total, _ in amounts:
-        if needed > total:
-            return no(reason, f"needs {needed:g} {unit}, the site has {total:g}")
-    for reason, unit, needed, total, used in amounts:
-        if needed > total - used + 1e-9:  # cores are fractions; ten times 0.1 must fit into 1
-            free = f"{round(max(total - used, 0.0), 2):g} of {total:g} are free"
-            return no(reason, f"needs {needed:g} {unit}, {free}", for_good=False)
+    for reason, unit, needed, there, _ in amounts:
+        if needed > there:
+            return reason, f"needs {needed:g} {unit}, the site has {there:g}", True
+    for reason, unit, needed, there, taken in amounts:
+        if needed > there - taken + 1e-9:  # cores are fractions; ten times 0.1 must fit into 1
+            free = f"{round(max(there - taken, 0.0), 2):g} of {there:g} are free"
+            return reason, f"needs {needed:g} {unit}, {free}", False
     return None

@@ -74,8 +74,8 @@ class Promises:
 
 
 def _needs(record: Record) -> Promised:
-    needs = record.spec.needs
-    return Promised(needs.cpu, needs.memory_mb, needs.gpu, 1)
+    held = record.holds
+    return Promised(held.cpu, held.memory_mb, record.spec.needs.gpu, 1)
 
 
 def _sum(some: Promised, more: Promised, sign: int) -> Promised:

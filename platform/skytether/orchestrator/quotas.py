@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from skytether.api.rest import RobotUse
+from skytether.api.rest import RobotUse, Size
 
 from .access import Principal
 from .errors import Fault, InvalidError, QuotaError, TooManyError
@@ -42,9 +42,9 @@ class Bound:
 
 def use_of(records: Iterable[Record]) -> RobotUse:
     """What instances that have not ended ask for."""
-    needs = [record.spec.needs for record in records]
-    memory = sum(need.memory_mb for need in needs)
-    return RobotUse(instances=len(needs), cpu=round(sum(need.cpu for need in needs), 6), memory_mb=memory)
+    held = [record.holds for record in records]
+    memory = sum(size.memory_mb for size in held)
+    return RobotUse(instances=len(held), cpu=round(sum(size.cpu for size in held), 6), memory_mb=memory)
 
 
 def use_by_robot(records: Iterable[Record]) -> dict[str, RobotUse]:
@@ -85,6 +85,32 @@ class Quotas:
                     self._refuse(bound.key)
                     raise QuotaError(f"{bound}: {bound.advice}")
             yield
+
+    @contextmanager
+    def resizing(self, record: Record, wanted: Size) -> Iterator[None]:
+        """Around the storing of what an instance is to have: see ``admitting``.
+
+        Raises:
+            QuotaError: Its robot would have too much.
+        """
+        with self._admitting, self._store.admitting():
+            use, whose, most = use_of(self._store.live_of(record.robot)), f"robot '{record.robot}'", self.settings
+            after = record.after({"resize": wanted.model_dump()}).holds
+            cpu = round(use.cpu + after.cpu - record.holds.cpu, 6)
+            memory_mb = use.memory_mb + after.memory_mb - record.holds.memory_mb
+            for bound, before in (
+                (Bound("robot_cpu", whose, "cores", cpu, most.robot_cpu), use.cpu),
+                (Bound("robot_memory_mb", whose, "MiB of memory", memory_mb, most.robot_memory_mb), use.memory_mb),
+            ):
+                if bound.wanted > max(bound.most, before) + 1e-9:
+                    self._refuse(bound.key)
+                    raise QuotaError(f"{bound}: {bound.advice}")
+            yield
+
+    def left(self, robot: str) -> Size:
+        """What a robot may have beside what it has, of cores and memory; less than nothing, too."""
+        use, most = use_of(self._store.live_of(robot)), self.settings
+        return Size(cpu=round(most.robot_cpu - use.cpu, 6), memory_mb=most.robot_memory_mb - use.memory_mb)
 
     def _bounds(self, record: Record) -> Iterator[Bound]:
         most, needs = self.settings, record.spec.needs

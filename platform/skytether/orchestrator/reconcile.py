@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from skytether.api.grant import Grant
-from skytether.api.rest import Measurement, Refusal, State
+from skytether.api.rest import Measurement, Refusal, Size, State
 
 from .accounts import of_instance, of_run
 from .clocks import SetClock
@@ -21,11 +21,12 @@ from .db import GONE
 from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
 from .moves import Moves, told
-from .placement import UNSTARTED, Decision, Prospect, place
+from .placement import UNSTARTED, Decision, Prospect, lacks, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .promises import NOTHING, Promises, Sums
 from .records import Record
-from .runtimes.base import Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
+from .resizing import Resizing
+from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .security import SecretFileError, Secrets
 from .service_events import ServiceEvents
 from .settings import Limits, Timing, Weights
@@ -55,6 +56,7 @@ _BALKS = 5
 """Acts in a row that a site did not answer, after which a pass asks it for nothing more: nor would it answer that."""
 _SHARE = 0.1
 """Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
+_PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
 _PROMISES_AGE = 3.0
 """Seconds for which sums are good enough for a request at an orchestrator that does not lead."""
 
@@ -89,12 +91,14 @@ class Reconciler:
         strain: Strain | None = None,
         site_instances: int = sys.maxsize,
         stored: Stored | None = None,
+        left: Callable[[str], Size] = lambda _: _PLENTY,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
         While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``, and
-        nothing more where ``stored`` says that it is full.
+        nothing more where ``stored`` says that it is full. ``left``: what a robot may have beside what it has.
         """
+        self._resizing = Resizing(store, metrics, lambda: self.moves, self._room, left, self.note, steady)
         self._site_instances = site_instances
         self._stored = stored
         self._strain = strain or Strain(steady)
@@ -276,6 +280,24 @@ class Reconciler:
             self._promise_anew(self._store.live())
         return self._promises.sums({record.id for record in without} | self._leaving())
 
+    def note(self, record: Record) -> None:
+        """It holds more or less at its site than before; the next whole pass of the placer knows it anyway."""
+        self._promises.add(record)
+
+    def _room(self, site: Site) -> Size:
+        capacity, promised = site.capacity or Capacity(0.0, 0), self.promised().get(site.name, NOTHING)
+        return Size(cpu=capacity.cpu - promised.cpu, memory_mb=capacity.memory_mb - promised.memory_mb)
+
+    def lacks(self, record: Record, size: Size) -> str:
+        """Why an instance cannot have this at its site, beside all that is stored; empty: it can."""
+        site = self.sites.find(record.site)
+        if site is None:
+            return f"site '{record.site}' was deleted"
+        promised = Promises(self._store.live()).sums(self._leaving() | {record.id})
+        used = promised.get(site.name, NOTHING).capacity
+        found = lacks(record.sized(size).needs, site.capacity or Capacity(0.0, 0), used)
+        return "" if found is None else found[1]
+
     def _give_up_siteless(self, placed: Sequence[Record], now: float) -> None:
         """End what was placed at a site in the moment when that was deleted: nobody else looks at it ever again."""
         missing = [record for record in placed if self.sites.find(record.site) is None]
@@ -329,11 +351,16 @@ class Reconciler:
         )
 
     def _allows(self, record: Record, site: Site) -> bool:
-        """One that replaces another does not go where that is, unless it was told to or that one is ended there."""
+        """One that replaces another does not go where that is.
+
+        Unless it was told to, or that one is ended there, or it is there for being larger or smaller.
+        """
         if record.pinned is not None:
             return site.name == record.pinned
         replaced = self._store.get(record.replaces) if record.replaces else None
-        return replaced is None or site.name != replaced.site or replaced.id in site.leaving
+        if replaced is None or site.name != replaced.site or replaced.id in site.leaving:
+            return True
+        return record.has != replaced.has
 
     def _leaving(self) -> set[str]:
         """What sites are about to end: it takes no room of what they have left."""
@@ -437,6 +464,8 @@ class Reconciler:
         if whole:
             site.pass_took = time.thread_time() - began
         done = self._act_on(site, actions)
+        if whole and not site.balks:
+            self._resizing.keep(site, live, looked, now)
         if due:
             site.tidied_at = time.monotonic()
             try:

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic_core import to_json
 
 from skytether.api.manifest import Manifest, ServiceSpec
-from skytether.api.rest import State
+from skytether.api.rest import Size, State
 
 MOVES: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.PLACING, State.STOPPED}),
@@ -93,6 +93,10 @@ class Record:
     """Warm, and nobody's yet: it has no robot and no lease."""
     key_id: str = ""
     """Fingerprint of the secret key that its session's is derived from; empty: from before they were noted."""
+    size: dict[str, Any] | None = None
+    """:class:`skytether.api.rest.Size` as JSON: what it has now; None: what its manifest says."""
+    resize: dict[str, Any] | None = None
+    """What it is to have instead, with ``reason`` (bounded, for metrics) and ``why``; None: nothing else."""
     said: int = 0
     """Number of the last report of the present run that became an event: whoever leads next tells none twice."""
     version: int = 1
@@ -101,12 +105,39 @@ class Record:
     def after(self, changes: Mapping[str, Any]) -> Record:
         """As it is after changes of other fields than the manifest, which is not parsed again."""
         changed = copy(self)
+        if "size" in changes and changes["size"] != self.size:
+            vars(changed).pop("spec", None)
         vars(changed).update(changes)
         return changed
 
     @cached_property
     def spec(self) -> ServiceSpec:
-        return _spec(to_json(self.manifest))
+        """What its manifest says, with the needs that it has now."""
+        said = _spec(to_json(self.manifest))
+        return said if self.size is None else said.sized(self.size["cpu"], self.size["memory_mb"])
+
+    @property
+    def has(self) -> Size:
+        """What it has now."""
+        needs = self.spec.needs
+        return Size(cpu=needs.cpu, memory_mb=needs.memory_mb)
+
+    def sized(self, size: Size) -> ServiceSpec:
+        """What its manifest says, with other needs."""
+        return _spec(to_json(self.manifest)).sized(size.cpu, size.memory_mb)
+
+    @property
+    def wants(self) -> Size | None:
+        """What it is to have instead; None: nothing else."""
+        return None if self.resize is None else Size(cpu=self.resize["cpu"], memory_mb=self.resize["memory_mb"])
+
+    @property
+    def holds(self) -> Size:
+        """What is kept for it: what it has, or is to have, whichever is more."""
+        has, wants = self.has, self.wants
+        if wants is None:
+            return has
+        return Size(cpu=max(has.cpu, wants.cpu), memory_mb=max(has.memory_mb, wants.memory_mb))
 
 
 @lru_cache(maxsize=256)

@@ -286,8 +286,17 @@ class Store(GroupStore):
         with self._reader.connect() as connection:
             return set(connection.scalars(select(instances.c.id).where(instances.c.id.in_(list(ids)))))
 
-    def change(self, record: Record, now: float, *, through: State | None = None, **changes: Any) -> Record | None:
-        """Change an instance if it is still as it was seen; ``through``: a state that it passes at once.
+    def change(
+        self, record: Record, now: float, *, through: State | None = None, happened: str = "", **changes: Any
+    ) -> Record | None:
+        """Change an instance if it is still as it was seen.
+
+        Args:
+            record: As it was seen.
+            now: Seconds since the epoch.
+            through: A state that it passes at once.
+            happened: What is told as an event, where neither state nor reason tells it.
+            changes: New values of fields.
 
         Returns:
             The record as it is now; None if somebody else changed it meanwhile.
@@ -309,8 +318,10 @@ class Store(GroupStore):
                 _add_event(connection, passed)
             if told:
                 _add_event(connection, new)
+            if happened:
+                _add_event(connection, new.after({"reason": happened[:_REASON_LENGTH], "updated_at": now}))
         self._remember(new)
-        if told:
+        if told or happened:
             self.on_change(new.id)
         return new
 

@@ -51,6 +51,10 @@ class FakeRun:
     reports: tuple[ServiceReport, ...] = ()
     leaving: str = ""
     """Why the site is about to end it."""
+    cpu_s: float | None = None
+    """What it has used; None: a little with each look."""
+    memory_bytes: int = 1 << 20
+    step_s: float | None = None
 
 
 class FakeWorld(dict[str, FakeRun]):
@@ -85,6 +89,10 @@ class FakeRuntime(Runtime):
         """Why nothing can be started at present."""
         self.started: list[tuple[str, int]] = []
         """Instance and attempt of every run that was begun here."""
+        self.resized: list[tuple[str, float, int]] = []
+        """Instance, cores and memory of every change that was made here."""
+        self.keeps = ""
+        """Why it changes nothing of what runs."""
         self._options = options
         self._ports = count(40_000)
 
@@ -119,6 +127,24 @@ class FakeRuntime(Runtime):
         self.world[launch.instance] = FakeRun(launch, port, log=log, reports=reports)
         self.started.append((launch.instance, launch.attempt))
 
+    @override
+    def keeps_size(self, spec: ServiceSpec) -> str:
+        return self.keeps
+
+    @override
+    def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
+        self._must_lead()
+        if self.keeps:
+            raise RuntimeFailure(self.keeps)
+        run = self.world.get(instance)
+        if run is None or run.ended or run.launch.attempt != attempt:
+            return False
+        size = (spec.needs.cpu, spec.needs.memory_mb)
+        if size != (run.launch.spec.needs.cpu, run.launch.spec.needs.memory_mb):
+            run.launch = replace(run.launch, spec=spec)
+            self.resized.append((instance, *size))
+        return True
+
     def observe(self) -> Mapping[str, Observation]:
         self._answer()
         for run in self.world.values():
@@ -132,7 +158,8 @@ class FakeRuntime(Runtime):
         if run.looks < self.looks_until_ready:
             return Observation(attempt, Phase.STARTING)
         here = Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, leaving=run.leaving, reports=run.reports)
-        return replace(here, cpu_s=0.01 * run.looks, memory_bytes=1 << 20)
+        cpu_s = 0.01 * run.looks if run.cpu_s is None else run.cpu_s
+        return replace(here, cpu_s=cpu_s, memory_bytes=run.memory_bytes, step_s=run.step_s)
 
     def stop(self, instance: str, *, force: bool) -> None:
         self._must_lead()

@@ -77,6 +77,8 @@ Caller = Annotated[Principal, _holder("read", robots=True)]
 """A robot, or an operator who may read: for looking."""
 Actor = Annotated[Principal, _holder("instances", robots=True)]
 """A robot, or an operator who may change instances."""
+InstancesOperator = Annotated[Principal, _holder("instances")]
+"""An operator who may change instances."""
 KeyHolder = Annotated[Principal, _holder("sessions", robots=True)]
 """A robot, or an operator who may have keys of sessions."""
 Reader = Annotated[Principal, _holder("read")]

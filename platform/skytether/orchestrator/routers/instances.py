@@ -19,6 +19,7 @@ from skytether.api.rest import (
     Migrate,
     Neighbours,
     Renew,
+    Resize,
     SessionClaim,
     SessionKey,
     Share,
@@ -30,7 +31,7 @@ from ..instances import utc
 from ..records import Record
 from ..runtimes.base import LogStream
 from ..store import EventRow
-from .deps import PREFIX, Actor, Caller, Core, InThread, KeyHolder, made, says
+from .deps import PREFIX, Actor, Caller, Core, InstancesOperator, InThread, KeyHolder, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/instances", tags=["instances"], responses=says(401))
 
@@ -89,6 +90,15 @@ def get(core: Core, caller: Caller, instance: str) -> Instance:
 def delete(core: Core, caller: Actor, instance: str) -> None:
     """End an instance; may be called again."""
     core.instances.delete(caller, instance)
+
+
+@router.patch("/{instance}", responses=says(403, 404, 409, 422, 503))
+def resize(core: Core, caller: InstancesOperator, instance: str, asked: Resize) -> Instance:
+    """Give a running instance more or less, without a restart; ``resize`` of it says so until it has it.
+
+    Where its site cannot, another one is started that can (``successor``), and its robot changes to that.
+    """
+    return core.instances.show(core.instances.resize(caller, instance, asked))
 
 
 @router.post("/{instance}/renew", responses=says(404, 422))

@@ -67,6 +67,8 @@ class Observation:
     received_bytes: int | None = None
     """By the network, of this run so far."""
     sent_bytes: int | None = None
+    step_s: float | None = None
+    """Of 20 of its last steps 19 took no longer, says the service; None: it does not say."""
     reports: tuple[ServiceReport, ...] = ()
     """The newest that the run reported, read from the file beside its ready file within some seconds; a runtime that
     cannot reads none."""
@@ -217,6 +219,26 @@ class Runtime(ABC):
             SiteSilentError: The site does not answer, or another orchestrator is just acting on this instance.
             RuntimeFailure: It cannot be started; nothing of it is left running.
         """
+
+    def keeps_size(self, spec: ServiceSpec) -> str:  # noqa: ARG002 (here none can be changed)
+        """Why what a run of the service may take cannot be changed while it runs; empty: it can. From any thread."""
+        return "what runs there keeps the cores and memory that it began with"
+
+    def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:  # noqa: ARG002
+        """Have a run have the cores and memory that a launch with this spec would give it, without a restart.
+
+        Asked again and again, by whoever leads; a run that has it already is left alone, and so is one that is not
+        there, or of another attempt. What runs is never brought below what it uses.
+
+        Returns:
+            Whether it has it; False: the site is at it, or knows of no such run (yet).
+
+        Raises:
+            OvertakenError: Another orchestrator leads by now.
+            SiteSilentError: The site does not answer: whether it has it is known later.
+            RuntimeFailure: It cannot have it; it has what it had.
+        """
+        raise RuntimeFailure(self.keeps_size(spec))
 
     @abstractmethod
     def observe(self) -> Mapping[str, Observation]:

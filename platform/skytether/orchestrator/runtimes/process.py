@@ -283,6 +283,16 @@ class ProcessRuntime(Runtime):
                 start_new_session=True,
             )
 
+    @override
+    def keeps_size(self, spec: ServiceSpec) -> str:
+        return ""
+
+    @override
+    def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
+        self._fence.must_lead()
+        run = self._runs.find(instance)
+        return run is not None and run.attempt == attempt and run.lives  # nothing holds it to what it is promised
+
     def observe(self) -> Mapping[str, Observation]:
         now = time.monotonic()
         if measure := now - self._measured_at >= _MEASURE:

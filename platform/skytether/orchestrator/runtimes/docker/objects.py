@@ -22,11 +22,10 @@ from ..containers import (
     exit_status,
     image_refusal,
     last_line,
-    most_cores,
-    most_memory_mb,
     out_of_memory,
 )
 from ..egress import refusal_of
+from .limits import NO_LIMITS, Limits, limits_of, pull_limits
 from .meter import Usage
 from .options import DockerOptions
 
@@ -61,8 +60,6 @@ _MOST_VOLUMES = 32
 _LEAST_BETWEEN_CHECKS = {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}
 """Nanoseconds between two checks of an image's health: each costs the engine more than the container, whose limits do
 not hold for that."""
-_LEAST_CORES = 0.01
-"""The kernel gives no less."""
 _ADVICE = (
     ("could not select device driver", "the engine has no NVIDIA container toolkit: install it, or set 'gpu' to 0"),
     ("error gathering device information", "plug it in, or take it out of the site's option 'devices'"),
@@ -104,7 +101,7 @@ class Seen:
     """``created``, ``running``, ``paused``, ``exited``, ``dead``, ``removing``."""
     exit_code: int = 0
     out_of_memory: bool = False
-    memory_limit: int = 0
+    limits: Limits = NO_LIMITS
     host_port: int | None = None
     """Published UDP port; known while it runs."""
     ill: str = ""
@@ -248,8 +245,6 @@ def container(
         epoch: Of the leader; 0: there is none.
     """
     spec, grant = launch.spec, launch.grant
-    memory = most_memory_mb(spec) << 20
-    limit = max(_LEAST_CORES, min(most_cores(spec), cores))
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
     paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
@@ -277,10 +272,7 @@ def container(
             "ReadonlyRootfs": True,
             "CapDrop": ["ALL"],
             "SecurityOpt": options.security,
-            "Memory": memory,
-            "MemorySwap": memory,  # none beyond it: a service that swaps is of no use to a robot
-            "NanoCpus": int(limit * 1e9),
-            "CpuShares": max(2, int(spec.needs.cpu * 1024)),
+            **limits_of(spec, cores).document(),
             "PidsLimit": spec.limits.pids,
             "Tmpfs": {_TMP: _TMPFS},
             "Mounts": [
@@ -395,7 +387,7 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
         status=state["Status"],
         exit_code=state["ExitCode"],
         out_of_memory=state["OOMKilled"],
-        memory_limit=inspected["HostConfig"]["Memory"],
+        limits=pull_limits(inspected["HostConfig"]),
         host_port=port or (int(labels[_PORT]) if labels.get(_PORT, "").isdecimal() else None),
         ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
         gpus=frozenset(int(number) for number in labels.get(_GPUS, "").split(",") if number.isdecimal()),
@@ -468,5 +460,5 @@ def observation(
 
 def _how_it_ended(seen: Seen) -> str:
     if seen.out_of_memory and seen.exit_code:
-        return out_of_memory(seen.memory_limit >> 20)
+        return out_of_memory(seen.limits.memory >> 20)
     return ""

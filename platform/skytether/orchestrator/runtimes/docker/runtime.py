@@ -28,12 +28,13 @@ from ..base import (
     Runtime,
     RuntimeFailure,
 )
-from ..containers import USER, kept_owner, with_owner
+from ..containers import USER, kept_owner, least_memory_mb, with_owner
 from .engine import Engine, EngineGoneError
 from .fence import Fence
 from .follow import Follower
 from .images import check_credentials
 from .launch import Job, kill, later_runs, remove
+from .limits import limits_of
 from .logs import ContainerLog
 from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
@@ -226,6 +227,28 @@ class DockerRuntime(Runtime):
     def _newest(self, instance: str) -> Seen | None:
         seen = self._follower.of(instance)
         return seen[-1] if seen else None
+
+    @override
+    def keeps_size(self, spec: ServiceSpec) -> str:
+        return ""
+
+    @override
+    def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
+        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
+        seen, wanted = self._newest(instance), limits_of(spec, cores)
+        if seen is None or not seen.runs or seen.attempt != attempt:
+            return False
+        if seen.limits == wanted:
+            return True
+        used = self._follower.meter.usage(seen.id)
+        if used is not None and wanted.memory < min(seen.limits.memory, least_memory_mb(used.memory_bytes) << 20):
+            raise RuntimeFailure(f"it uses {used.memory_bytes >> 20} MiB, and so much would be taken from it")
+        self._must_lead()  # a change by an earlier leader that comes late is seen, and made good
+        with self._doubting(), self._engine.asked():
+            api: Any = self._engine.api()  # a `Client`
+            api.change(seen.id, wanted.document())
+            after = self._follower.look(seen.id)
+        return after is not None and after.limits == wanted
 
     def observe(self) -> Mapping[str, Observation]:
         with self._lock:
