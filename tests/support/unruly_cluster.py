@@ -108,6 +108,10 @@ class UnrulyCluster:
         """``fails``: the chance of a run to fail at once."""
         self.regime = CALM
         self.fails = fails
+        self.minor = 33
+        """Of its version; `pods/resize` is there from 33 on."""
+        self.no_room = ""
+        """How nodes answer who is to have more: ``Infeasible`` or ``Deferred``; empty: they give it."""
         self.runs: dict[str, Run] = {}
         """By uid of their pod, all that there ever were."""
         self.doubles: list[str] = []
@@ -300,7 +304,9 @@ class UnrulyCluster:
         if pod is None or run.over or run.ending:
             return
         run.at_work = True
-        pod["status"] |= {"phase": "Running", "podIP": "10.1.0.1", "containerStatuses": [_container(started=False)]}
+        has = pod["spec"]["containers"][0]["resources"]
+        status = {**_container(started=False), "resources": json.loads(json.dumps(has))}
+        pod["status"] |= {"phase": "Running", "podIP": "10.1.0.1", "containerStatuses": [status]}
         self._changed(namespace, "pods", pod, "MODIFIED")
         if rng.random() < self.fails:
             await asyncio.sleep(rng.uniform(0.05, 0.5))
@@ -309,7 +315,7 @@ class UnrulyCluster:
         await asyncio.sleep(rng.uniform(0.1, 0.4))
         pod = self._pod(namespace, name, uid)
         if pod is not None and not run.over and not run.ending:
-            pod["status"]["containerStatuses"] = [_container(started=True)]
+            pod["status"]["containerStatuses"][0] |= _container(started=True)
             self._changed(namespace, "pods", pod, "MODIFIED")
 
     def _ended(self, namespace: str, name: str, uid: str, reason: str) -> None:
@@ -401,6 +407,41 @@ class UnrulyCluster:
         )
         return 200, there
 
+    def _resize(self, namespace: str, name: str, body: Document) -> tuple[int, Document]:
+        """As the API server takes it; what the pod's node makes of it comes later."""
+        there = self._of(namespace, "pods").get(name)
+        if there is None:
+            return _status(404, "NotFound", f'pods "{name}" not found')
+        uid, (changed,) = there["metadata"]["uid"], body["spec"]["containers"]
+        if body["metadata"].get("uid", uid) != uid:
+            return _status(409, "Conflict", "Precondition failed: UID in precondition")
+        (container,) = there["spec"]["containers"]
+        assert changed["name"] == container["name"]
+        before = container["resources"]
+        after = {key: {**before[key], **changed["resources"].get(key, {})} for key in ("requests", "limits")}
+        if (before["requests"] == before["limits"]) != (after["requests"] == after["limits"]):
+            return _status(422, "Invalid", "Pod QOS Class may not change as a result of resizing")
+        container["resources"] = after
+        told = there["status"].setdefault("conditions", [])
+        told[:] = [one for one in told if not one["type"].startswith("PodResize")]
+        self._changed(namespace, "pods", there, "MODIFIED")
+        self._loop.call_later(self._rng.uniform(0.05, 0.4), lambda: self._actuate(namespace, name, uid))
+        return 200, there
+
+    def _actuate(self, namespace: str, name: str, uid: str) -> None:
+        """A node gives a container what it is to have, or says why not."""
+        pod = self._pod(namespace, name, uid)
+        if pod is None or not pod["status"].get("containerStatuses"):
+            return
+        wanted, (status,) = pod["spec"]["containers"][0]["resources"], pod["status"]["containerStatuses"]
+        has = status.get("resources") or wanted
+        if self.no_room and _cores_of(wanted) > _cores_of(has):
+            why = {"reason": self.no_room, "message": f"node has no room: {wanted['requests']['cpu']} wanted"}
+            pod["status"]["conditions"].append({"type": "PodResizePending", "status": "True", **why})
+        else:
+            status["resources"] = json.loads(json.dumps(wanted))
+        self._changed(namespace, "pods", pod, "MODIFIED")
+
     def _apply(self, namespace: str, kind: str, body: Document) -> tuple[int, Document]:
         there = self._of(namespace, kind).get(body["metadata"]["name"])
         if there is None:
@@ -480,6 +521,8 @@ class UnrulyCluster:
         query = dict(parse_qsl(url.query))
         path = url.path.strip("/").split("/")
         group = path[1] if path[0] == "apis" else ""
+        if path == ["api", "v1"]:
+            path.append("apiresources")
         path = path[2:] if path[0] == "api" else path[3:] if path[0] == "apis" else path
         namespace = path[1] if path[0] == "namespaces" else ""
         path = path[2:] if namespace else path
@@ -533,7 +576,12 @@ class UnrulyCluster:
         apply: bool,
     ) -> tuple[int, Document]:
         if kind == "version":
-            return 200, {"major": "1", "minor": "33"}
+            return 200, {"major": "1", "minor": str(self.minor)}
+        if kind == "apiresources":
+            names = ["pods", "pods/log", *(["pods/resize"] if self.minor >= 33 else [])]
+            return 200, {"kind": "APIResourceList", "resources": [{"name": one} for one in names]}
+        if rest == ["resize"] and kind == "pods" and method == "PATCH" and self.minor >= 33:
+            return self._resize(namespace, name, body)
         if rest or group == "metrics.k8s.io":
             return _status(404, "NotFound", "there is no such thing here")
         if method == "GET" and not name:
@@ -620,6 +668,11 @@ def _now() -> str:
 
 def _container(*, started: bool) -> Document:
     return {"name": "service", "ready": started, "started": started, "state": {"running": {"startedAt": _now()}}}
+
+
+def _cores_of(resources: Document) -> int:
+    """Thousandths that are kept."""
+    return int(resources["requests"]["cpu"].removesuffix("m"))
 
 
 def _node(number: int) -> Document:

@@ -147,6 +147,12 @@ class Resizing:
 
     def _give_up(self, site: Site, record: Record, wants: Size, why: str, known: _Known, now: float) -> None:
         """It is moved to where it can have that; otherwise it keeps what it has."""
+        try:
+            site.runtime.resize(record.id, record.attempt, record.spec)  # nothing is left half changed
+        except (SiteSilentError, OvertakenError):
+            raise
+        except RuntimeFailure as error:
+            log.info("site %s: %s", site.name, error)
         known.asked_since, known.not_before = math.inf, self._steady() + _AGAIN_S
         text, moved = f"site {site.name} does not give it {wants}: {why}", None
         if _is_more(wants, record.has):

@@ -210,6 +210,8 @@ class Answers:
         path = request.url.path.strip("/").split("/")
         if path == ["version"]:
             return JSONResponse({"major": "1", "minor": "33"})
+        if path == ["api", "v1"]:
+            return JSONResponse({"kind": "APIResourceList", "groupVersion": "v1", "resources": [{"name": "pods"}]})
         path = path[2:] if path[0] == "api" else path[3:]
         if path[:1] == ["namespaces"]:
             path = path[2:]

@@ -43,6 +43,7 @@ _PER_S, _BURST = 300.0, 100
 _AGAIN_S = 1.0
 """Until the next call, where the API server has too much to do and does not say for how long."""
 _MERGE = "application/merge-patch+json"
+_STRATEGIC = "application/strategic-merge-patch+json"
 _APPLY = "application/apply-patch+yaml"
 _MANAGER = {"fieldManager": "skytether"}
 """Who has written what we write, as every object says (``managedFields``)."""
@@ -126,6 +127,14 @@ class Cluster:
     def merge(self, path: str, body: Document) -> Any:
         """A JSON merge patch."""
         return self._document("PATCH", path, query=_MANAGER, body=body, kind=_MERGE)
+
+    def merge_lists(self, path: str, body: Document) -> Any:
+        """A strategic merge patch: of lists, what is named in it is changed, and the rest stays."""
+        return self._document("PATCH", path, query=_MANAGER, body=body, kind=_STRATEGIC)
+
+    def offers(self, resource: str) -> bool:
+        """Whether the API server has it, of the core's group: ``pods/resize``."""
+        return any(one.get("name") == resource for one in self.get("/api/v1").get("resources") or ())
 
     def apply(self, path: str, body: Document) -> Any:
         """Server-side apply: it is there afterwards, and has what ``body`` says; what others have added stays.

@@ -15,9 +15,10 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import Opening, ServiceSpec
 
 from ..base import Capacity, Launch
-from ..containers import INNER_PORT, USER, data_name, image_refusal, most_cores, most_memory_mb
+from ..containers import INNER_PORT, USER, data_name, image_refusal
 from ..egress import refusal_of
 from .options import KubernetesOptions
+from .resize import quantity, resources_of
 
 Document = Mapping[str, Any]
 HEALTH_PORT = 7601
@@ -223,16 +224,8 @@ def claim(launch: Launch, options: KubernetesOptions, owner: str) -> dict[str, A
 
 
 def _resources(spec: ServiceSpec) -> dict[str, Any]:
-    needs = spec.needs
-    gpus = {_GPU: str(needs.gpu)} if needs.gpu else {}
-    return {
-        "requests": {"cpu": _cores(needs.cpu), "memory": f"{needs.memory_mb}Mi", **gpus},
-        "limits": {"cpu": _cores(most_cores(spec)), "memory": f"{most_memory_mb(spec)}Mi", **gpus},
-    }
-
-
-def _cores(cores: float) -> str:
-    return f"{max(1, round(1000 * cores))}m"
+    gpus = {_GPU: str(spec.needs.gpu)} if spec.needs.gpu else {}
+    return {key: {**amounts, **gpus} for key, amounts in resources_of(spec).document().items()}
 
 
 def owned_by(made: Document) -> list[dict[str, Any]]:
@@ -397,23 +390,6 @@ def tolerated(taint: Document, options: KubernetesOptions) -> bool:
         if toleration.get("operator", "Equal") == "Exists" or toleration.get("value", "") == taint.get("value", ""):
             return True
     return False
-
-
-_UNITS = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "P": 1e15, "E": 1e18} | {
-    f"{unit}i": 1024.0**power for power, unit in enumerate("KMGTPE", start=1)
-}
-
-
-def quantity(text: str) -> float:
-    """Of a resource: ``500m``, ``16Gi``.
-
-    Raises:
-        ValueError: It is none.
-    """
-    for unit in (text[-2:], text[-1:]):
-        if unit in _UNITS:
-            return float(text[: -len(unit)]) * _UNITS[unit]
-    return float(text)
 
 
 def external_address(node: Document) -> str:

@@ -26,7 +26,7 @@ from ..base import (
     RuntimeFailure,
     SiteSilentError,
 )
-from ..containers import USER, kept_owner, with_owner
+from ..containers import USER, kept_owner, least_memory_mb, with_owner
 from ..egress import resolve
 from .budget import Budget
 from .cluster import Cluster, ClusterSilentError, RefusedError
@@ -48,6 +48,7 @@ from .objects import (
 )
 from .options import KubernetesOptions
 from .reports import ReportReader
+from .resize import SUBRESOURCE, in_class_of, patch, resources_of
 from .seen import Seen, observation, refused
 from .services import Services
 from .usage import Meter
@@ -58,6 +59,8 @@ log = logging.getLogger(__name__)
 _KEPT = 2
 """Earlier runs whose pods stay, for their logs."""
 _NETWORKING = "networking.k8s.io/v1"
+_FIND_OUT_S = 300.0
+"""Seconds between two looks at what the API server offers."""
 _POLICY_S = 10.0
 """Seconds between two looks whether pods are still closed off."""
 
@@ -101,6 +104,9 @@ class KubernetesRuntime(Runtime):
         """When the NetworkPolicy of all pods was seen to be there, by the monotonic clock [s]."""
         self._blocked = ""
         self._new_enough = False
+        self._resizes = False
+        """Whether the API server changes what a pod has while it runs, as it said last."""
+        self._found_out_at: float | None = None
         self._closed = ""
         """Why no node takes pods at present."""
         self._watch.start()
@@ -130,8 +136,48 @@ class KubernetesRuntime(Runtime):
         if not self._new_enough:
             self._cluster.check_version()
             self._new_enough = True
+        self._find_out()
         total, self._closed = self._nodes.offered(self._options)
         return total
+
+    def _find_out(self) -> None:
+        """What the API server can do, now and then: clusters are upgraded."""
+        if self._found_out_at is not None and time.monotonic() - self._found_out_at < _FIND_OUT_S:
+            return
+        try:
+            self._resizes = self._cluster.offers(SUBRESOURCE)
+        except RefusedError as error:
+            log.info("site %s: what the API server offers is not told: %s", self._site, error)
+        self._found_out_at = time.monotonic()
+
+    @override
+    def keeps_size(self, spec: ServiceSpec) -> str:
+        return "" if self._resizes else "the cluster cannot change what a pod has while it runs (Kubernetes 1.33 can)"
+
+    @override
+    def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
+        there = self._watch.of(instance, self._options.timeout_s)
+        seen = there[-1] if there else None
+        if seen is None or seen.attempt != attempt or not seen.running or self._over(seen):
+            return False
+        if keeps := self.keeps_size(spec):
+            raise RuntimeFailure(keeps)
+        has = seen.resources
+        if has is None:
+            raise RuntimeFailure("somebody has taken away what its pod asks for")
+        wanted = in_class_of(resources_of(spec), has)
+        if wanted == has:
+            if seen.unresized:
+                raise RuntimeFailure(seen.unresized)
+            return not seen.resizing
+        used = self._meter.of(seen).memory_bytes
+        if used is not None and wanted.memory_limit < min(has.memory_limit, least_memory_mb(used)):
+            raise RuntimeFailure(f"it uses {used >> 20} MiB, and so much would be taken from it")
+        self._must_lead()  # a change by an earlier leader that comes late is seen, and made good
+        path = self._cluster.path("pods", f"{seen.name}/resize")
+        with self._doubting():
+            self._watch.take(self._cluster.merge_lists(path, patch(seen.uid, wanted)))
+        return False  # until its node says so
 
     @override
     def lead(self, epoch: int) -> None:

@@ -13,8 +13,9 @@ from skytether.api.usage import NO_USAGE, Usage
 from ..base import Observation, Phase
 from ..containers import INNER_PORT, exit_status, last_line, out_of_memory
 from ..hosts import parse_address, rendezvous
-from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, SESSION, quantity
+from .objects import ATTEMPT, FAILURE, INSTANCE, NODE_PORT, SESSION
 from .options import KubernetesOptions
+from .resize import Resources, differ, pull_progress, pull_resources, quantity
 
 Document = Mapping[str, Any]
 _NO_FREE_PORT = "didn't have free ports"
@@ -78,6 +79,12 @@ class Seen:
     """It was asked to end."""
     disrupted: str = ""
     """Why the cluster is about to end it."""
+    resources: Resources | None = None
+    """As its description says."""
+    resizing: bool = False
+    """Its node is about to give it these."""
+    unresized: str = ""
+    """Why its node will not."""
     removed: bool = False
     """It is deleted, by us or anybody: its node ends what runs of it yet."""
 
@@ -112,6 +119,7 @@ def parse(document: Document) -> Seen | None:
         ports = [int(notes[NODE_PORT])]
     limits = (container.get("resources") or {}).get("limits") or {}
     waits_for = _waits_for(status, waiting)
+    resources, (at_it, never) = pull_resources(container.get("resources") or {}), pull_progress(status)
     claims = [one["persistentVolumeClaim"]["claimName"] for one in spec.get("volumes") or () if one.get(_CLAIM)]
     if _CLAIM.lower() in waits_for.lower() and claims:
         waits_for += f" ('kubectl describe pvc {claims[0]}' says why; site's option 'storage_class')"
@@ -142,6 +150,9 @@ def parse(document: Document) -> Seen | None:
         failure=notes.get(FAILURE, ""),
         stops=bool(spec.get("activeDeadlineSeconds")) or bool(meta.get("deletionTimestamp")),
         disrupted=_disrupted(status),
+        resources=resources,
+        resizing=at_it or differ(pull_resources(told.get("resources") or {}), resources),
+        unresized=never,
         removed=bool(meta.get("deletionTimestamp")),
     )
 

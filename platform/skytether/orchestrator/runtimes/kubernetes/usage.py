@@ -20,7 +20,8 @@ from skytether.api.usage import NO_USAGE, Usage
 from ..base import RuntimeFailure
 from ..now_and_then import NowAndThen
 from .cluster import Cluster, RefusedError
-from .objects import OWNER, quantity
+from .objects import OWNER
+from .resize import quantity
 from .seen import Seen
 
 log = logging.getLogger(__name__)
