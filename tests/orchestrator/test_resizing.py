@@ -13,11 +13,11 @@ from reconcile_bench import Bench, add
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Resize, Size, State
-from skytether.orchestrator.autoscaler import CALM_S, PAUSE_S
 from skytether.orchestrator.quotas import use_of
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import OvertakenError, SiteSilentError
 from skytether.orchestrator.settings import Quotas as QuotaSettings
+from skytether.orchestrator.vertical_scaling import CALM_S, PAUSE_S
 
 NewRecord = Callable[..., Record]
 TWO = Size(cpu=2, memory_mb=512)

@@ -98,6 +98,7 @@ annotations:
 {{- define "skytether.rules" -}}
 - {apiGroups: [""], resources: [pods], verbs: [get, list, watch, create, patch, delete]}
 - {apiGroups: [""], resources: [pods/log, pods/proxy], verbs: [get]}
+- {apiGroups: [""], resources: [pods/resize], verbs: [patch]}
 - {apiGroups: [""], resources: [secrets], verbs: [get, create, delete]}
 - {apiGroups: [""], resources: [services], verbs: [list, create, patch, delete]}
 - {apiGroups: [""], resources: [persistentvolumeclaims], verbs: [create, delete]}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from .manifest import Strict, TopicSpec
 
@@ -42,5 +42,15 @@ class Grant(Strict):
     runtime looks at the files."""
     data_dir: str = "."
     """Where the instance may write what it produces (recordings)."""
+    step_times: bool = False
+    """Tell with the reports how long steps take."""
     idle_exit_s: float = 120
     """The instance ends by itself when it has heard nothing from its robot for this long."""
+
+    @model_serializer(mode="wrap")
+    def _as_earlier_images_take_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Services of images that were made before there were step times refuse a grant that speaks of them."""
+        document: dict[str, Any] = handler(self)
+        if not self.step_times:
+            document.pop("step_times", None)
+        return document

@@ -2,8 +2,9 @@
 
     {"reports": [{"number": 1, "code": "no_path", "message": "There is no way to the goal."}]}
 
-The newest come last, and have the highest numbers. No service is trusted: whatever is in its file, what is read of it
-is bounded, and obeys no code.
+Beside them ``{"step_s": 0.004}`` says that of 20 of its last steps 19 took no longer, where the orchestrator wants to
+know. The newest come last, and have the highest numbers. No service is trusted: whatever is in its file, what is read
+of it is bounded, and obeys no code.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ MOST_CHARACTERS = 300
 """Of a message."""
 _MOST_NUMBER = 2**31 - 1
 """That every database can hold."""
+_LONGEST_S = 3600.0
 _CODE = re.compile(r"[a-z][a-z0-9_]{0,62}", re.ASCII)
 
 
@@ -46,9 +48,18 @@ def is_code(text: str) -> bool:
     return _CODE.fullmatch(text) is not None
 
 
-def write_reports(reports: Iterable[ServiceReport]) -> bytes:
+def write_reports(reports: Iterable[ServiceReport], step_s: float | None = None) -> bytes:
     """The content of the file."""
-    return json.dumps({"reports": [asdict(report) for report in reports]}).encode()
+    steps = {} if step_s is None else {"step_s": round(step_s, 6)}
+    return json.dumps({"reports": [asdict(report) for report in reports], **steps}).encode()
+
+
+def pull_step_s(document: object) -> float | None:
+    """How long steps take, says a document that anybody may have written; None: it does not say."""
+    told = document.get("step_s") if isinstance(document, dict) else None
+    if isinstance(told, bool) or not isinstance(told, int | float):
+        return None
+    return float(told) if 0 <= told <= _LONGEST_S else None
 
 
 def pull_reports(document: object) -> tuple[ServiceReport, ...]:

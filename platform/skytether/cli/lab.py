@@ -13,6 +13,7 @@ from .lab_failover import alarms, failover
 from .lab_hostile import hostile
 from .lab_legs import legs
 from .lab_navigation import localisation, mapping, navigation
+from .lab_resize import resize
 from .lab_run import app as run_app
 from .lab_safety import safety
 from .lab_scale import scale
@@ -25,6 +26,7 @@ app.add_typer(bench, name="bench")
 app.add_typer(run_app, name="run")
 app.command("world")(world)
 bench.command("safety")(safety)
+bench.command("resize")(resize)
 bench.command("hostile")(hostile)
 bench.command("scale")(scale)
 bench.command("authentication")(authentication)

@@ -583,6 +583,7 @@ class Reconciler:
             topics=spec.topics,
             launch=spec.launch,
             remap=spec.remap,
+            step_times=spec.needs.scaling is not None and spec.needs.scaling.step_ms is not None,
         )
         return Launch(record.attempt, spec, grant)
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 
 from skytether.api.rest import Size, State
 
-from .autoscaler import Proposal, Seen, Trend, bounded, decide
 from .metrics import Metrics
 from .moves import Moves
 from .records import Record
 from .runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .sites import Site
 from .store import Store
+from .vertical_scaling import Proposal, Seen, Trend, bounded, decide
 
 log = logging.getLogger(__name__)
 

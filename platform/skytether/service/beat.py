@@ -23,13 +23,19 @@ def touch(path: str, in_step_for: float) -> bool:
 
 
 @contextmanager
-def beating(path: str | None, in_step_for: Callable[[], float], period: float = BEAT_S) -> Iterator[None]:
-    """Touch the ready file every ``period`` seconds; None: there is none."""
+def beating(
+    path: str | None,
+    in_step_for: Callable[[], float],
+    period: float = BEAT_S,
+    tell: Callable[[], None] = lambda: None,
+) -> Iterator[None]:
+    """Touch the ready file every ``period`` seconds, and ``tell`` as often; None: there is none."""
     ended = threading.Event()
 
     def beat() -> None:
         while path is not None and not ended.wait(period):
             touch(path, in_step_for())
+            tell()
 
     thread = threading.Thread(target=beat, name="beat", daemon=True)
     if path is not None:

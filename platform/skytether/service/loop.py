@@ -9,6 +9,7 @@ from .clock import Clock
 from .errors import ServiceError
 from .port import ServicePort
 from .service import Service
+from .step_times import StepTimes
 
 
 class Loop:
@@ -19,9 +20,17 @@ class Loop:
         port: Its port; tells whether a robot is connected.
         clock: Where time comes from.
         idle_exit: End after so many seconds without a robot.
+        times: Where it is noted how long each step takes; None: nowhere.
     """
 
-    def __init__(self, service: Service[Any], port: ServicePort, clock: Clock, idle_exit: float) -> None:
+    def __init__(
+        self,
+        service: Service[Any],
+        port: ServicePort,
+        clock: Clock,
+        idle_exit: float,
+        times: StepTimes | None = None,
+    ) -> None:
         self.steps = 0
         self.skipped = 0
         """Steps left out because an earlier one, or the machine, was late by a whole period."""
@@ -29,6 +38,7 @@ class Loop:
         self._port = port
         self._clock = clock
         self._idle_exit = idle_exit
+        self._times = times
         self._stopping = False
         self._step_began: float | None = None
 
@@ -109,6 +119,9 @@ class Loop:
         self._port.settle(now)
         self._service.step(now)
         self._step_began = None
+        if self._times is not None:
+            ended = self._clock.now()
+            self._times.note(ended, ended - now)
         self.steps += 1
 
     def _idle(self, now: float, since: float) -> bool:

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -32,6 +32,7 @@ from .loop import Loop
 from .params import read_params
 from .port import ServicePort, classes_of
 from .service import Context, Service
+from .step_times import StepTimes
 
 
 def run(cls: type[Service[Any]]) -> NoReturn:
@@ -107,12 +108,13 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
         service.reports.path = Path(grant.ready_file).with_name(FILE_NAME)
     with closing(SystemClock()) as clock:
         port = ServicePort(service, clock.wake)
-        loop = Loop(service, port, clock, grant.idle_exit_s)
+        times = StepTimes() if grant.step_times else None
+        loop = Loop(service, port, clock, grant.idle_exit_s, times)
         bridge = Bridge(spec, port, bind=(grant.bind_host, grant.bind_port))
         with _ending_on_signals(loop), answering(grant):
             try:
                 bridge.start()
-                return _work(service, loop, bridge, grant)
+                return _work(service, loop, bridge, grant, _teller(service, clock, times))
             except BridgeError as error:
                 raise ServiceError(str(error)) from None
             finally:
@@ -120,7 +122,18 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
                 bridge.stop()
 
 
-def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant) -> int:
+def _teller(service: Service[Any], clock: SystemClock, times: StepTimes | None) -> Callable[[], None]:
+    """What tells how long steps take, where that is wanted."""
+
+    def tell() -> None:
+        news = None if times is None else times.news(clock.now())
+        if news is not None:
+            service.reports.tell_steps(news)
+
+    return tell
+
+
+def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant, tell: Callable[[], None]) -> int:
     """From start to stop, the bridge being up."""
     started = False
     gc.freeze()
@@ -131,7 +144,7 @@ def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant) -> in
         warm_up(service, grant)
         gc.freeze()  # what is there now stays: looking through it would cost a step or two (20 ms) now and then
         write_ready_file(grant, bridge.address[1])
-        with beating(grant.ready_file, loop.in_step_for):
+        with beating(grant.ready_file, loop.in_step_for, tell=tell):
             loop.run()
     except ServiceError:
         raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from collections import deque
 from pathlib import Path
 
@@ -19,6 +20,8 @@ class Reports:
         self.path: Path | None = None
         """The file; None: there is none, as in tests."""
         self.recent: deque[ServiceReport] = deque(maxlen=MOST_REPORTS)
+        self._step_s: float | None = None
+        self._lock = threading.Lock()
 
     def add(self, code: str, message: str) -> None:
         """Report something; what was reported last, word for word, is not reported again.
@@ -28,18 +31,26 @@ class Reports:
         """
         if not is_code(code):
             raise ValueError(f"a report's code has small letters, digits and underscores only, not {code!r}")
-        last = self.recent[-1] if self.recent else ServiceReport(0, "", "")
-        if (last.code, last.message) == (code, message):
-            return
-        self.recent.append(ServiceReport(last.number + 1, code, message))
-        if self.path is not None:
-            self._write(self.path)
+        with self._lock:
+            last = self.recent[-1] if self.recent else ServiceReport(0, "", "")
+            if (last.code, last.message) == (code, message):
+                return
+            self.recent.append(ServiceReport(last.number + 1, code, message))
+            if self.path is not None:
+                self._write(self.path)
+
+    def tell_steps(self, step_s: float) -> None:
+        """Say how long steps take; from any thread."""
+        with self._lock:
+            self._step_s = step_s
+            if self.path is not None:
+                self._write(self.path)
 
     def _write(self, path: Path) -> None:
         """In one piece. A service does its work on a full disk, too."""
         draft = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            draft.write_bytes(write_reports(self.recent))
+            draft.write_bytes(write_reports(self.recent, self._step_s))
             draft.replace(path)
         except OSError as error:
             log.warning("a report cannot be written: %s", error)

@@ -72,7 +72,7 @@ class MigrateRow:
         return asdict(self)
 
 
-class _Commands:
+class Commands:
     """Arrivals of commands that were admitted."""
 
     def __init__(self) -> None:
@@ -83,6 +83,7 @@ class _Commands:
             self.times.append(command.received_at)
 
     def longest_gap_ms(self, since: float, until: float) -> float:
+        """The longest time between two of them, in a span of the monotonic clock."""
         times = [t for t in list(self.times) if since <= t <= until]
         return max((b - a for a, b in pairwise(times)), default=np.inf) * 1e3
 
@@ -100,9 +101,9 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
         token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
         bind = ("127.0.0.1", 0)
         config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=bind, renew_s=0.5)
-        seen = _Commands()
+        seen = Commands()
         with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
-            _wait(lambda: agent.source is Source.CLOUD, agent)
+            wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             for i in range(n):
                 time.sleep(2 * _AROUND_S)
@@ -115,8 +116,8 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
                 time.sleep(_AROUND_S)
                 began = time.monotonic()
                 before = len(agent.status().driver.transitions)
-                coming = operator.migrate_instance(_instance(agent)).id
-                _wait(lambda: _instance(agent) == coming, agent)  # noqa: B023 (called at once)
+                coming = operator.migrateinstance_of(instance_of(agent)).id
+                wait_for(lambda: instance_of(agent) == coming, agent)  # noqa: B023 (called at once)
                 changed = time.monotonic()
                 time.sleep(_AROUND_S)
                 gaps.append(seen.longest_gap_ms(began - _AROUND_S, changed + _AROUND_S))
@@ -147,15 +148,21 @@ def _load(program: str) -> None:
         raise BenchError(f"the service's program does not load: {done.stderr.strip().splitlines()[-1]}")
 
 
-def _instance(agent: Agent) -> str:
+def instance_of(agent: Agent) -> str:
+    """The id of the instance that drives it; empty: none."""
     instance = agent.status().instance
     return instance.id if instance else ""
 
 
-def _wait(condition: Callable[[], bool], agent: Agent) -> None:
+def wait_for(condition: Callable[[], bool], agent: Agent) -> None:
+    """Until it is so.
+
+    Raises:
+        BenchError: It was not so in time.
+    """
     deadline = time.monotonic() + _LIMIT_S
     while not condition():
         if time.monotonic() > deadline:
-            why = agent.status().trouble or "the service was not moved"
+            why = agent.status().trouble or "the service does not do what was asked"
             raise BenchError(f"nothing happened within {_LIMIT_S:.0f} s: {why}")
         time.sleep(_LOOK_S)

@@ -320,10 +320,11 @@ class ProcessRuntime(Runtime):
             if run.child and status is None:
                 return Observation(run.attempt, Phase.STARTING)  # the kernel is just at it
             line = last_line(Path(run.folder, "log"))
-            return Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=line, reports=run.reports())
+            return Observation(run.attempt, Phase.EXITED, exit_status=status, last_line=line, reports=run.reports()[0])
         port = run.port()
         phase = Phase.RUNNING if port else Phase.STARTING
         host = (self._options.advertise_host or self._options.bind_host) if phase is Phase.RUNNING else None
+        reports, step_s = run.reports()
         return Observation(
             run.attempt,
             phase,
@@ -332,7 +333,8 @@ class ProcessRuntime(Runtime):
             exceeds=run.exceeds,
             cpu_s=stat.cpu_s,
             memory_bytes=stat.memory_bytes,
-            reports=run.reports(),
+            step_s=step_s,
+            reports=reports,
         )
 
     def stop(self, instance: str, *, force: bool) -> None:

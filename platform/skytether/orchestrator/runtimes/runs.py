@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.api.grant import GRANT_VARIABLE
-from skytether.api.service_report import FILE_NAME, ServiceReport, pull_reports
+from skytether.api.service_report import FILE_NAME, ServiceReport, pull_reports, pull_step_s
 
 from .base import Observation, Phase, RuntimeFailure
 from .disk import remove_tree, size_of
@@ -69,8 +69,8 @@ class Run:
     """As it was when it was read last."""
     ready: tuple[Stamp, int] | None = None
     """Which ready file was read, and its port."""
-    reported: tuple[Stamp, tuple[ServiceReport, ...]] | None = None
-    """Which file of reports was read, and what is in it."""
+    reported: tuple[Stamp, tuple[ServiceReport, ...], float | None] | None = None
+    """Which file of reports was read, what is in it, and how long it says that steps take [s]."""
     emptied: bool = False
     """Of what it left in its own folder."""
 
@@ -101,15 +101,16 @@ class Run:
             self.ready = None if port is None else (written, port)
         return self.ready[1] if self.ready else None
 
-    def reports(self) -> tuple[ServiceReport, ...]:
-        """What it reported; read again where it was written again."""
+    def reports(self) -> tuple[tuple[ServiceReport, ...], float | None]:
+        """What it reported, and how long it says that steps take [s]; read again where it was written again."""
         path = f"{os.path.dirname(self.ready_file)}/{FILE_NAME}"
         written = _stamp(path)
         if written is None:
-            return ()
+            return (), None
         if self.reported is None or self.reported[0] != written:
-            self.reported = written, pull_reports(read_json(Path(path)))
-        return self.reported[1]
+            document = read_json(Path(path))
+            self.reported = written, pull_reports(document), pull_step_s(document)
+        return self.reported[1:]
 
     def empty(self) -> None:
         """End what it left behind once it has ended, and remove its own folder's content, but for what it told.

@@ -439,6 +439,7 @@ def observation(
     *,
     cut_off: bool = False,
     reports: tuple[ServiceReport, ...] = (),
+    step_s: float | None = None,
 ) -> Observation:
     """What the contract calls it; ``exceeds``: what it wrote too much of; ``cut_off``: its network is held no more."""
     if seen.ended:
@@ -454,7 +455,8 @@ def observation(
         used = asdict(usage) if usage is not None else {}
         where = options.advertised, seen.host_port
         ill = "the container that held its network has ended" if cut_off else seen.ill
-        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, reports=reports, **used)
+        told: dict[str, Any] = {"reports": reports, "step_s": step_s}
+        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, **told, **used)
     return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds, reports=reports)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
 from typing import Any
 
-from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
+from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports, pull_step_s
 
 from ..base import RuntimeFailure
 from ..now_and_then import NowAndThen
@@ -32,8 +32,8 @@ _MOST_ARCHIVE = MOST_BYTES + (8 << 10)
 """Of the archive of one such file: the file, and some heads of 512 bytes. A service may have put a huge file in the
 place of the one that the engine told of."""
 
-Known = tuple[str, tuple[ServiceReport, ...]]
-"""What the engine said of a file, and what was read of it then."""
+Known = tuple[str, tuple[ServiceReport, ...], float | None]
+"""What the engine said of a file, and what was read of it then: reports, and how long steps take [s]."""
 
 
 class ReportReader:
@@ -52,6 +52,11 @@ class ReportReader:
         """What it reported, as read last."""
         known = self._known.get(container)
         return known[1] if known is not None else ()
+
+    def step_s(self, container: str) -> float | None:
+        """How long it says that its steps take, as read last."""
+        known = self._known.get(container)
+        return known[2] if known is not None else None
 
     def begin(self) -> None:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
@@ -97,7 +102,10 @@ class ReportReader:
             # must not keep those of others from being read.
             log.debug("reports of container %.12s are not read: %s", container, error)
             return known
-        return (stat, pull_reports(unpacked(answer.content))) if answer.status_code == HTTPStatus.OK else None
+        if answer.status_code != HTTPStatus.OK:
+            return None
+        document = unpacked(answer.content)
+        return stat, pull_reports(document), pull_step_s(document)
 
 
 def _is_readable(stat: str) -> bool:

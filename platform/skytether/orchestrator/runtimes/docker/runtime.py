@@ -274,6 +274,7 @@ class DockerRuntime(Runtime):
                 self._scales.exceeds(seen.volume, seen.other_volumes),
                 cut_off=bool(seen.namespace) and not (seen.namespace in helpers and helpers[seen.namespace].runs),
                 reports=self._reports.of(seen.id),
+                step_s=self._reports.step_s(seen.id),
             )
             for instance, seen in newest.items()
             if seen.status != "created"

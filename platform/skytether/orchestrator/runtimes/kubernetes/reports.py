@@ -10,7 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 
-from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports
+from skytether.api.service_report import MOST_BYTES, ServiceReport, pull_reports, pull_step_s
 from skytether.api.usage import NO_USAGE, Usage, pull_usage
 
 from ..base import RuntimeFailure
@@ -30,8 +30,8 @@ _REST = 20
 _PER_S = 100.0
 """Pods that are asked in a second, at most: of ten thousand each has its turn every two minutes."""
 
-_Told = tuple[tuple[ServiceReport, ...], Usage]
-_NOTHING: _Told = (), NO_USAGE
+_Told = tuple[tuple[ServiceReport, ...], Usage, float | None]
+_NOTHING: _Told = (), NO_USAGE, None
 
 
 class ReportReader:
@@ -57,6 +57,10 @@ class ReportReader:
     def usage(self, pod: str) -> Usage:
         """What it says that it uses, as read last."""
         return self._known.get(pod, _NOTHING)[1]
+
+    def step_s(self, pod: str) -> float | None:
+        """How long it says that its steps take, as read last."""
+        return self._known.get(pod, _NOTHING)[2]
 
     def begin(self) -> None:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
@@ -89,7 +93,7 @@ class ReportReader:
         path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")
         try:
             document = json.loads(self._cluster.small(path, MOST_BYTES, _TIMEOUT_S))
-            return pull_reports(document), pull_usage(document)
+            return pull_reports(document), pull_usage(document), pull_step_s(document)
         except (ValueError, RecursionError):
             return _NOTHING
         except RuntimeFailure as error:  # this one alone: it has just ended, or speaks no HTTP

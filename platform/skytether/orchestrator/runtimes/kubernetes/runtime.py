@@ -354,6 +354,7 @@ class KubernetesRuntime(Runtime):
                 trouble=self._health.trouble(seen, self._watch.ill(seen) and not seen.stops),
                 leaving=self._nodes.leaving(seen.node),
                 balancer=self._services.balancer(instance),
+                step_s=self._reports.step_s(seen.name),
             )
             for instance, seen in newest.items()
         }

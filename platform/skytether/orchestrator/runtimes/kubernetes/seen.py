@@ -209,6 +209,7 @@ def observation(
     trouble: str = "",
     leaving: str = "",
     balancer: tuple[str, int] | str | None = None,
+    step_s: float | None = None,
 ) -> Observation:
     """What the contract calls it.
 
@@ -221,6 +222,7 @@ def observation(
         over: It has lingered for as long as it could.
         trouble: What is wrong with its service.
         leaving: Why its node is about to be without it.
+        step_s: How long it says that its steps take.
         balancer: At which a load balancer passes on to it, or why there is no such address yet; None: there is none.
     """
     if seen.ended or over:
@@ -247,6 +249,7 @@ def observation(
             port,
             detail=trouble,
             leaving="" if seen.stops else seen.disrupted or leaving,
+            step_s=step_s,
             reports=reports,
             **asdict(usage),
         )

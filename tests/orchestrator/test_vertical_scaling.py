@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs, Scaling, ServiceSpec
 from skytether.api.rest import Size
-from skytether.orchestrator.autoscaler import (
+from skytether.orchestrator.runtimes.containers import least_memory_mb
+from skytether.orchestrator.vertical_scaling import (
     AIM_CPU,
     BUSY,
     CALM_S,
@@ -28,7 +29,6 @@ from skytether.orchestrator.autoscaler import (
     bounded,
     decide,
 )
-from skytether.orchestrator.runtimes.containers import least_memory_mb
 
 CPU = Scaling(cpu={"min": 0.25, "max": 4})
 MEMORY = Scaling(memory_mb={"min": 64, "max": 2048})

@@ -1,0 +1,171 @@
+"""How long a robot is without commands while its service is given more cores and memory, or less.
+
+Everything is real: an orchestrator, the service in a container of this machine's engine (or as a process), a simulated
+walker whose agent drives at 100 Hz. The instance is under load: another program in its container, within its limits,
+keeps half a core busy. Beside each change the same is measured over as long a time without one.
+"""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from skytether.api.client import Client
+from skytether.api.rest import Resize, RobotCreate, Size
+from skytether.lab.bench.containers import docker, docker_site
+from skytether.lab.bench.migrate import PERIOD_MS, Commands, instance_of, wait_for
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.embedded import EmbeddedOrchestrator
+from skytether.lab.trail import Trail
+from skytether.lab.walk import World
+from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.command import Source
+
+SIZES = Size(cpu=2.0, memory_mb=512), Size(cpu=1.0, memory_mb=256)
+"""In turn; both hard limits change each time."""
+_AROUND_S = 0.5
+"""Commands from so long before the request until so long after it was done count."""
+_LOOK_S = 0.02
+_LOAD = """
+import time
+while True:
+    until = time.perf_counter() + 0.005
+    while time.perf_counter() < until:
+        pass
+    time.sleep(0.005)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class ResizeRow:
+    """One line of the table; gaps are the longest time between two commands of one span.
+
+    Attributes:
+        runtime: Kind of the site.
+        n: Changes.
+        gap_p50_periods: Median of the gap around a change, in periods of the commands.
+        gap_max_periods: The largest of them.
+        gap_still_p50_periods: The same over as long a time without a change.
+        gap_still_max_periods: The largest of those.
+        over: Changes with a gap of more than two periods.
+        over_still: The same of the times without a change.
+        resize_p50_s: Median time from the request until the instance had it.
+        fallbacks: Changes during which the robot's own controller took over.
+        restarts: Of the instance.
+    """
+
+    runtime: str
+    n: int
+    gap_p50_periods: float
+    gap_max_periods: float
+    gap_still_p50_periods: float
+    gap_still_max_periods: float
+    over: int
+    over_still: int
+    resize_p50_s: float
+    fallbacks: int
+    restarts: int
+
+    def document(self) -> dict[str, object]:
+        """For ``--json``."""
+        return asdict(self)
+
+
+def bench_resize(
+    n: int,
+    runtime: str = "docker",
+    prefix: str = "skytether/",
+    on_resize: Callable[[int, float], None] = lambda *_: None,
+) -> ResizeRow:
+    """Change what a driven robot's instance has, ``n`` times.
+
+    Args:
+        n: Changes.
+        runtime: ``docker`` or ``process``.
+        prefix: Of the images' names.
+        on_resize: Called with the number of each change and its gap [ms].
+
+    Raises:
+        BenchError: It did not drive, was not changed in time, or there is no such image, or engine.
+    """
+    if runtime not in ("docker", "process"):
+        raise BenchError(f"there is no runtime '{runtime}' to measure; there are docker, process")
+    gaps: list[float] = []
+    still: list[float] = []
+    took: list[float] = []
+    fallbacks = 0
+    with (
+        EmbeddedOrchestrator() as orchestrator,
+        docker_site(orchestrator, prefix, SERVICE) if runtime == "docker" else nullcontext(),
+        Client(orchestrator.url, orchestrator.operator_token) as operator,
+    ):
+        token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
+        config = AgentConfig(ROBOT, orchestrator.url, SERVICE, token, bind=("127.0.0.1", 0))
+        seen = Commands()
+        with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
+            wait_for(lambda: agent.source is Source.CLOUD, agent)
+            gc.freeze()  # as a robot's program does
+            instance = instance_of(agent)
+            with _loaded(instance, runtime):
+                for i in range(n):
+                    time.sleep(2 * _AROUND_S)
+                    before = len(agent.status().driver.transitions)
+                    began, done = _change(operator, instance, SIZES[i % len(SIZES)], agent)
+                    time.sleep(_AROUND_S)
+                    gaps.append(seen.longest_gap_ms(began - _AROUND_S, done + _AROUND_S))
+                    took.append(done - began)
+                    fallbacks += len(agent.status().driver.transitions) > before
+                    on_resize(i, gaps[-1])
+                    time.sleep(2 * _AROUND_S + took[-1])
+                    now = time.monotonic()
+                    still.append(seen.longest_gap_ms(now - 2 * _AROUND_S - took[-1], now))
+            restarts = operator.get_instance(instance).restarts
+    periods, still_periods = np.array(gaps) / PERIOD_MS, np.array(still) / PERIOD_MS
+    return ResizeRow(
+        runtime,
+        n,
+        round(float(np.median(periods)), 3),
+        round(float(periods.max()), 3),
+        round(float(np.median(still_periods)), 3),
+        round(float(still_periods.max()), 3),
+        int((periods > 2).sum()),
+        int((still_periods > 2).sum()),
+        round(float(np.median(took)), 3),
+        fallbacks,
+        restarts,
+    )
+
+
+def _change(operator: Client, instance: str, size: Size, agent: Agent) -> tuple[float, float]:
+    """When it was asked for, and when it was seen to be done."""
+    began = time.monotonic()
+    operator.resize_instance(instance, Resize(cpu=size.cpu, memory_mb=size.memory_mb))
+    wait_for(lambda: operator.get_instance(instance).size == size, agent)
+    done = time.monotonic()
+    if (now := instance_of(agent)) != instance:
+        raise BenchError(f"the robot was handed over to {now}: the site did not change {instance}")
+    return began, done
+
+
+@contextmanager
+def _loaded(instance: str, runtime: str) -> Iterator[None]:
+    """Keep half a core of the instance busy meanwhile."""
+    if runtime == "docker":
+        (container,) = docker("ps", "-q", "--filter", f"label=skytether.io/instance={instance}").split()
+        docker("exec", "-d", container, "/app/bin/python", "-c", _LOAD)
+        yield  # it ends with its container
+        return
+    load = subprocess.Popen([sys.executable, "-c", _LOAD])
+    try:
+        yield
+    finally:
+        load.kill()
+        load.wait()
