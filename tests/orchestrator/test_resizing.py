@@ -269,6 +269,27 @@ def test_at_a_site_that_keeps_sizes_only_more_is_worth_a_move(running: Any) -> N
     assert b.record().resize is None
 
 
+def test_a_run_that_ran_out_of_memory_has_more_the_next_time_as_far_as_there_is(running: Any) -> None:
+    b = running(SCALED, memory_mb=500)
+
+    def runs_out(attempt: int) -> None:
+        b.runtime.world["i1"].out_of_memory = True
+        b.runtime.crash("i1", -9)
+        b.clock.forward(20)
+        b.step(4)
+        assert (b.record().state, b.record().attempt) == (State.RUNNING, attempt)
+
+    runs_out(2)
+    assert b.record().has == Size(cpu=1, memory_mb=384)
+    assert b.runtime.world["i1"].launch.spec.needs.memory_mb == 384
+    assert told(b)[-1].endswith("with 384 MiB of memory instead of 256")
+    runs_out(3)
+    assert b.record().has.memory_mb == 496, "what the site has left"
+    runs_out(4)
+    assert b.record().has.memory_mb == 496
+    assert "instead of" not in told(b)[-1]
+
+
 # Over REST
 
 

@@ -61,6 +61,7 @@ class Crash:
     why: str
     """Continues "the service ..."."""
     for_good: bool = False
+    out_of_memory: bool = False
     unstarted: bool = False
     """It could not even be begun and nothing is left, or it ended before it was ready: another site may do better."""
 
@@ -172,7 +173,8 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
     if seen.phase is Phase.EXITED:
         for_good = seen.exit_status == BAD_GRANT_STATUS
         ended = seen.exit_status is not None and not for_good  # else something may be left that is to be cleared first
-        return Crash(record, how_it_ended(seen), for_good, seen.unstarted or ended)
+        unstarted = seen.unstarted or ended
+        return Crash(record, how_it_ended(seen), for_good, out_of_memory=seen.out_of_memory, unstarted=unstarted)
     if seen.detail and seen.detail != record.reason:
         return Progress(record, seen.detail)
     if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:
@@ -185,7 +187,7 @@ def _running(record: Record, seen: Observation | None) -> Action | None:
     if seen is None:
         return Crash(record, "is gone")
     if seen.phase is Phase.EXITED:
-        return Crash(record, how_it_ended(seen))
+        return Crash(record, how_it_ended(seen), out_of_memory=seen.out_of_memory)
     if seen.phase is Phase.RUNNING and seen.detail:
         return Crash(record, f"is not well: {seen.detail}")
     if seen.phase is Phase.RUNNING and (seen.host, seen.port) != (record.host, record.port):

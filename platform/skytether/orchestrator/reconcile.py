@@ -604,9 +604,16 @@ class Reconciler:
         changes = after_crash(crash, self._clock(), self._timing)
         if crash.unstarted and changes["failures"] >= _TRIES:
             changes |= self._elsewhere(site, crash, gives_up=changes["state"] is State.FAILED)
+        larger = self._resizing.larger(site, crash.record) if crash.out_of_memory else None
+        if larger is not None and not changes["state"].final:
+            changes |= {"size": larger.model_dump(), "resize": None}
+            changes["reason"] += f", with {larger.memory_mb} MiB of memory instead of {crash.record.has.memory_mb}"
         after = self._store.change(crash.record, self._clock(), **changes)
         if after is None:
             return
+        if larger is not None and after.has == larger:
+            self._metrics.resized(crash.record, crash.record.has, larger, "memory")
+            self.note(after)
         log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
         if after.restarts:
             self._store.count(after, [of_instance(after)])

@@ -20,7 +20,7 @@ from .records import Record
 from .runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .sites import Site
 from .store import Store
-from .vertical_scaling import Proposal, Seen, Trend, bounded, decide
+from .vertical_scaling import Proposal, Seen, Trend, bounded, decide, more_memory
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +103,15 @@ class Resizing:
                     return
         except (SiteSilentError, OvertakenError) as error:
             log.warning("site %s: %s", site.name, error)  # the next pass, or whoever leads, asks again
+
+    def larger(self, site: Site, record: Record) -> Size | None:
+        """What the next run has of one that ran out of memory; None: the same, for there is no more for it."""
+        scaling, has = record.spec.needs.scaling, record.has
+        if scaling is None or scaling.memory_mb is None:
+            return None
+        wanted = more_memory(scaling.memory_mb, has)
+        wanted = bounded(bounded(wanted, has, self._left(record.robot)), has, self._room(site))
+        return wanted if wanted.memory_mb > has.memory_mb else None
 
     def _keep(self, site: Site, record: Record, seen: Observation, now: float) -> None:
         follows = record.spec.needs.scaling is not None and not record.spare

@@ -33,6 +33,8 @@ GROWTH = 2.0
 """The largest factor of one change, up or down."""
 SLOWER = 1.5
 """The factor for steps that take too long while the cores are not busy."""
+OUT_OF_MEMORY = 1.5
+"""The factor for memory that was not enough."""
 BUSY, FULL = 0.8, 0.8
 """Share of cores, and of memory, above which there is too little."""
 AIM_CPU, AIM_MEMORY = 0.6, 0.65
@@ -179,6 +181,12 @@ def _of_memory(
     elif mib < has:
         told.append(("idle", f"at most {lane.calm_peak:.0f} MiB were used for {lane.patience_s:g} s"))
     return lane, int(mib)
+
+
+def more_memory(range_: MemoryRange, has: Size) -> Size:
+    """What an instance is to have that ran out of memory."""
+    memory = int(min(_up(has.memory_mb * OUT_OF_MEMORY, MIB), range_.max))
+    return Size(cpu=has.cpu, memory_mb=max(memory, has.memory_mb))
 
 
 def bounded(wanted: Size, has: Size, room: Size) -> Size:

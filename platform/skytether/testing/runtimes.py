@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 from typing_extensions import override
@@ -55,6 +55,8 @@ class FakeRun:
     """What it has used; None: a little with each look."""
     memory_bytes: int = 1 << 20
     step_s: float | None = None
+    out_of_memory: bool = False
+    """How it ended."""
 
 
 class FakeWorld(dict[str, FakeRun]):
@@ -154,7 +156,8 @@ class FakeRuntime(Runtime):
     def _look(self, run: FakeRun) -> Observation:
         attempt = run.launch.attempt
         if run.ended:
-            return Observation(attempt, Phase.EXITED, exit_status=run.exit_status, last_line=run.last_line)
+            how: dict[str, Any] = {"exit_status": run.exit_status, "last_line": run.last_line}
+            return Observation(attempt, Phase.EXITED, **how, out_of_memory=run.out_of_memory)
         if run.looks < self.looks_until_ready:
             return Observation(attempt, Phase.STARTING)
         here = Observation(attempt, Phase.RUNNING, "127.0.0.1", run.port, leaving=run.leaving, reports=run.reports)

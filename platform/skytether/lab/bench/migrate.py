@@ -116,7 +116,7 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
                 time.sleep(_AROUND_S)
                 began = time.monotonic()
                 before = len(agent.status().driver.transitions)
-                coming = operator.migrateinstance_of(instance_of(agent)).id
+                coming = operator.migrate_instance(instance_of(agent)).id
                 wait_for(lambda: instance_of(agent) == coming, agent)  # noqa: B023 (called at once)
                 changed = time.monotonic()
                 time.sleep(_AROUND_S)

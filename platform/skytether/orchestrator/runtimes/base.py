@@ -54,6 +54,8 @@ class Observation:
     """STARTING: what it waits for ("pulling x: 12 of 80 MB"); as long as this changes, the start makes progress.
     RUNNING: what its own health check finds wrong; empty: it is well. EXITED: how it ended, where the status does not
     tell; continues "the service ..."."""
+    out_of_memory: bool = False
+    """EXITED: it was killed for taking more memory than it may."""
     unstarted: bool = False
     """EXITED: it could not even be begun, and nothing of it or of earlier runs is left: another site may do better.
     STARTING: nothing of it runs yet."""

@@ -449,14 +449,15 @@ def observation(
             exit_status=exit_status(seen.exit_code),
             last_line=seen.last_line,
             detail=_how_it_ended(seen),
+            out_of_memory=bool(_how_it_ended(seen)),
             reports=reports,
         )
     if seen.runs and seen.ready and seen.host_port is not None:
         used = asdict(usage) if usage is not None else {}
         where = options.advertised, seen.host_port
         ill = "the container that held its network has ended" if cut_off else seen.ill
-        told: dict[str, Any] = {"reports": reports, "step_s": step_s}
-        return Observation(seen.attempt, Phase.RUNNING, *where, detail=ill, exceeds=exceeds, **told, **used)
+        told: dict[str, Any] = {"detail": ill, "exceeds": exceeds, "reports": reports, "step_s": step_s}
+        return Observation(seen.attempt, Phase.RUNNING, where[0], where[1], **told, **used)
     return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds, reports=reports)
 
 

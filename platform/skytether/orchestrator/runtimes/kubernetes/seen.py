@@ -236,6 +236,7 @@ def observation(
             exit_status=exit_status(code) if code is not None else None,
             last_line=last_line(seen.last_words),
             detail=_detail(seen, usage),
+            out_of_memory=seen.ended_how == "OOMKilled",
             reports=reports,
         )
     if (seen.started or seen.lingers) and seen.running:
