@@ -290,6 +290,17 @@ def test_a_run_that_ran_out_of_memory_has_more_the_next_time_as_far_as_there_is(
     assert "instead of" not in told(b)[-1]
 
 
+def test_with_no_room_for_its_size_anywhere_it_has_what_its_manifest_says_and_says_why(
+    bench: Any, new_record: NewRecord
+) -> None:
+    b = bench(cpu=4)
+    add(b, new_record(manifest=document(cpu=1, memory_mb=256), size=Size(cpu=8, memory_mb=256).model_dump()))
+    b.step(2)
+    assert (b.record().state, b.record().has, b.record().size) == (State.RUNNING, Size(cpu=1, memory_mb=256), None)
+    assert told(b) == ["has 1 core and 256 MiB instead of 8 cores and 256 MiB: lab: needs 8 cores, the site has 4"]
+    assert b.runtime.world["i1"].launch.spec.needs.cpu == 1
+
+
 # Over REST
 
 

@@ -294,7 +294,7 @@ def resize_instance(
         found = until_resized(client, instance, timeout_s) if wait else found
     if wait and found.id == instance and found.size != wanted:
         fail(f"it was not given that, and has {found.size}: `skytether instance events {instance}` says why")
-    _show(found, json)
+    show(found, json)
 
 
 @instance_app.command("events")

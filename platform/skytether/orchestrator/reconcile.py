@@ -376,6 +376,13 @@ class Reconciler:
         untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
         if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
             decision = self.weigh(replace(record, refused=untried), promised)  # it may have been mended
+        smaller: dict[str, Any] = {}
+        if decision.site is None and record.size is not None and record.replaces is None:
+            as_its_manifest_says = self.weigh(replace(record, size=None), promised)
+            if as_its_manifest_says.site is not None:
+                has, gets = record.has, replace(record, size=None).has
+                smaller = {"size": None, "happened": f"has {gets} instead of {has}: {told(record, decision.refused)}"}
+                decision = as_its_manifest_says
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
             self._metrics.refused(record.service, decision.refused)
@@ -395,6 +402,7 @@ class Reconciler:
             refused=refused,
             scores=[score.model_dump() for score in decision.scores],
             start_at=0.0,
+            **smaller,
         )
         if chosen is not None:
             self._promises.add(chosen)
