@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine-ros1 slow-others slow-kubernetes unit images fuzz jepsen check fmt docs licences audit lock clean
+.PHONY: demo test slow-engine-ros1 slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs licences audit lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -49,6 +49,19 @@ check: $(READY) ## style, types and layers: the same for people and CI
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+terraform: $(READY) checkov ## Terraform's modules and examples: their own tests, names by the providers' schemas, checkov
+	$(BIN)/pytest -q tests/terraform
+
+checkov: .checkov/bin/checkov
+	.checkov/bin/checkov --directory terraform --framework terraform --compact --quiet --skip-download
+
+.checkov/bin/checkov:
+	@$(PYTHON) -m venv .checkov
+	@.checkov/bin/pip install --quiet --disable-pip-version-check checkov==3.3.30
+
+iaas: $(READY) ## a bare virtual machine that Terraform makes, that joins, drives a robot, and is destroyed; minutes by step
+	$(BIN)/python tests/iaas/run.py
+
 fmt: $(READY) ## format, and mend what can be mended
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
@@ -56,6 +69,7 @@ fmt: $(READY) ## format, and mend what can be mended
 docs: $(READY) ## the pages that are made from the code
 	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
 	$(BIN)/python .ci/chart.py
+	$(BIN)/python .ci/terraform_docs.py
 	for service in navigation follow-in-front; do $(BIN)/python .ci/parameters.py $$service > docs/$$service-parameters.md || exit; done
 
 licences: $(READY) ## the licences of all that requirements.lock names, as a page
@@ -85,4 +99,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean: ## remove what the build and the tools made
-	rm -rf .venv .audit .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .audit .checkov .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -119,6 +119,7 @@ TOGETHER = (
     "service/test_actions_live.py",
     "service/test_calls.py",
     "services/",
+    "terraform/",
     "wire/",
 )
 """Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
@@ -249,6 +250,15 @@ def data_dir() -> Path:
     if not Path(folder).is_dir():
         require("data", f"SKYTETHER_DATA names {folder}, which is no directory")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def terraform_program() -> str:
+    """Terraform, or OpenTofu, which does the same."""
+    found = shutil.which("terraform") or shutil.which("tofu")
+    if found is None:
+        require("terraform", "neither terraform nor tofu is here")
+    return found
 
 
 @pytest.fixture(scope="session")
