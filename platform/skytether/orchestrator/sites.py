@@ -437,7 +437,11 @@ class Sites:
 
 
 def dismantle(
-    declared: Iterable[SiteCreate], folder: Path, find_runtime: Callable[[str], type[Runtime]] = load_runtime
+    declared: Iterable[SiteCreate],
+    folder: Path,
+    find_runtime: Callable[[str], type[Runtime]] = load_runtime,
+    *,
+    erase: bool = False,
 ) -> None:
     """End and remove all that is at declared sites, whose orchestrators are gone for good.
 
@@ -445,6 +449,7 @@ def dismantle(
         declared: As `declared.read_sites` gives them.
         folder: Where the runtimes keep what they note.
         find_runtime: Gives a runtime by its name.
+        erase: And what services wrote there.
 
     Raises:
         InvalidError: Runtime or options are wrong.
@@ -457,6 +462,8 @@ def dismantle(
         runtime = kind(asked.name, folder / asked.name, options)
         try:
             _empty(runtime)
+            if erase:
+                runtime.erase()
         finally:
             runtime.close()
 

@@ -98,7 +98,7 @@ class LocalProvider(Provider):
         if not (self._notes / machine).exists():
             return
         try:
-            dismantle([site], self._folder)  # it may never have been a site, or not have been empty
+            dismantle([site], self._folder, erase=True)  # it may never have been a site, or not have been empty
         except RuntimeFailure as error:
             raise ProviderSilentError(str(error)) from error
         shutil.rmtree(self._folder / machine, ignore_errors=True)  # what its services wrote goes with it

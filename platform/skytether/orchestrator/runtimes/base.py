@@ -325,5 +325,12 @@ class Runtime(ABC):
             RuntimeFailure: The site does not answer.
         """
 
+    def erase(self) -> None:  # noqa: B027 (most keep it in the folder of the site)
+        """Delete what services wrote and left here, which otherwise stays; after ``dismantle``, of a machine that goes.
+
+        Raises:
+            RuntimeFailure: The site does not answer.
+        """
+
     def close(self) -> None:  # noqa: B027 (most need none)
         """Let go of the site; what runs there runs on."""

@@ -100,6 +100,8 @@ class DockerRuntime(Runtime):
         self._tried_at = -math.inf
         self._swept_at = -math.inf
         self._early: threading.Thread | None = None
+        self._early_lock = threading.Lock()
+        """Held while that is begun: what is not begun yet cannot be waited for."""
         self._follower = Follower(self._engine, self._owner, self._on_connect, options.timeout_s)
         self._namespaces = Namespaces(
             self._engine, options, self._owner, self._follower, self._prepare, self._fence.must_lead
@@ -121,8 +123,15 @@ class DockerRuntime(Runtime):
 
     def _begin_early(self) -> None:
         self._tried_at = time.monotonic()
-        self._early = threading.Thread(target=self._prepare_early, name="docker-network", daemon=True)
-        self._early.start()
+        with self._early_lock:
+            self._early = threading.Thread(target=self._prepare_early, name="docker-network", daemon=True)
+            self._early.start()
+
+    def _wait_early(self) -> None:
+        with self._early_lock:
+            early = self._early
+        if early is not None:
+            early.join(self._options.timeout_s)
 
     def _prepare_early(self) -> None:
         with suppress(RuntimeFailure):  # each start tries again, and says it to who asked
@@ -395,13 +404,16 @@ class DockerRuntime(Runtime):
 
     @override
     def dismantle(self) -> None:
-        if self._early is not None:
-            self._early.join(self._options.timeout_s)  # or it makes the network again
+        self._wait_early()  # or it makes the network again
         self._remove_unbegun()
         self._namespaces.clear()
         remove_left(self._engine, self._owner)
         self._fence.clear()
         remove_network(self._engine, self._options)
+
+    @override
+    def erase(self) -> None:
+        remove_left(self._engine, self._owner, data=True)
 
     @override
     def close(self) -> None:
@@ -414,6 +426,5 @@ class DockerRuntime(Runtime):
             job.join(max(0.0, deadline - time.monotonic()))  # what it has begun is closed off, and seen in its network
         self._namespaces.close()
         self._follower.close()
-        if self._early is not None:
-            self._early.join(self._options.timeout_s)  # or it leaves its container behind
+        self._wait_early()  # or it leaves its container behind
         self._engine.drop()

@@ -41,14 +41,17 @@ def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
     return found
 
 
-def remove_left(engine: Engine, owner: str) -> None:
+def remove_left(engine: Engine, owner: str, *, data: bool = False) -> None:
     """Remove the volumes of containers that somebody removed without them: one of each holds a session's key.
+
+    With ``data`` also those that outlive their containers.
 
     Raises:
         RuntimeFailure: The engine does not answer.
     """
     with engine.asked():
-        wanted = {"label": [f"{OWNER}={owner}", INSTANCE], "dangling": True}
+        labels = [f"{OWNER}={owner}"] if data else [f"{OWNER}={owner}", INSTANCE]
+        wanted = {"label": labels, "dangling": True}
         for volume in engine.api().volumes(wanted)["Volumes"] or ():
             remove_volume(engine, volume["Name"])
 
