@@ -130,7 +130,7 @@ def test_a_drained_group_goes_with_its_last_machine(run: Run) -> None:
         (("--max", "1", "--option", "runtime=podman"), 1, "options.runtime: input should be 'process' or 'docker'"),
         (("--max", "1", "--option", "options={networks: 1}"), 1, "options.networks: unknown key"),
         (("--max", "1", "--option", "options={cpu: 1}"), 1, "options.cpu is made for each machine: leave it out"),
-        (("--max", "1", "--provider", "cloudy"), 1, "there is no provider 'cloudy'; installed are: local"),
+        (("--max", "1", "--provider", "cloudy"), 1, "there is no provider 'cloudy'; installed are: local, openstack"),
         (("--max", "1", "--tier", "fog"), 2, "tier: "),
     ],
 )

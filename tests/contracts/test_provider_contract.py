@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from openstack_cloud import OpenstackCloud
 
 from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.providers.base import Condition, Found, Invitation, Order, Provider
 from skytether.orchestrator.providers.local import LocalOptions, LocalProvider
+from skytether.orchestrator.providers.openstack import OpenstackOptions, OpenstackProvider
 from skytether.testing.providers import FakeCloud, FakeProvider, FakeProviderOptions
 
 OWNER, OTHER = "00aa11bb22cc", "ffffffffffff"
@@ -30,6 +32,9 @@ class Kit(ABC):
 
     def order(self, name: str = "cloud-1") -> Order:
         return Order(name, {"team": "walkers"}, INVITATION)
+
+    def close(self) -> None:  # noqa: B027 (most need none)
+        """Leave nothing behind; no machine is there by now."""
 
     def until(self, provider: Provider, seen: Callable[[list[Found]], bool]) -> list[Found]:
         deadline = time.monotonic() + 30.0
@@ -53,7 +58,44 @@ class LocalKit(Kit):
         return LocalProvider("cloud", owner, self.folder, LocalOptions(options={"confined": False}))
 
 
-@pytest.fixture(params=[pytest.param(FakeKit, id="fake"), pytest.param(LocalKit, id="local")])
+class OpenstackKit(Kit):
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.cloud = OpenstackCloud()
+        self.cloud.__enter__()
+        (folder / "machine.yaml").write_text("#!/bin/sh\njoin @SKYTETHER_TOKEN@\n")
+        self.opened: list[Provider] = []
+
+    def open(self, owner: str = OWNER) -> Provider:
+        options = OpenstackOptions(
+            cloud="lab",
+            clouds_file=self.cloud.clouds_yaml(self.folder),
+            flavor="m1.large",
+            image="debian-12",
+            network="robots",
+            user_data=self.folder / "machine.yaml",
+        )
+        self.opened.append(OpenstackProvider("cloud", owner, self.folder, options))
+        return self.opened[-1]
+
+    def close(self) -> None:
+        for provider in self.opened:
+            provider.close()
+        self.cloud.__exit__()
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(FakeKit, id="fake"),
+        pytest.param(LocalKit, id="local"),
+        pytest.param(
+            OpenstackKit,
+            id="openstack",
+            # openstacksdk warns of itself.
+            marks=pytest.mark.filterwarnings("ignore::PendingDeprecationWarning"),
+        ),
+    ]
+)
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kit]:
     kit = request.param(tmp_path)
     yield kit
@@ -62,6 +104,7 @@ def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kit]:
         for found in provider.machines():
             provider.destroy(found.id)
         provider.close()
+    kit.close()
 
 
 def test_a_machine_offers_something(kit: Kit) -> None:

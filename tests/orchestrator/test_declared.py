@@ -159,7 +159,7 @@ def test_a_declared_group_is_made_changed_and_otherwise_left(start: Start) -> No
         ("cloud: {provider: local, max: 1, min: 2}", "cloud: min is 2 and max 1: min must not be above max"),
         ("cloud: {provider: local, max: 1, maximum: 2}", "cloud.maximum: unknown key, did you mean 'max'?"),
         ("cloud: {provider: local, max: 1, runtime: docker}", "a site has a runtime, a group of sites a provider"),
-        ("cloud: {provider: lokal, max: 1}", "there is no provider 'lokal'; installed are: local"),
+        ("cloud: {provider: lokal, max: 1}", "there is no provider 'lokal'; installed are: local, openstack"),
         ("cloud: {provider: local, max: 1, options: {cpus: 1}}", "options.cpus: unknown key, did you mean 'cpu'?"),
         ("cloud: {provider: local}", "cloud.max: is missing"),
     ],

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import SiteCreate
@@ -43,8 +43,8 @@ _OFFER_AGE = 60.0
 class Invites(Protocol):
     """Lets machines become sites by themselves."""
 
-    def __call__(self, machine: str, group: GroupCreate) -> Invitation:
-        """For a site of this name, in place of those before; the group says of which tier it is, and so on.
+    def __call__(self, machine: str, group: GroupCreate, options: Mapping[str, Any]) -> Invitation:
+        """For a site of this name, in place of those before, of the group's tier and so on, with these options.
 
         Raises:
             ProviderFailure: It cannot be.
@@ -52,7 +52,7 @@ class Invites(Protocol):
         ...
 
 
-def no_invitations(machine: str, group: GroupCreate) -> Invitation:  # noqa: ARG001 (as all have it)
+def no_invitations(machine: str, group: GroupCreate, options: Mapping[str, Any]) -> Invitation:  # noqa: ARG001
     """Where machines cannot join.
 
     Raises:
@@ -327,7 +327,7 @@ class Scaler:
         """Ask for a machine whose row is there."""
         provider = group.provider
         try:
-            invitation = self._invite(name, group.asked) if provider.joins else None
+            invitation = self._invite(name, group.asked, provider.site_options) if provider.joins else None
             id_ = provider.make(Order(name, group.asked.labels, invitation))
         except ProviderSilentError as error:
             self._failed(group, f"{name}: {error}")  # whether it is made, the next looks tell

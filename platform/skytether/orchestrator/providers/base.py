@@ -154,5 +154,10 @@ class Provider(ABC):
         """How a machine is reached as a site; None: it becomes one by itself. Pure."""
         return None
 
+    @property
+    def site_options(self) -> Mapping[str, Any]:
+        """What the runtime of machines that join is told."""
+        return {}
+
     def close(self) -> None:  # noqa: B027 (most need none)
         """Let go; the machines stay."""
