@@ -56,7 +56,7 @@ def test_a_command_of_the_documentation_is_there(page: str, line: str) -> None:
             return
         assert name in command.commands, f"{page}: {line}"
         command = command.commands[name]
-    known = {"-h", "--help", "--install-completion"}  # every command has these, the last of them the first only
+    known = {"-", "-h", "--help", "--install-completion"}  # every command has these, the last of them the first only
     options = known | {
         option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)
     }

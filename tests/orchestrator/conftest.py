@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 import uvicorn
+from node_scene import NodeScene, ReachedRuntime, find_runtime
 from reconcile_bench import Bench
 
 from skytether.api.client import Client
@@ -23,7 +25,7 @@ from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.pause import Pause
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.server import listening
-from skytether.orchestrator.settings import Settings, Timing
+from skytether.orchestrator.settings import Nodes, Settings, Timing
 from skytether.orchestrator.sites import load_runtime
 from skytether.orchestrator.store import Store
 from skytether.testing import runtimes
@@ -255,3 +257,41 @@ def served_with(tmp_path: Path, server: Server) -> Iterator[Callable[..., Served
 def shared(tmp_path_factory: pytest.TempPathFactory, shared_server: Server) -> Iterator[Served]:
     """One for tests that leave it as they found it."""
     yield from served_in(tmp_path_factory.mktemp("shared"), shared_server)
+
+
+class Later:
+    """The time, or what it will be."""
+
+    def __init__(self) -> None:
+        self.by = 0.0
+
+    def __call__(self) -> float:
+        return time.time() + self.by
+
+
+@pytest.fixture
+def later() -> Later:
+    return Later()
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, server: Server, later: Later) -> Iterator[NodeScene]:
+    """An orchestrator that machines join, and its machines."""
+    ReachedRuntime.worlds.clear()
+    state = tmp_path / "state"
+    state.mkdir(mode=0o700)
+    (state / "state.db").write_bytes(migrated())
+    settings = Settings(
+        state_dir=state, timing=QUICK, nodes=Nodes(port=0), catalog={"modules": ["skytether.testing.toy_service"]}
+    )
+    core = Orchestrator(settings, clock=later, find_runtime=find_runtime)
+    core.start()
+    core.sites.delete("local")
+    server.app = create_app(core)
+    server.share_routes()
+    with Client(server.url, (state / "operator.token").read_text().strip()) as operator:
+        operator.put_service("toy", document(needs={"cpu": 0.1, "memory_mb": 1}))
+        scene = NodeScene(core, operator, tmp_path)
+        yield scene
+        scene.close()
+    core.stop()

@@ -35,6 +35,9 @@ ROUTES: list[tuple[str, str, Any, tuple[int, int, int, int, int]]] = [
     ("POST", f"{API}/sites", {"name": "tmp", "tier": "robot", "runtime": "fake"}, (401, 401, 403, 403, 201)),
     ("GET", f"{API}/sites/lab", None, (401, 401, 200, 200, 200)),
     ("GET", f"{API}/sites/lab/probe", None, (401, 401, 204, 204, 204)),
+    ("POST", f"{API}/sites/nowhere/drain", None, (401, 401, 403, 403, 404)),
+    ("POST", f"{API}/sites/nowhere/resume", None, (401, 401, 403, 403, 404)),
+    ("POST", f"{API}/invitations", {"name": "new"}, (401, 401, 403, 403, 409)),
     ("DELETE", f"{API}/sites/tmp", None, (401, 401, 403, 403, 204)),
     ("GET", f"{API}/robots", None, (401, 401, 403, 403, 200)),
     ("POST", f"{API}/robots", {"name": "tmp"}, (401, 401, 403, 403, 201)),
@@ -114,7 +117,14 @@ def test_every_route_is_in_the_list(people: People) -> None:
         for path, methods in people.http.get(people.served.url + "/openapi.json").json()["paths"].items()
         for method in methods
     }
-    parameters = {"lab": "{site}", "tmp": "{}", "toy": "{service}", "new": "{service}", "ID": "{instance}"}
+    parameters = {
+        "lab": "{site}",
+        "nowhere": "{site}",
+        "tmp": "{}",
+        "toy": "{service}",
+        "new": "{service}",
+        "ID": "{instance}",
+    }
     parameters |= {"none": "{token}", "walker": "{robot}", "0a": "{order}"}
     parameters["ENDED"] = "{instance}"
     listed = set()

@@ -93,6 +93,31 @@ ROWS: dict[str, dict[str, Any]] = {
         "cost": 0.0,
         "images": ["*"],
         "draining": False,
+        "evacuating": False,
+    },
+    "nodes": {
+        "site": "lab",
+        "serial": "7f",
+        "ends_at": NOW,
+        "next_serial": None,
+        "follow": True,
+        "joined_at": NOW,
+        "seen_at": NOW,
+        "seen_as": "192.0.2.7",
+        "machine": {"cpu": 4.0, "architecture": "arm64"},
+    },
+    "invitations": {
+        "id": "n1",
+        "prefix": KEPT.prefix,
+        "sha256": KEPT.digest,
+        "site": {"name": "ward", "tier": "edge", "runtime": "docker"},
+        "name": "ward",
+        "by": "operator",
+        "created_at": NOW,
+        "expires_at": NOW + 3600,
+        "used_at": None,
+        "used_from": None,
+        "used_key": None,
     },
     "site_groups": {
         "name": "cloud",
@@ -197,6 +222,9 @@ def look_through(store: Store, counts: dict[str, int]) -> None:
     assert groups == ([("cloud", 2, 1, ((NOW, "a machine was made"),))] if "site_groups" in counts else [])
     machines = [(row.name, row.stage, row.provided) for row in store.machines()]
     assert machines == ([("cloud-1", Stage.JOINING, "vm-1")] if "machines" in counts else [])
+    if "nodes" in counts:
+        assert store.nodes.all()["lab"].machine.architecture == "arm64"
+        assert [one.site.name for one in store.nodes.invitations(KEPT.prefix)] == ["ward"]
     sums = [account.sums() for account in store.accounts().values()]
     assert sums == ([{("control_overruns",): 7}] if "accounts" in counts else [])
     assert [(e.id, e.state) for e in store.events("i1", 0)] == [(1, State.RUNNING)]

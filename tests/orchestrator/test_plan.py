@@ -319,3 +319,14 @@ def test_what_is_not_well_is_started_again(new_record: NewRecord) -> None:
 def test_a_runtime_may_know_better_how_it_ended() -> None:
     ended = seen(Phase.EXITED, exit_status=-9, detail="ran out of memory", last_line="x")
     assert how_it_ended(ended) == 'ran out of memory; its last line: "x"'
+
+
+def test_robots_that_were_cut_off_with_their_site_get_time_to_renew(new_record: NewRecord) -> None:
+    """A day later their leases are over, and neither they nor what they have could say a word."""
+    now = NOW + 86_400
+    short = at_site(new_record, State.RUNNING, lease_s=15, host="127.0.0.1", port=4000)
+    assert decide(short, RUNNING, now, T, seen_since=now - 14) is None
+    assert decide(short, RUNNING, now, T, seen_since=now - 15) == Expire(short)
+    long = dataclasses.replace(short, lease_s=3600)
+    assert decide(long, RUNNING, now, T, seen_since=now - 59) is None
+    assert decide(long, RUNNING, now, T, seen_since=now - 60) == Expire(long)

@@ -23,6 +23,8 @@ from .rest import (
     Instance,
     InstanceCreate,
     InstanceEvent,
+    Invitation,
+    Invite,
     Migrate,
     Neighbours,
     Problem,
@@ -270,13 +272,31 @@ class Client(Connection):
         """Add a site."""
         return self._one(Site, "POST", "/sites", site)
 
-    def delete_site(self, name: str, *, drain: bool = False) -> bool:
-        """Forget a site that has no instances; with ``drain`` it takes no more, and goes with its last one.
+    def invite(self, request: Invite) -> Invitation:
+        """Make a token with which one machine may join as a site."""
+        return self._one(Invitation, "POST", "/invitations", request)
+
+    def drain_site(self, name: str) -> Site:
+        """Have a site take no more instances, and move those that are there elsewhere."""
+        return self._one(Site, "POST", _at("sites", name, "drain"))
+
+    def resume_site(self, name: str) -> Site:
+        """Have a site that was drained take instances again."""
+        return self._one(Site, "POST", _at("sites", name, "resume"))
+
+    def delete_site(self, name: str, *, drain: bool = False, force: bool = False) -> bool:
+        """Forget a site that has no instances.
+
+        Args:
+            name: Its name.
+            drain: It takes no more, and goes with its last one.
+            force: With all that is there, for a machine that is gone for good.
 
         Returns:
             Whether it is gone by now.
         """
-        return self._request("DELETE", _at("sites", name) + "?drain=true" * drain).status_code != HTTPStatus.ACCEPTED
+        query = "?force=true" if force else "?drain=true" if drain else ""
+        return self._request("DELETE", _at("sites", name) + query).status_code != HTTPStatus.ACCEPTED
 
     def probe(self, site: str) -> float:
         """One round trip to where a site answers, in seconds; the first one also opens the connection."""

@@ -378,6 +378,58 @@ class SiteCreate(Strict):
     """Patterns (``registry.example/*``) of the images that may run there."""
 
 
+class Invite(Strict):
+    """Let one machine join as a site."""
+
+    name: Name
+    tier: Tier = "edge"
+    options: dict[str, Any] = {}
+    """Of the Docker runtime, as for a site; what the machine says of its address and ports is for those that are not
+    among them."""
+    speed: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    cost: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    images: tuple[Annotated[str, Field(min_length=1, max_length=255)], ...] = ("*",)
+    ttl_s: Annotated[float, Field(ge=1, le=86_400)] = 3600.0
+    """How long the join token is good for."""
+
+
+class Invitation(Strict):
+    """The only time that a join token is shown."""
+
+    id: str
+    name: str
+    token: Annotated[str, Field(repr=False)]
+    """Good once; with the SHA-256 of the public key by which the machine knows the orchestrator."""
+    expires_at: datetime
+    urls: tuple[str, ...] = ()
+    """Where machines connect, as far as the orchestrator was told (its setting ``nodes.urls``)."""
+    port: int
+    """TCP port where they connect."""
+
+
+class NodeState(Strict):
+    """What is known of a machine that joined."""
+
+    joined_at: datetime
+    seen_at: datetime
+    """When it was linked last."""
+    seen_as: str
+    """The address that its connections come from."""
+    certificate_until: datetime
+    hostname: str = ""
+    system: str = ""
+    architecture: str = ""
+    cpu: float = 0.0
+    """Cores."""
+    memory_mb: int = 0
+    disk_mb: int = 0
+    """Free, where its engine keeps what it has."""
+    engine: str = ""
+    """Its version."""
+    echo: int | None = None
+    """UDP port of its echo for probes."""
+
+
 class Unfit(Strict):
     """A service that a site failed to start, and of which it gets no more for a while."""
 
@@ -412,6 +464,10 @@ class Site(SiteCreate):
     """What it failed to start, as far as the orchestrator that leads has seen; told by that one, and to operators."""
     draining: bool = False
     """It takes no more instances, and is deleted with its last one."""
+    evacuating: bool = False
+    """It takes no more instances, and those that are there are moved elsewhere."""
+    node: NodeState | None = None
+    """Of a machine that joined; told to operators."""
 
 
 TokenLife = Annotated[float, Field(ge=1, le=10 * 365 * 86_400)]

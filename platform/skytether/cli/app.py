@@ -24,6 +24,7 @@ from . import (
     resources,
     robot_run,
     robot_status,
+    site_nodes,
     tokens,
 )
 from .output import log_to_console
@@ -44,6 +45,7 @@ app.command()(apply.apply)
 resources.robot_app.command("status")(robot_status.status)
 app.add_typer(orchestrator.app, name="orchestrator")
 app.add_typer(resources.service_app, name="service")
+site_nodes.add_to(resources.site_app)
 app.add_typer(resources.site_app, name="site")
 app.add_typer(groups.app, name="group")
 app.add_typer(resources.instance_app, name="instance")

@@ -83,8 +83,9 @@ def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False
 
 def _why(site: Site) -> str:
     """What is wrong with a site: with all of it, or with single services there."""
+    state = "draining" if site.draining else "being drained" if site.evacuating else ""
     unfit = (f"no {u.service} before {u.until:%H:%M:%S} UTC: the service {u.reason}" for u in site.unfit)
-    return "; ".join(filter(None, ("draining" if site.draining else "", site.reason, *unfit)))
+    return "; ".join(filter(None, (state, site.reason, *unfit)))
 
 
 @site_app.command("show")
@@ -117,13 +118,14 @@ def add_site(
 
     from skytether.api.rest import SiteCreate
 
-    options = {}
-    for entry in option or ():
-        key, is_, value = entry.partition("=")
-        if not is_:
-            fail(f"--option {entry}: write KEY=VALUE", 2)
-        options[key] = value_of(value)
-    asked = {"name": name, "runtime": runtime, "tier": tier, "options": options, "speed": speed, "cost": cost}
+    asked = {
+        "name": name,
+        "runtime": runtime,
+        "tier": tier,
+        "options": options_of(option),
+        "speed": speed,
+        "cost": cost,
+    }
     try:
         request = SiteCreate.model_validate({**asked, "images": tuple(image or ("*",))})
     except ValidationError as error:
@@ -132,6 +134,17 @@ def add_site(
     with connected(url, token_file) as client:
         made = client.create_site(request)
     show(made, json)
+
+
+def options_of(entries: list[str] | None) -> dict[str, Any]:
+    """What ``--option KEY=VALUE`` says."""
+    options = {}
+    for entry in entries or ():
+        key, is_, value = entry.partition("=")
+        if not is_:
+            fail(f"--option {entry}: write KEY=VALUE", 2)
+        options[key] = value_of(value)
+    return options
 
 
 def value_of(text: str) -> Any:

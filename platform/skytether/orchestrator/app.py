@@ -13,7 +13,7 @@ from .hosts import Hosts, own_names
 from .logs import Audit
 from .pause import Pause
 from .reception import Reception
-from .routers import catalog, groups, health, instances, robots, sites, tokens
+from .routers import catalog, groups, health, instances, invitations, robots, sites, tokens
 from .routers.deps import plain_request
 
 _NO_TELEMETRY: TelemetryConfig = {"tracing": False, "metrics": False, "logs": False}
@@ -34,7 +34,7 @@ def create_app(core: Orchestrator) -> FastAPI:
     )
     app.state.core = core
     problems.install(app)
-    for part in (catalog, sites, groups, instances, robots, tokens, health, docs_page):
+    for part in (catalog, sites, groups, invitations, instances, robots, tokens, health, docs_page):
         app.include_router(part.router)
     pause = Pause()
     app.add_middleware(

@@ -1,4 +1,4 @@
-"""A copy of what an orchestrator cannot make anew: database, secret key, operator's token; taken while it runs.
+"""A copy of what an orchestrator cannot make anew: database, keys, operator's token; taken while it runs.
 
 What a copy does not hold are instances' folders (recordings belong to their owners) and, with PostgreSQL, the database,
 which has tools of its own (``pg_dump``).
@@ -9,13 +9,17 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
+from .nodes.authority import KEY as NODES_KEY
 from .security import KEY, OLD_KEY, OPERATOR
 
 DATABASE = "state.db"
 SECRETS = (KEY, OPERATOR)
+_MAYBE = (NODES_KEY,)
+"""Of machines that joined, where any may."""
 
 
 class BackupError(Exception):
@@ -47,7 +51,7 @@ def backup(state_dir: Path, to: Path) -> list[str]:
                 source.backup(copy)  # consistent, whatever is written meanwhile
                 copy.execute("PRAGMA journal_mode=DELETE")  # one file
             copied.append(DATABASE)
-        for name in (*SECRETS, *_old_keys(state_dir)):
+        for name in (*SECRETS, *_there(state_dir, _MAYBE), *_old_keys(state_dir)):
             _copy(state_dir / name, to / name)
             copied.append(name)
     except (OSError, sqlite3.Error) as error:
@@ -69,12 +73,16 @@ def restore(source: Path, state_dir: Path) -> list[str]:
         raise BackupError(f"{state_dir} holds {', '.join(present)}: move that away first, or give another --state-dir")
     try:
         state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-        put = [name for name in (DATABASE, *SECRETS, *_old_keys(source)) if (source / name).exists()]
+        put = [*_there(source, (DATABASE, *SECRETS, *_MAYBE)), *_old_keys(source)]
         for name in put:
             _copy(source / name, state_dir / name)
     except OSError as error:
         raise BackupError(f"cannot write {state_dir}: {error.strerror}") from error
     return put
+
+
+def _there(folder: Path, names: Iterable[str]) -> list[str]:
+    return [name for name in names if (folder / name).exists()]
 
 
 def _old_keys(folder: Path) -> list[str]:

@@ -32,6 +32,9 @@ from .leader import Leadership
 from .loops import Loop
 from .metrics import GroupGauges, Metrics, Running, SiteGauges
 from .moves import Moves
+from .nodes.authority import KEY as NODES_KEY
+from .nodes.authority import Authority
+from .nodes.enrolment import Enrolment
 from .providers.base import Provider
 from .quotas import Quotas
 from .reconcile import Reconciler
@@ -86,7 +89,7 @@ class Orchestrator:
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
         self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
         self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
-        clock = self._clock = clock or self._shared_clock or time.time
+        clock = self.clock = clock or self._shared_clock or time.time
         self.store.key_id = lambda: secrets.fingerprint
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
@@ -137,6 +140,17 @@ class Orchestrator:
             find_runtime,
         )
         self.reconciler.sites = self.sites
+        self.authority: Authority | None = None
+        self.nodes: Enrolment | None = None
+        """Machines that joined; None: none can."""
+        self.node_port = settings.nodes.port
+        """TCP port where they connect."""
+        if settings.nodes.port is not None:
+            self.authority = Authority(settings.secrets_dir or settings.state_dir, clock)
+            days, renew_days = settings.nodes.certificate_days, settings.nodes.renew_days
+            self.nodes = Enrolment(
+                self.store, lambda: self.sites, self.authority, clock, days, renew_days, settings.nodes.urls
+            )
         moves = Moves(
             self.store,
             self.catalogue,
@@ -241,6 +255,11 @@ class Orchestrator:
             raise SecretFileError(
                 "the database belongs to orchestrators with another secret.key: give this one the same (--secrets-dir)"
             )
+        if self.authority is not None and not self.store.agree(NODES_KEY, self.authority.pin):
+            raise SecretFileError(
+                f"the database belongs to orchestrators with another {NODES_KEY}: give this one the same "
+                "(--secrets-dir), or no machine that joined is let in"
+            )
         self.elector.start()
         self.elector.wait_first(_FIRST_LOOK)
         self.sites.start(self.settings.local_site, declared)
@@ -254,7 +273,7 @@ class Orchestrator:
             self._write()
             # Another one leads, and cannot know whom this one refused.
             if not self.leadership.leads and (self.strain.felt() or self.strain.owed()):
-                self.store.extend_leases(self._clock(), at_least=True)
+                self.store.extend_leases(self.clock(), at_least=True)
         return PERIOD
 
     def _write(self) -> None:

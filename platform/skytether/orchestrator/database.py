@@ -17,6 +17,7 @@ from .db import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
 from .discovery import NAME
 from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
 from .models import facts, gates, robots, services, shared, sites, stops, tokens
+from .nodes.rows import NodeRows
 from .security import TokenHash
 
 
@@ -98,7 +99,8 @@ _HOLDERS = (
     .where(tokens.c.prefix == bindparam("prefix"))
 )
 """Made once: every request asks it."""
-_SITES = select(*(column for column in sites.c if column is not sites.c.draining)).order_by(sites.c.name)
+_STATE_OF_SITES = (sites.c.draining, sites.c.evacuating)
+_SITES = select(*(column for column in sites.c if column not in set(_STATE_OF_SITES))).order_by(sites.c.name)
 _HEAR_GATE = text(
     "INSERT INTO gates (robot, at, report) SELECT name, :at, :report FROM robots WHERE name = :of_robot"
     " ON CONFLICT (robot) DO UPDATE SET at = excluded.at, report = excluded.report"
@@ -127,6 +129,7 @@ class Database:
         self._writer = self._engine.execution_options(immediate=True)
         self._turn = threading.Lock()
         self._schema = ""
+        self.nodes = NodeRows(self._writing, self._reader)
 
     @contextmanager
     def _writing(self, *, alone: bool = False) -> Iterator[Connection]:
@@ -233,6 +236,16 @@ class Database:
         """Those that are to be deleted with their last instance."""
         with self._reader.connect() as connection:
             return set(connection.scalars(select(sites.c.name).where(sites.c.draining)))
+
+    def evacuating_sites(self) -> set[str]:
+        """Those that take no more, and whose instances are moved elsewhere."""
+        with self._reader.connect() as connection:
+            return set(connection.scalars(select(sites.c.name).where(sites.c.evacuating)))
+
+    def evacuate_site(self, name: str, evacuating: bool) -> None:
+        """From now on, or not any more."""
+        with self._writing() as connection:
+            connection.execute(update(sites).where(sites.c.name == name).values(evacuating=evacuating))
 
     def drain_site(self, name: str) -> None:
         """From now on; it cannot be taken back."""

@@ -49,6 +49,39 @@ sites = Table(
     Column("cost", Float, nullable=False, server_default="0"),
     Column("images", JSON, nullable=False, server_default='["*"]'),
     Column("draining", Boolean, nullable=False, server_default=false()),
+    Column("evacuating", Boolean, nullable=False, server_default=false(), comment="What runs there is moved elsewhere"),
+)
+
+nodes = Table(
+    "nodes",
+    metadata,
+    Column("site", String(63), ForeignKey("sites.name", ondelete="CASCADE"), primary_key=True),
+    Column("serial", String(40), nullable=False, comment="Of the certificate that it showed last"),
+    Column("ends_at", Float, nullable=False),
+    Column("next_serial", String(40), comment="Of the one that it was given and has not shown yet"),
+    Column("follow", Boolean, nullable=False, comment="Whether the address of the site is the machine's present one"),
+    Column("joined_at", Float, nullable=False),
+    Column("seen_at", Float, nullable=False),
+    Column("seen_as", String(64), nullable=False, comment="Address that its connections come from"),
+    Column("machine", JSON, nullable=False),
+    comment="Machines that joined, and which certificates of theirs are good: no others are",
+)
+
+invitations = Table(
+    "invitations",
+    metadata,
+    Column("id", String(16), primary_key=True),
+    Column("prefix", String(16), nullable=False, index=True),
+    Column("sha256", String(64), nullable=False),
+    Column("site", JSON, nullable=False, comment="As it is to be"),
+    Column("name", String(63), nullable=False),
+    Column("by", String(80), nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("expires_at", Float, nullable=False),
+    Column("used_at", Float, comment="NULL: it is good"),
+    Column("used_from", String(64)),
+    Column("used_key", String(64), comment="SHA-256 of the public key that got a certificate"),
+    comment="Tokens with which a machine may join, once",
 )
 
 site_groups = Table(

@@ -295,12 +295,15 @@ class Moves:
 
     def _drains(self, record: Record) -> bool:
         site = self._sites().find(record.site)
-        return site is not None and site.draining
+        return site is not None and (site.draining or site.evacuating)
 
     def _leaving(self, record: Record) -> str:
         """Why its site is about to end it; empty: it is not."""
         site = self._sites().find(record.site)
-        return (site.leaving.get(record.id, "") or site.emptied) if site is not None else ""
+        if site is None:
+            return ""
+        drained = f"site {site.name} is being drained" if site.evacuating else ""
+        return site.leaving.get(record.id, "") or site.emptied or drained
 
     def _reachable(self, record: Record) -> bool:
         site = self._sites().find(record.site)

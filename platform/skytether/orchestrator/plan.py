@@ -20,6 +20,9 @@ from .settings import Timing
 
 BAD_GRANT_STATUS = 2
 """Exit status of a service that does not like its parameters or grant: another try would end the same way."""
+_RETURN_S = 60.0
+"""Seconds, or a lease if that is shorter, that robots get to renew once a silent site answers again: who was cut off
+together with it could not, and is driven by what runs there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +147,7 @@ def decide(
         return Stop(record.id, force=_waited(record.stopping_at or 0.0, now, seen_since) >= timing.stop_grace)
     if record.state.final:
         return Stop(record.id, force=True) if there else None
-    if now >= record.lease_expires_at:
+    if now >= record.lease_expires_at and now - seen_since >= min(record.lease_s, _RETURN_S):
         return Expire(record)
     if record.state in (State.PENDING, State.PLACING):
         return Place(record)

@@ -31,6 +31,7 @@ from .core import Orchestrator
 from .db import AddressError
 from .door import Door, GuardedProtocol
 from .errors import InvalidError, OutdatedError
+from .nodes.serving import serving_nodes
 from .security import SecretFileError
 from .settings import Settings
 
@@ -79,7 +80,11 @@ def run(settings: Settings) -> None:
         where = error.filename or settings.logs.audit_file
         raise StartError(f"cannot write the audit to {where}: {error.strerror}", usage=True) from error
     _allow_connections()
-    with _locked(settings.state_dir), listening(settings.host, settings.port) as listener:
+    with (
+        _locked(settings.state_dir),
+        listening(settings.host, settings.port) as listener,
+        _listening_for_nodes(settings) as for_nodes,
+    ):
         _check_secrecy(settings, listener)
         try:
             core = Orchestrator(settings)
@@ -87,7 +92,16 @@ def run(settings: Settings) -> None:
             raise StartError(str(error)) from error
         except AddressError as error:
             raise StartError(str(error), usage=True) from error
-        _serve(core, listener)
+        _serve(core, listener, for_nodes)
+
+
+@contextmanager
+def _listening_for_nodes(settings: Settings) -> Iterator[socket.socket | None]:
+    if settings.nodes.port is None:
+        yield None
+        return
+    with listening(settings.nodes.host or settings.host, settings.nodes.port, "nodes.") as listener:
+        yield listener
 
 
 def _check_secrecy(settings: Settings, listener: socket.socket) -> None:
@@ -110,7 +124,7 @@ def _allow_connections() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (enough, hard))
 
 
-def _serve(core: Orchestrator, listener: socket.socket) -> None:
+def _serve(core: Orchestrator, listener: socket.socket, for_nodes: socket.socket | None) -> None:
     server = _Server(core, listener)
     # Uvicorn handles signals while it serves, and raises them again when it has ended; ours are for before and after.
     previous = {number: signal.signal(number, server.handle_exit) for number in (signal.SIGTERM, signal.SIGINT)}
@@ -120,7 +134,7 @@ def _serve(core: Orchestrator, listener: socket.socket) -> None:
             gc.freeze()  # what is loaded by now stays: looking through it for garbage holds up every request
             gc.set_threshold(*_COLLECTED)
             sys.setswitchinterval(_SWITCH)
-            with _echo(core, listener):
+            with _echo(core, listener), serving_nodes(core, for_nodes):
                 server.run(sockets=[listener])
         finally:
             core.stop()
@@ -243,8 +257,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def listening(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket that listens.
+def listening(host: str, port: int, group: str = "") -> Iterator[socket.socket]:
+    """A socket that listens; ``group``: of the settings that say where, with a dot; none: options say it too.
 
     Raises:
         StartError: There is no such address, or the port is taken.
@@ -254,13 +268,18 @@ def listening(host: str, port: int) -> Iterator[socket.socket]:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
     except OSError as error:
-        raise StartError(f"there is no address '{host}' here: {error.strerror}; give another with --host") from error
+        other = f"give another with {_options(group, 'host')}"
+        raise StartError(f"there is no address '{host}' here: {error.strerror}; {other}") from error
     with listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind(address)
             listener.listen(_BACKLOG)
         except OSError as error:
-            text = f"cannot listen on {host} port {port}: {error.strerror}; give another with --host or --port"
-            raise StartError(text) from error
+            other = f"give another with {_options(group, 'host')} or {_options(group, 'port')}"
+            raise StartError(f"cannot listen on {host} port {port}: {error.strerror}; {other}") from error
         yield listener
+
+
+def _options(group: str, key: str) -> str:
+    return f"{group}{key}" if group else f"--{key}"

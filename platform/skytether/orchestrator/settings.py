@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from skytether.api.hosts import is_ip, is_name
 from skytether.api.manifest import Strict
+from skytether.api.node import read_url
 
 from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
 from .discovery import MAX_ADDRESS, is_address
@@ -232,6 +233,30 @@ class Logs(Group):
         return address
 
 
+class Nodes(Group):
+    """Machines that join by themselves, and call the orchestrator (docs/nodes.md)."""
+
+    port: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    """TCP port where they connect, such as 8603, always with TLS and certificates of its own; 0: any free one, written
+    to `nodes.address` in the state folder. None: no machine can join."""
+    host: Annotated[str, Field(min_length=1)] | None = None
+    """Address to listen on for them; None: as `host`."""
+    urls: tuple[str, ...] = ()
+    """`https://HOST:PORT` at which they reach the orchestrators over this database, each of them; none: where they
+    joined."""
+    certificate_days: Annotated[float, Field(gt=0, le=825)] = 30.0
+    """How long a machine's certificate is good for; it is renewed after two thirds of that."""
+    renew_days: Annotated[float, Field(ge=0, le=3650)] = 30.0
+    """For how long after its end it may still be renewed, by a machine that was away."""
+
+    @field_validator("urls")
+    @classmethod
+    def _reachable(cls, urls: tuple[str, ...]) -> tuple[str, ...]:
+        for url in urls:
+            read_url(url)
+        return urls
+
+
 class Settings(Group):
     """One orchestrator."""
 
@@ -274,6 +299,8 @@ class Settings(Group):
     not start so."""
     tls: Tls = Tls()
     """HTTPS without a proxy in front."""
+    nodes: Nodes = Nodes()
+    """Machines that join by themselves."""
     logs: Logs = Logs()
     """What is written down."""
     timing: Timing = Timing()

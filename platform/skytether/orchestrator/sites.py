@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 from typing_extensions import override
 
@@ -130,6 +131,8 @@ class Site:
         """Whose machine it is, for whoever leads; empty: of no group."""
         self.emptied = ""
         """Why what runs here is moved, as a sentence; empty: it stays."""
+        self.evacuating = False
+        """It takes no more instances, and those that are there are moved elsewhere."""
         self.called = False
         """Somebody started or ended an instance here since the last pass began."""
         self.passed_at = -math.inf
@@ -179,7 +182,7 @@ class Site:
             name=self.name,
             tier=self.asked.tier,
             cannot_run=self.runtime.refuses(spec),
-            draining=self.draining,
+            draining=self.draining or self.evacuating,
             unstarted=unstarted,
             unfit=unfit,
             unreachable=self.unreachable or None,
@@ -208,6 +211,8 @@ class Sites:
         self._timing = timing
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
+        self.on_deleted: Callable[[str], object] = lambda _: None
+        """Called with the name of a site when nothing of it is left here."""
 
     def start(self, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
         """Open every site of the store, and give them a moment to answer.
@@ -246,6 +251,7 @@ class Sites:
         """Open and close what another orchestrator over the same database added and deleted."""
         with self._lock:
             wanted, draining = {site.name: site for site in self._store.sites()}, self._store.draining_sites()
+            evacuating = self._store.evacuating_sites()
             gone = [site for name, site in self._sites.items() if wanted.get(name) != site.asked]
             for site in gone:
                 del self._sites[site.name]
@@ -253,6 +259,7 @@ class Sites:
                 if one.name not in self._sites:
                     self._open(one, self._make_usable(one))
                 self._sites[one.name].draining = one.name in draining
+                self._sites[one.name].evacuating = one.name in evacuating
         for site in gone:
             self._close(site)
 
@@ -263,12 +270,13 @@ class Sites:
         for site in all_:
             site.runtime.close()
 
-    def add(self, asked: SiteCreate, *, by_owner: bool = True) -> Site:
+    def add(self, asked: SiteCreate, *, by_owner: bool = True, put: Callable[[SiteCreate], bool] | None = None) -> Site:
         """A new site.
 
         Args:
             asked: As it was described.
             by_owner: By the operator of the state folder, who may make one that runs as the orchestrator's user.
+            put: Stores it, and says whether it could, in the place of what does that otherwise.
 
         Raises:
             ForbiddenError: Somebody else wants one that does.
@@ -276,26 +284,11 @@ class Sites:
             ConflictError: There is one of that name.
         """
         with self._lock:
-            if asked.name in self._sites:
-                raise ConflictError(
-                    f"there is a site '{asked.name}' already: choose another name, or delete that first"
-                )
-            kind = self._find_runtime(asked.runtime)
-            if kind.runs_as_us and not by_owner:
-                raise ForbiddenError(
-                    f"instances at a site of the runtime '{asked.runtime}' are processes of the orchestrator's own "
-                    "user: only the token in its state folder (operator.token) may make one"
-                )
-            given = sorted(kind.owner_options & asked.options.keys())
-            if given and not by_owner:
-                raise ForbiddenError(
-                    f"the options {', '.join(given)} may open up the whole machine of the site, or tell its engine "
-                    "passwords: only the token in the orchestrator's state folder (operator.token) may give them"
-                )
+            kind = self._check(asked, by_owner=by_owner)
             asked = asked.model_copy(update={"options": kind.completed(asked.options)})
             self._must_be_unique(asked, kind.unique)
             runtime = self._make_runtime(asked)
-            if not self._store.add_site(asked):  # by way of another orchestrator
+            if not (put or self._store.add_site)(asked):  # by way of another orchestrator
                 runtime.close()
                 raise ConflictError(
                     f"there is a site '{asked.name}' already: choose another name, or delete that first"
@@ -303,6 +296,43 @@ class Sites:
             site = self._open(asked, runtime)
         site.loop.wait_first(_FIRST_LOOK)
         return site
+
+    def check(self, asked: SiteCreate, *, by_owner: bool) -> None:
+        """Whether such a site could be added now; raises as ``add``."""
+        with self._lock:
+            kind = self._check(asked, by_owner=by_owner)
+        parse(kind.Options, asked.options, prefix=("options",))
+
+    def _check(self, asked: SiteCreate, *, by_owner: bool) -> type[Runtime]:
+        if asked.name in self._sites:
+            raise ConflictError(f"there is a site '{asked.name}' already: choose another name, or delete that first")
+        kind = self._find_runtime(asked.runtime)
+        if kind.runs_as_us and not by_owner:
+            raise ForbiddenError(
+                f"instances at a site of the runtime '{asked.runtime}' are processes of the orchestrator's own "
+                "user: only the token in its state folder (operator.token) may make one"
+            )
+        given = sorted(kind.owner_options & asked.options.keys())
+        if given and not by_owner:
+            raise ForbiddenError(
+                f"the options {', '.join(given)} may open up the whole machine of the site, or tell its engine "
+                "passwords: only the token in the orchestrator's state folder (operator.token) may give them"
+            )
+        return kind
+
+    def change_options(self, name: str, changes: Mapping[str, Any]) -> None:
+        """Have some options of a site be others, from now on; what runs there runs on.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            InvalidError: They are wrong.
+        """
+        with self._lock:
+            asked = self.get(name).asked
+            changed = asked.model_copy(update={"options": {**asked.options, **changes}})
+            parse(self._find_runtime(asked.runtime).Options, changed.options, prefix=("options",))
+            self._store.change_site(changed)
+        self.refresh()
 
     def _must_be_unique(self, asked: SiteCreate, key: str) -> None:
         value = asked.options.get(key)
@@ -313,8 +343,12 @@ class Sites:
                     "give another, or leave it out"
                 )
 
-    def delete(self, name: str) -> None:
+    def delete(self, name: str, *, force: bool = False) -> None:
         """Forget a site, with what ended instances left there.
+
+        Args:
+            name: Its name.
+            force: With instances there, too: they count as failed, and their robots ask again.
 
         Raises:
             NotFoundError: There is none of that name.
@@ -323,7 +357,7 @@ class Sites:
         with self._lock:
             site = self.get(name)
             held = [record.id for record in self._store.live_at(name)]
-            if held:
+            if held and not force:
                 raise ConflictError(
                     f"site '{name}' has {len(held)} instances: delete them first ({', '.join(held[:3])}), or drain it: "
                     "it takes no more, and is deleted with its last one"
@@ -341,6 +375,7 @@ class Sites:
         except RuntimeFailure as error:
             log.warning("site %s was deleted, but what it left there stays: %s", name, error)
         site.runtime.close()
+        self.on_deleted(name)
 
     def drain(self, name: str) -> bool:
         """Let a site take no more instances, and delete it as soon as none is there; whether it is gone by now.
@@ -356,6 +391,21 @@ class Sites:
             return False
         self.delete(name)
         return True
+
+    def evacuate(self, name: str, evacuating: bool = True) -> None:
+        """Let a site take no more instances, and have those that are there moved elsewhere; or not any more.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            ConflictError: It is to be deleted with its last instance, which cannot be taken back.
+        """
+        with self._lock:
+            site = self.get(name)
+            if site.draining and not evacuating:
+                raise ConflictError(f"site '{name}' is to be deleted with its last instance: that cannot be taken back")
+            self._store.evacuate_site(name, evacuating)
+            site.evacuating = evacuating
+        site.wake()
 
     def end_drained(self, held: Collection[str | None], forget: Callable[[str], object]) -> None:
         """Delete what was drained; in threads of their own, for a site that does not answer takes its time.

@@ -19,6 +19,7 @@ UNITS = [
     PACKAGE / "systemd" / "skytether-robot.service",
     ROOT / "docs" / "examples" / "robot" / "skytether-gate.service",
 ]
+NODE = ROOT / "docs" / "examples" / "node" / "skytether-node.service"
 ORCHESTRATOR = ROOT / "docs" / "examples" / "orchestrator" / "skytether-orchestrator.service"
 
 
@@ -87,7 +88,7 @@ def test_the_package_s_files_are_what_catkin_and_roslaunch_read():
 
 
 @pytest.mark.usefixtures("systemd")
-@pytest.mark.parametrize("source", [*UNITS, ORCHESTRATOR], ids=lambda path: path.name)
+@pytest.mark.parametrize("source", [*UNITS, ORCHESTRATOR, NODE], ids=lambda path: path.name)
 def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
     unit = tmp_path / source.name
     text = source.read_text()
@@ -99,7 +100,9 @@ def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
 
 @pytest.mark.usefixtures("systemd")
 @pytest.mark.parametrize(
-    ("source", "tenths"), [(UNITS[0], 26), (UNITS[1], 26), (ORCHESTRATOR, 19)], ids=["robot", "gate", "orchestrator"]
+    ("source", "tenths"),
+    [(UNITS[0], 26), (UNITS[1], 26), (ORCHESTRATOR, 19), (NODE, 18)],
+    ids=["robot", "gate", "orchestrator", "node"],
 )
 def test_the_units_are_scored(source, tenths):
     """Of 100, the worst; a unit that says nothing has 96."""

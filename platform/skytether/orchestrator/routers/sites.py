@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 
 from fastapi import APIRouter, Response
 
-from skytether.api.rest import Site, SiteCreate, Unfit
+from skytether.api.rest import NodeState, Site, SiteCreate, Unfit
 
 from ..access import Principal
 from ..core import Orchestrator
 from ..instances import utc
+from ..nodes.rows import Node
 from ..sites import Site as LiveSite
 from .deps import PREFIX, Caller, Core, SitesOperator, made, says
 
 router = APIRouter(prefix=f"{PREFIX}/sites", tags=["sites"])
 
 
-def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
+def _show(core: Orchestrator, site: LiveSite, caller: Principal, nodes: Mapping[str, Node]) -> Site:
     asked, total = site.asked, site.capacity
     unreachable, blocked = site.unreachable, site.runtime.blocked()
     return Site(
@@ -39,6 +41,22 @@ def _show(core: Orchestrator, site: LiveSite, caller: Principal) -> Site:
         instances=len(core.store.live_at(asked.name)),
         unfit=_unfit(site) if caller.robot is None else (),
         draining=site.draining,
+        evacuating=site.evacuating,
+        node=_node(nodes[asked.name]) if asked.name in nodes and caller.robot is None else None,
+    )
+
+
+def _nodes(core: Orchestrator) -> Mapping[str, Node]:
+    return core.nodes.all() if core.nodes is not None else {}
+
+
+def _node(node: Node) -> NodeState:
+    return NodeState(
+        joined_at=utc(node.joined_at),
+        seen_at=utc(node.seen_at),
+        seen_as=node.seen_as,
+        certificate_until=utc(node.ends_at),
+        **node.machine.model_dump(exclude={"id"}),
     )
 
 
@@ -58,7 +76,8 @@ def _unfit(site: LiveSite) -> tuple[Unfit, ...]:
 @router.get("", responses=says(401))
 def list_sites(core: Core, caller: Caller) -> list[Site]:
     """All sites; a robot does not see their options."""
-    return [_show(core, site, caller) for site in core.sites.all()]
+    nodes = _nodes(core)
+    return [_show(core, site, caller, nodes) for site in core.sites.all()]
 
 
 @router.post("", status_code=201, responses=says(401, 403, 409, 422))
@@ -66,25 +85,40 @@ def create_site(core: Core, caller: SitesOperator, asked: SiteCreate, response: 
     """Add a site."""
     site = core.sites.add(asked, by_owner=caller.owns_state)
     made(response, "sites", site.name)
-    return _show(core, site, caller)
+    return _show(core, site, caller, {})
 
 
 @router.get("/{site}", responses=says(401, 404))
 def get_site(core: Core, caller: Caller, site: str) -> Site:
     """One site."""
-    return _show(core, core.sites.get(site), caller)
+    return _show(core, core.sites.get(site), caller, _nodes(core))
+
+
+@router.post("/{site}/drain", responses=says(401, 403, 404))
+def drain_site(core: Core, caller: SitesOperator, site: str) -> Site:
+    """Have a site take no more instances, and move those that are there elsewhere, before it is updated, say."""
+    core.sites.evacuate(site)
+    return _show(core, core.sites.get(site), caller, _nodes(core))
+
+
+@router.post("/{site}/resume", responses=says(401, 403, 404, 409))
+def resume_site(core: Core, caller: SitesOperator, site: str) -> Site:
+    """Have a site that was drained take instances again."""
+    core.sites.evacuate(site, False)
+    return _show(core, core.sites.get(site), caller, _nodes(core))
 
 
 @router.delete(
     "/{site}", status_code=204, responses={202: {"description": "It is being drained"}, **says(401, 403, 404, 409)}
 )
-def delete_site(core: Core, _: SitesOperator, site: str, drain: bool = False) -> Response:
-    """Forget a site that has no instances.
+def delete_site(core: Core, _: SitesOperator, site: str, drain: bool = False, force: bool = False) -> Response:
+    """Forget a site that has no instances. No certificate of a machine that joined as it is good any more.
 
     With ``drain`` one that has some takes no more (202), and is forgotten when the last of them has ended or was moved.
+    With ``force`` it is forgotten at once, whatever is there: for a machine that is gone for good.
     """
-    if not drain:
-        core.sites.delete(site)
+    if force or not drain:
+        core.sites.delete(site, force=force)
     elif not core.sites.drain(site):
         return Response(status_code=202)
     core.metrics.forget_site(site)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import socket
 import time
 from collections.abc import Callable
 from functools import partial
@@ -64,7 +65,20 @@ def hurried(get: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
 def _connection(make: Callable[[], Any]) -> Any:
     made = make()
     made.response_class = WholeAnswer
+    if hasattr(made, "unix_socket"):
+        made.connect = partial(_connect, made)
     return made
+
+
+def _connect(made: Any) -> None:
+    """As Docker's SDK, which leaves a socket open that it could not connect."""
+    made.sock = socket.socket(socket.AF_UNIX)
+    try:
+        made.sock.settimeout(made.timeout)
+        made.sock.connect(made.unix_socket)
+    except OSError:
+        made.close()
+        raise
 
 
 def original(answer: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import shlex
 import shutil
 import socket
@@ -38,6 +39,8 @@ _PROBE_S = 5.0
 """An engine that is stopped lets its queue of connections fill up; then even this takes time."""
 _MOST_WORDS = 2000
 """Characters of what an engine says is wrong: they are kept, logged and told."""
+ENGINE_SOCKET, ENGINE_AWAY = "engine.sock", "engine.away"
+"""In the folder of a site that joined: the socket of its engine while the node is linked, and why it is not."""
 _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 
@@ -49,10 +52,15 @@ class EngineGoneError(SiteSilentError):
 class Engine:
     """One engine; connects at the first call, and anew after :meth:`drop`."""
 
-    def __init__(self, options: DockerOptions) -> None:
+    def __init__(self, options: DockerOptions, folder: Path | None = None) -> None:
+        """``folder``: the site's own, where the socket of a joined node is."""
         self._options = options
         self._lock = threading.Lock()
-        self._tunnel = Tunnel(options) if options.address.scheme == "ssh" else None
+        self._tunnel: Tunnel | NodeSocket | None = None
+        if options.address.scheme == "ssh":
+            self._tunnel = Tunnel(options)
+        elif options.address.scheme == "node":
+            self._tunnel = NodeSocket(options, folder or Path())
         self._clients: dict[float, APIClient] = {}
 
     def api(self, timeout_s: float | None = None) -> APIClient:
@@ -149,6 +157,37 @@ def root_cause(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return "timed out"
     return str(getattr(error, "strerror", None) or error or type(error).__name__)[:_MOST_WORDS].strip()
+
+
+class NodeSocket:
+    """The way to the engine of a node that joined: a socket in the site's folder, there while the node is linked."""
+
+    def __init__(self, options: DockerOptions, folder: Path) -> None:
+        self._name = options.address.hostname
+        self._folder = folder
+        self._file: int | None = None
+
+    def open(self) -> Path:
+        """Where it is: by the folder's open file, for a socket's path has 107 bytes at most, and a state folder's more.
+
+        Raises:
+            OSError: The node is not linked, or its engine is away; with what is known.
+        """
+        if not (self._folder / ENGINE_SOCKET).exists():
+            try:
+                why = (self._folder / ENGINE_AWAY).read_text()
+            except OSError:
+                why = "it has not called since this orchestrator was started"
+            raise OSError(f"node '{self._name}' is not linked ({why}); see `systemctl status skytether-node` there")
+        if self._file is None:
+            self._file = os.open(self._folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+        return Path(f"/proc/self/fd/{self._file}/{ENGINE_SOCKET}")
+
+    def close(self) -> None:
+        """Forget the path."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
 
 
 class Tunnel:

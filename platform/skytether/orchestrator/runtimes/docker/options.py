@@ -59,8 +59,8 @@ class DockerOptions(Strict):
     """Options of a Docker site."""
 
     engine: str = f"unix://{LOCAL_SOCKET}"
-    """``unix:///PATH``, ``ssh://[USER@]HOST[:PORT][/PATH]`` (PATH: its socket, /var/run/docker.sock unless given), or
-    ``tcp://HOST:PORT`` with ``tls``."""
+    """``unix:///PATH``, ``ssh://[USER@]HOST[:PORT][/PATH]`` (PATH: its socket, /var/run/docker.sock unless given),
+    ``tcp://HOST:PORT`` with ``tls``, or ``node://SITE`` of a machine that joined, which calls us."""
     tls: TlsOptions | None = None
     ssh: SshOptions = SshOptions()
     bind_host: BindHost | None = None
@@ -158,8 +158,10 @@ class DockerOptions(Strict):
             complete = complete and (address.scheme != "tcp" or port is not None)
         except ValueError as error:
             raise ValueError(f"engine: {error}") from None
-        if address.scheme not in ("unix", "ssh", "tcp") or not complete:
+        if address.scheme not in ("unix", "ssh", "tcp", "node") or not complete:
             raise ValueError("engine must be unix:///PATH, ssh://[USER@]HOST[:PORT] or tcp://HOST:PORT")
+        if address.scheme == "node" and self.advertise_host is None:
+            raise ValueError("advertise_host is needed with node://: the machine says it when it joins")
         for what in (address.username, address.hostname):
             # The SSH client may put them into a shell's command of ~/.ssh/config (ProxyCommand, Match exec).
             if what and (what.startswith("-") or not set(what) <= _PLAIN):

@@ -86,7 +86,7 @@ class DockerRuntime(Runtime):
         self._site = site
         self._options = options
         self._owner = options.owner or kept_owner(folder)
-        self._engine = Engine(options)
+        self._engine = Engine(options, folder)
         self._fence = Fence(self._engine, self._owner)
         self._scales = Scales(self._engine, self._owner, options.data_mb)
         self._lock = threading.Lock()

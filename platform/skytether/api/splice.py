@@ -1,0 +1,43 @@
+"""Two connections as one: what one says the other hears. For ways to the engines of joined nodes, at both ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+from .node import ANSWER_S
+
+PIECE = 1 << 16
+_TURNS = 5
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+async def splice(one: Stream, other: Stream) -> None:
+    """Pass bytes both ways until one side has ended, and what it said before has arrived.
+
+    Neither end of the other side is kept then: who asks an engine over HTTP ends when it has its answer.
+    """
+    ways = [asyncio.create_task(_pass(one[0], other[1])), asyncio.create_task(_pass(other[0], one[1]))]
+    try:
+        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        for _, writer in (one, other):
+            with contextlib.suppress(OSError):
+                async with asyncio.timeout(ANSWER_S):
+                    writer.close()
+                    await writer.wait_closed()
+    finally:
+        for way in ways:
+            way.cancel()
+        await asyncio.gather(*ways, return_exceptions=True)
+
+
+async def closed() -> None:
+    """Until connections that were aborted are closed, before a loop ends: each takes a turn for itself and for TLS."""
+    for _ in range(_TURNS):
+        await asyncio.sleep(0)
+
+
+async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while data := await reader.read(PIECE):
+        writer.write(data)
+        await writer.drain()

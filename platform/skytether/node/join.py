@@ -1,0 +1,337 @@
+"""Joining and leaving: all of it or nothing, on either side."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from skytether.api.node import Invited, Issued, Join, Leave, Look, Standing, Stands
+
+from . import checks, unit
+from .calls import RefusedError, Seen, UnreachableError, address_of, call, first_call, trusting
+from .checks import Finding
+from .machine import EngineInfo, address_towards, describe
+from .run import NodeProgram
+from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
+
+_TOKEN = re.compile(r"sky-[0-9a-f]{64}\.[0-9a-f]{64}")
+_POLL_S = 0.1
+_READY_S = 60.0
+"""By when a site that joined has answered."""
+
+
+class ChecksError(NodeError):
+    """This machine cannot join as it is; ``findings`` say why."""
+
+    def __init__(self, findings: list[Finding]) -> None:
+        self.findings = findings
+        super().__init__("; ".join(finding.says for finding in findings))
+
+
+@dataclass(frozen=True)
+class JoinOptions:
+    """How a machine is to join."""
+
+    urls: tuple[str, ...]
+    token: str
+    engine: str = "unix:///var/run/docker.sock"
+    advertise: str | None = None
+    """That robots are told; None: the address by which this machine reaches the orchestrator, whatever it is then."""
+    ports: tuple[int, int] | None = None
+    echo: int | None = 8600
+    folder: Path = Path("/etc/skytether/node")
+    unit: bool = True
+    program: str = ""
+    """What the unit runs."""
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What came of it."""
+
+    name: str
+    address: str
+    stands: Stands
+    took_s: dict[str, float]
+    """By step [s]."""
+
+
+class _Steps:
+    def __init__(self) -> None:
+        self.took_s: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        began = time.monotonic()
+        yield
+        self.took_s[name] = time.monotonic() - began
+
+
+def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: None) -> Joined:
+    """Make this machine a site.
+
+    Nothing is changed before all checks are good, and what was changed is taken back if anything fails after that.
+
+    Args:
+        options: How.
+        tell: Called with what each check found.
+
+    Raises:
+        ChecksError: This machine cannot join as it is.
+        NodeError: It did not work; the text says what to do.
+    """
+    store, steps = NodeStore(options.folder), _Steps()
+    token, pin = _parts(options.token)
+    if store.exists():
+        raise NodeError(
+            f"this machine is the site '{store.config().name}' already: run `skytether site leave` first, or give "
+            "another --folder"
+        )
+    path = engine_path(options.engine)
+    with steps.step("checks"):
+        url, seen, engine = _check(options, pin, path, tell)
+    trust = trusting(seen.authority)
+    with steps.step("token"):
+        invited = call(url, trust, Look(token=token), Invited)
+    address = options.advertise or address_towards(url) or ""
+    with steps.step("certificate"):
+        key = new_key()
+        asked = Join(
+            token=token,
+            request=request_for(key),
+            address=address,
+            follow=options.advertise is None,
+            ports=options.ports,
+            machine=describe(engine, options.echo),
+        )
+        issued = _ask_twice(url, trust, asked)
+    urls = tuple(dict.fromkeys((*options.urls, *issued.urls)))
+    config = NodeConfig(
+        name=invited.name,
+        urls=urls,
+        engine=path,
+        address=address,
+        follow=options.advertise is None,
+        echo=options.echo,
+        unit=options.unit,
+    )
+    try:
+        with steps.step("unit" if options.unit else "keys"):
+            store.join(config, seen.authority, key, issued.certificate)
+            if options.unit:
+                unit.install(unit.unit(options.program or unit.own_program(), options.folder, path))
+        with steps.step("site"), contextlib.nullcontext() if options.unit else _linked(store):
+            stands = _until_there(store, url)
+    except BaseException as error:
+        _take_back(store, url)
+        if isinstance(error, OSError):
+            raise NodeError(
+                f"cannot write to {options.folder}: {error.strerror}; nothing is left of the join"
+            ) from error
+        raise
+    return Joined(invited.name, address, stands, steps.took_s)
+
+
+def _parts(text: str) -> tuple[str, str]:
+    token = text.strip()
+    if not _TOKEN.fullmatch(token):
+        raise NodeError(
+            "this is no join token: it is one word, sky-... with a dot in it, as `skytether site invite NAME` prints it"
+        )
+    return token, token.partition(".")[2]
+
+
+def engine_path(engine: str) -> str:
+    """Path of an engine's socket.
+
+    Raises:
+        NodeError: It is no address of a local engine.
+    """
+    path = engine.removeprefix("unix://")
+    if not path.startswith("/"):
+        raise NodeError(f"--engine {engine}: write unix:///PATH; the engine of another machine joins there")
+    return path
+
+
+def _check(
+    options: JoinOptions, pin: str, path: str, tell: Callable[[Finding], object]
+) -> tuple[str, Seen, EngineInfo | None]:
+    found: list[Finding] = []
+
+    def note(finding: Finding) -> None:
+        found.append(finding)
+        tell(finding)
+
+    note(checks.look_at_rights(options.folder, unit=options.unit))
+    finding, engine = checks.look_at_engine(path)
+    note(finding)
+    if engine is not None:
+        note(checks.judge_memory(engine.memory_mb))
+        note(checks.look_at_disk(engine))
+    ports = range(options.ports[0], options.ports[1] + 1) if options.ports else ()
+    note(checks.look_at_ports(ports, options.echo))
+    answered, seen = _reach(options.urls, pin, note)
+    if seen is not None:
+        note(checks.judge_clock(seen.ahead_s))
+        named = options.advertise is not None
+        address = options.advertise or address_towards(answered)
+        if address is None:
+            note(
+                Finding("address", "this machine has no address towards the orchestrator: give --advertise", good=False)
+            )
+        else:
+            note(checks.judge_address(address, named=named, orchestrator=address_of(answered)[0]))
+    bad = [one for one in found if not one.good]
+    if bad or seen is None:
+        raise ChecksError(bad)
+    return answered, seen, engine
+
+
+def _reach(urls: tuple[str, ...], pin: str, note: Callable[[Finding], object]) -> tuple[str, Seen | None]:
+    """The first orchestrator that answers, and is the one of the token."""
+    failure = ""
+    for url in urls:
+        try:
+            seen = first_call(url, pin)
+        except UnreachableError as error:
+            failure = failure or str(error)
+        except NodeError as error:
+            failure = str(error)
+            break
+        else:
+            note(Finding("orchestrator", f"{url} is the one that made the token"))
+            return url, seen
+    note(Finding("orchestrator", failure, good=False))
+    return urls[0], None
+
+
+def _ask_twice(url: str, trust: ssl.SSLContext, asked: Join) -> Issued:
+    """An answer may be lost on its way: with the same key the same token is good again."""
+    try:
+        return call(url, trust, asked, Issued)
+    except UnreachableError:
+        return call(url, trust, asked, Issued)
+
+
+def _until_there(store: NodeStore, url: str) -> Stands:
+    """Wait until the site answers at the orchestrator."""
+    deadline = time.monotonic() + _READY_S
+    trust, last = trusting(store.authority(), store.identity), ""
+    while time.monotonic() < deadline:
+        try:
+            stands = call(url, trust, Standing(), Stands)
+        except UnreachableError as error:
+            last = str(error)
+        else:
+            if stands.state in ("ready", "blocked"):
+                return stands
+            last = stands.reason or "the site is gone"
+            if stands.state == "gone":
+                break
+        time.sleep(_POLL_S)
+    raise NodeError(
+        f"the site did not answer within {_READY_S:.0f} s ({last}); nothing is left of the join, the token is used up: "
+        "`journalctl -u skytether-node` may say more"
+    )
+
+
+@contextmanager
+def _linked(store: NodeStore) -> Iterator[None]:
+    """Run the node here for a moment."""
+    program, loop = NodeProgram(store), asyncio.new_event_loop()
+    task = loop.create_task(program.run())
+
+    def run() -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            loop.run_until_complete(task)
+        loop.run_until_complete(loop.shutdown_default_executor())
+        loop.close()
+
+    thread = threading.Thread(target=run, name="node", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+
+
+def _take_back(store: NodeStore, url: str) -> None:
+    with contextlib.suppress(NodeError):
+        call(url, trusting(store.authority(), store.identity), Leave(force=True), Stands)
+    unit.remove()
+    store.clear()
+
+
+def leave(
+    store: NodeStore, *, force: bool, timeout_s: float, tell: Callable[[str], object] = lambda _: None
+) -> str | None:
+    """Let this machine be no site any more; what runs here is moved first.
+
+    Args:
+        store: Of the node.
+        force: At once, whatever runs here, and also where no orchestrator answers.
+        timeout_s: For what runs here to be moved.
+        tell: Called with how far it is.
+
+    Returns:
+        What is left to be done elsewhere; None: nothing.
+
+    Raises:
+        NodeError: It did not work; the machine is a site still.
+    """
+    left: str | None = None
+    try:
+        config = store.config()
+        _leave(config, store, force=force, timeout_s=timeout_s, tell=tell)
+    except NodeError as error:
+        if not force:
+            raise
+        left = str(error)
+    unit.remove()
+    store.clear()
+    return left
+
+
+def _leave(
+    config: NodeConfig, store: NodeStore, *, force: bool, timeout_s: float, tell: Callable[[str], object]
+) -> None:
+    trust = trusting(store.authority(), store.identity)
+    deadline, told = time.monotonic() + timeout_s, ""
+    while True:
+        stands = _ask_any(config, trust, Leave(force=force))
+        if stands.state == "gone":
+            return
+        text = f"{stands.instances} instances are here still" + (f": {stands.reason}" if stands.reason else "")
+        if text != told:
+            tell(text)
+            told = text
+        if time.monotonic() >= deadline:
+            raise NodeError(
+                f"{text}; nothing else takes them, perhaps: `skytether instance list` says why. They stay, and so does "
+                "the site; with --force it ends with them"
+            )
+        time.sleep(1.0)
+
+
+def _ask_any(config: NodeConfig, trust: ssl.SSLContext, asked: Leave) -> Stands:
+    failure: NodeError | None = None
+    for url in config.urls:
+        try:
+            return call(url, trust, asked, Stands)
+        except RefusedError:
+            raise
+        except UnreachableError as error:
+            failure = error
+    raise NodeError(
+        f"{failure}; with --force this machine leaves without a word: then remove the site there, "
+        f"`skytether site remove {config.name} --force`"
+    )

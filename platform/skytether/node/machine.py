@@ -1,0 +1,154 @@
+"""What a machine is, and its engine: looked at, never changed."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import json
+import os
+import platform
+import shutil
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+from typing_extensions import override
+
+from skytether.api.node import Machine
+
+from .calls import address_of
+
+_ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
+_ENGINE_S = 10.0
+_MOST = 1 << 20
+"""Bytes of an engine's answer."""
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """What an engine says of itself."""
+
+    version: str
+    api_version: str
+    architecture: str
+    cpu: float
+    memory_mb: int
+    folder: str
+    """Where it keeps what it has."""
+
+
+class _Connection(http.client.HTTPConnection):
+    def __init__(self, path: str) -> None:
+        super().__init__("engine", timeout=_ENGINE_S)
+        self._path = path
+
+    @override
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX)
+        self.sock.settimeout(_ENGINE_S)
+        self.sock.connect(self._path)
+
+
+def ask_engine(path: str) -> EngineInfo:
+    """Ask an engine what it is.
+
+    Raises:
+        OSError: It does not answer.
+        ValueError: It answers something else.
+    """
+    version, info = _get(path, "/version"), _get(path, "/info")
+    try:
+        return EngineInfo(
+            version=str(version["Version"])[:100],
+            api_version=str(version["ApiVersion"]),
+            architecture=_ARCHITECTURES.get(str(info["Architecture"]), str(info["Architecture"])),
+            cpu=float(info["NCPU"]),
+            memory_mb=int(info["MemTotal"]) >> 20,
+            folder=str(info.get("DockerRootDir") or ""),
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"what listens at {path} is no Docker engine: its answer has no {error}") from None
+
+
+def _get(path: str, what: str) -> Any:
+    connection = _Connection(path)
+    try:
+        connection.request("GET", what)
+        answer = connection.getresponse()
+        body = answer.read(_MOST)
+        if answer.status != http.HTTPStatus.OK:
+            raise ValueError(f"what listens at {path} is no Docker engine: it answers {answer.status} to {what}")
+        return json.loads(body)
+    except http.client.HTTPException as error:
+        raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
+    finally:
+        connection.close()
+
+
+def free_mb(folder: str) -> int | None:
+    """Room on the disk of a folder, or of the nearest one above it that is there; None: it cannot be seen from here."""
+    place = Path(folder or "/")
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    try:
+        return shutil.disk_usage(place).free >> 20
+    except OSError:
+        return None
+
+
+def describe(engine: EngineInfo | None, echo: int | None) -> Machine:
+    """This machine, as its orchestrators are told."""
+    return Machine(
+        id=machine_id(),
+        hostname=socket.gethostname()[:253],
+        system=_system()[:120],
+        architecture=engine.architecture if engine else _ARCHITECTURES.get(platform.machine(), platform.machine())[:32],
+        cpu=engine.cpu if engine else float(os.cpu_count() or 1),
+        memory_mb=engine.memory_mb if engine else psutil.virtual_memory().total >> 20,
+        disk_mb=free_mb(engine.folder if engine else "/") or 0,
+        engine=engine.version if engine else "",
+        echo=echo,
+    )
+
+
+def architecture() -> str:
+    """Of this machine, as container images name it."""
+    return _ARCHITECTURES.get(platform.machine(), platform.machine())
+
+
+def machine_id() -> str:
+    """The same as long as this is the same machine; tells nothing of it."""
+    for path in ("/etc/machine-id", "/var/lib/dbus/machine-id"):
+        try:
+            text = Path(path).read_text().strip()
+        except OSError:
+            continue
+        if text:
+            return hashlib.sha256(f"skytether node {text}".encode()).hexdigest()[:32]
+    return ""
+
+
+def address_towards(url: str) -> str | None:
+    """This machine's address by which it reaches an orchestrator; None: there is no way there. Nothing is sent."""
+    host, port = address_of(url)
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.connect(address)
+            return str(probe.getsockname()[0]).partition("%")[0]
+    except OSError:
+        return None
+
+
+def own_addresses() -> set[str]:
+    """All of this machine's."""
+    return {one.address.partition("%")[0] for rows in psutil.net_if_addrs().values() for one in rows}
+
+
+def _system() -> str:
+    try:
+        return platform.freedesktop_os_release().get("PRETTY_NAME", "") or platform.platform()
+    except OSError:
+        return platform.platform()

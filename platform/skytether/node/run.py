@@ -1,0 +1,294 @@
+"""The node's program: keeps a link to each orchestrator, and ways from there to this machine's engine; renews.
+
+It connects to the engine's socket and to its orchestrators, and to nobody else, whoever asks for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import random
+import ssl
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from skytether.api.manifest import Strict
+from skytether.api.node import (
+    ANSWER_S,
+    GO,
+    MOST_LINE,
+    MOST_WAYS,
+    SERVER_NAME,
+    SILENT_S,
+    Issued,
+    Link,
+    Linked,
+    Machine,
+    Renew,
+    Said,
+    Told,
+    Way,
+    line_of,
+)
+from skytether.api.splice import PIECE, Stream, closed, splice
+
+from . import calls
+from .calls import RefusedError, address_of, explained, read_answer, trusting
+from .machine import address_towards, ask_engine, describe
+from .store import NodeError, NodeStore, new_key, renew_due, request_for
+
+log = logging.getLogger(__name__)
+
+_LOOK_S, _LOOK_AWAY_S = 5.0, 1.0
+"""Between two looks at the engine, and whether the certificate is to be renewed; and while the engine is away."""
+_AGAIN_S, _AGAIN_MOST_S = 1.0, 30.0
+"""Before another attempt to link; the wait doubles, and is by chance up to a third shorter, so that a thousand nodes of
+an orchestrator that was restarted do not come at once."""
+_REFUSED_S = 300.0
+"""Before another attempt where the last one was refused for good."""
+_RENEW_AGAIN_S = 60.0
+
+
+@dataclass
+class _Clock:
+    """The orchestrator's time, as it was told, by a clock that nobody sets."""
+
+    told: float
+    at: float
+
+    def __call__(self) -> float:
+        return self.told + time.monotonic() - self.at
+
+
+class NodeProgram:
+    """Runs until it is cancelled."""
+
+    def __init__(self, store: NodeStore, on_linked: Callable[[str], object] = lambda _: None) -> None:
+        """``on_linked`` is called with the address of each orchestrator whenever a link stands.
+
+        Raises:
+            NodeError: This machine has not joined.
+        """
+        self._store = store
+        self._config = store.config()
+        self._trust: ssl.SSLContext = trusting(store.authority(), store.identity)
+        self._on_linked = on_linked
+        self._links: dict[str, asyncio.Task[None]] = {}
+        self._told: dict[str, str] = {}
+        self._renewed_at = -_RENEW_AGAIN_S
+        self._renewing = asyncio.Lock()
+        self._doubts: set[asyncio.Event] = set()
+        """Set where the engine did not answer somebody: whoever looks at it now and then looks at once."""
+
+    async def run(self) -> None:
+        """Keep all links; returns when it is cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                self._group = group
+                self._learn(self._config.urls)
+                await asyncio.Event().wait()
+        finally:
+            await closed()
+
+    def _learn(self, urls: tuple[str, ...]) -> None:
+        """Link with those that are new, and keep them."""
+        for url in urls:
+            if url not in self._links:
+                self._links[url] = self._group.create_task(self._keep(url))
+        if new := tuple(url for url in urls if url not in self._config.urls):
+            self._config = self._config.model_copy(update={"urls": (*self._config.urls, *new)})
+            with contextlib.suppress(OSError):  # it is told again
+                self._store.save(self._config)
+
+    async def _keep(self, url: str) -> None:
+        wait = _AGAIN_S
+        while True:
+            began = time.monotonic()
+            try:
+                await self._link(url)
+                self._say(url, f"the link to {url} ended")
+                pause = _AGAIN_S
+            except RefusedError as error:
+                self._say(url, f"{url}: {error}")
+                pause = _REFUSED_S if error.final else wait
+            except NodeError as error:
+                self._say(url, str(error))
+                pause = wait
+            wait = _AGAIN_S if time.monotonic() - began > _AGAIN_MOST_S else min(_AGAIN_MOST_S, 2 * wait)
+            await asyncio.sleep(pause * random.uniform(2 / 3, 1))
+
+    def _say(self, url: str, text: str) -> None:
+        """Once, however often it is so."""
+        if self._told.get(url) != text:
+            self._told[url] = text
+            log.warning("%s", text)
+
+    # One link
+
+    async def _open(self, url: str, request: Strict) -> Stream:
+        host, port = address_of(url)
+        writer: asyncio.StreamWriter | None = None
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                reader, writer = await asyncio.open_connection(host, port, limit=MOST_LINE)
+                await writer.start_tls(self._trust, server_hostname=SERVER_NAME)
+        except BaseException as error:
+            if writer is not None:
+                writer.transport.abort()
+            if isinstance(error, OSError):
+                raise explained(url, error) from error
+            raise
+        writer.write(line_of(request))
+        return reader, writer
+
+    async def _link(self, url: str) -> None:
+        machine = await asyncio.to_thread(self._describe)
+        address = await asyncio.to_thread(address_towards, url) if self._config.follow else None
+        reader, writer = await self._open(url, Link(machine=machine, address=address))
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                line = await reader.readuntil(b"\n")
+            try:
+                linked = read_answer(line, Linked, url)
+            except RefusedError as error:
+                if error.over:
+                    await self._renew(url)
+                    return
+                raise
+            self._told.pop(url, None)
+            log.info("linked with %s", url)
+            self._on_linked(url)
+            self._learn(linked.urls)
+            await self._both(self._hear(url, reader, writer), self._look(url, writer, linked))
+        except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValidationError) as error:
+            raise NodeError(f"the link to {url} ended: {str(error) or type(error).__name__}") from error
+        finally:
+            writer.transport.abort()
+
+    async def _both(self, *works: Coroutine[Any, Any, None]) -> None:
+        """Until one of them ends; raises what that raised."""
+        tasks = [asyncio.create_task(work) for work in works]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _describe(self) -> Machine:
+        try:
+            engine = ask_engine(self._config.engine)
+        except (OSError, ValueError):
+            engine = None
+        return describe(engine, self._config.echo)
+
+    async def _hear(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Do what the orchestrator says until it says nothing more."""
+        ways: set[asyncio.Task[None]] = set()
+        try:
+            while True:
+                async with asyncio.timeout(SILENT_S):
+                    line = await reader.readuntil(b"\n")
+                told = Told.model_validate_json(line)
+                if told.ping is not None:
+                    writer.write(line_of(Said(pong=told.ping)))
+                for _ in range(min(told.open or 0, MOST_WAYS - len(ways))):
+                    way = asyncio.create_task(self._way(url, writer))
+                    ways.add(way)
+                    way.add_done_callback(ways.discard)
+        except asyncio.IncompleteReadError:
+            return
+        finally:
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+
+    async def _look(self, url: str, writer: asyncio.StreamWriter, linked: Linked) -> None:
+        """Say when the engine goes and comes, and renew the certificate in time."""
+        clock, doubt = _Clock(linked.time, time.monotonic()), asyncio.Event()
+        self._doubts.add(doubt)
+        try:
+            await self._look_again(url, writer, clock, doubt)
+        finally:
+            self._doubts.discard(doubt)
+
+    async def _look_again(self, url: str, writer: asyncio.StreamWriter, clock: _Clock, doubt: asyncio.Event) -> None:
+        away: str | None = None
+        while True:
+            doubt.clear()
+            now = await self._engine_away()
+            if now != away:
+                away = now
+                writer.write(line_of(Said(engine=now[:300])))
+                if now:
+                    log.warning("the engine at %s cannot be reached: %s", self._config.engine, now)
+            certificate = self._store.certificate()
+            begins, ends = certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
+            if renew_due(begins, ends, clock()):
+                with contextlib.suppress(NodeError):  # it is good still, and tried again
+                    await self._renew(url)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_LOOK_AWAY_S if away else _LOOK_S):
+                    await doubt.wait()
+
+    async def _engine_away(self) -> str:
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                _, writer = await asyncio.open_unix_connection(self._config.engine)
+        except OSError as error:
+            return error.strerror or type(error).__name__
+        writer.close()
+        return ""
+
+    async def _renew(self, url: str) -> None:
+        """Be known by another key from the next connection on."""
+        async with self._renewing:
+            if time.monotonic() - self._renewed_at < _RENEW_AGAIN_S:
+                return
+            self._renewed_at = time.monotonic()
+            key = new_key()
+            request = Renew(request=request_for(key))
+            try:
+                issued = await asyncio.to_thread(calls.call, url, self._trust, request, Issued)
+                await asyncio.to_thread(self._store.renew, key, issued.certificate)
+                self._trust = trusting(self._store.authority(), self._store.identity)
+            except NodeError as error:
+                log.warning("the certificate could not be renewed: %s", error)
+                raise
+            except OSError as error:
+                raise NodeError(f"the renewed certificate cannot be kept in {self._store.folder}: {error}") from error
+            log.info("the certificate was renewed")
+
+    # Ways
+
+    async def _way(self, url: str, link: asyncio.StreamWriter) -> None:
+        """One connection for somebody who asks the engine from there."""
+        try:
+            reader, writer = await self._open(url, Way())
+        except NodeError:
+            link.write(line_of(Said(failed=1)))
+            return
+        try:
+            if await reader.readexactly(1) != GO:
+                return  # a refusal
+            try:
+                engine = await asyncio.open_unix_connection(self._config.engine, limit=PIECE)
+            except OSError:
+                for doubt in self._doubts:
+                    doubt.set()
+                raise
+            try:
+                await splice((reader, writer), engine)
+            finally:
+                engine[1].transport.abort()
+        except (OSError, asyncio.IncompleteReadError):
+            pass  # whoever asked sees the connection end
+        finally:
+            writer.transport.abort()
