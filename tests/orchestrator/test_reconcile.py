@@ -10,7 +10,7 @@ import pytest
 from reconcile_bench import add
 
 from skytether.api.rest import State
-from skytether.orchestrator.records import Record
+from skytether.orchestrator.records import Change, Record
 from skytether.orchestrator.runtimes.base import Phase, SiteSilentError
 from skytether.orchestrator.settings import Timing
 from skytether.orchestrator.store import Store
@@ -62,6 +62,29 @@ def test_of_a_crowd_those_that_are_ready_do_not_wait_until_the_last_ones_are_sta
     assert {(b.record(name).state, b.record(name).attempt) for name in names} == {(State.RUNNING, 1)}
     waited = [(record := b.record(name)).running_at - record.started_at for name in names]
     assert max(waited) <= 10, "they were looked at meanwhile"
+
+
+def test_a_crowd_is_placed_by_few_transactions_and_who_left_meanwhile_takes_no_room(
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench()
+    names = [f"i{number}" for number in range(40)]
+    for name in names:
+        add(b, new_record(name))
+    change_all, sizes = b.store.change_all, []
+
+    def place(asked: Any, now: float) -> Any:
+        sizes.append(len(asked))
+        if sizes == [16]:
+            change_all([Change(asked[3].record, {"state": State.STOPPED})], now)
+        return change_all(asked, now)
+
+    monkeypatch.setattr(b.store, "change_all", place)
+    b.reconciler.place_step()
+    assert sizes == [16, 16, 8]
+    states = [b.record(name).state for name in names]
+    assert (states.count(State.STARTING), states.count(State.STOPPED)) == (39, 1)
+    assert b.reconciler.promised()["lab"].instances == 39
 
 
 def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, new_record: NewRecord) -> None:

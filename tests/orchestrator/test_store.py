@@ -18,7 +18,7 @@ from skytether.orchestrator.database import RobotRow, TokenRow
 from skytether.orchestrator.db import AddressError, make_engine, migrate
 from skytether.orchestrator.models import metadata
 from skytether.orchestrator.moves import FOREVER
-from skytether.orchestrator.records import IllegalMoveError, Record
+from skytether.orchestrator.records import Change, IllegalMoveError, Record
 from skytether.orchestrator.security import TokenHash
 from skytether.orchestrator.store import KeyReusedError, Store
 
@@ -116,6 +116,24 @@ def test_a_change_needs_to_have_seen_the_last_one(store: Store, new_record: NewR
     assert second.updated_at == NOW + 1
     assert store.change(first, NOW + 2, state=State.STOPPED) is None
     assert store.get("i1") == second
+
+
+def test_of_several_changes_at_once_those_are_made_that_have_seen_the_last_one(
+    store: Store, new_record: NewRecord
+) -> None:
+    told: list[str] = []
+    store.on_change = told.append
+    seen = [store.add(new_record(name), "operator", None, "") for name in ("i1", "i2", "i3")]
+    ended = store.change(seen[1], NOW + 1, state=State.STOPPED)
+    to = {"state": State.STARTING, "site": "lab"}
+    done = store.change_all([Change(record, to, State.PLACING) for record in seen], NOW + 2)
+    assert [record and record.site for record in done] == ["lab", None, "lab"]
+    assert [store.get(name) for name in ("i1", "i2", "i3")] == [done[0], ended, done[2]]
+    assert [event.state for event in store.events("i3", 0)] == ["pending", "placing", "starting"]
+    assert told == ["i1", "i2", "i3", "i2", "i1", "i3"]
+    with pytest.raises(IllegalMoveError):
+        store.change_all([Change(done[0], {"reason": "x"}), Change(ended, {"state": State.RUNNING})], NOW + 3)  # type: ignore[arg-type]
+    assert store.get("i1") == done[0]
 
 
 def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_record: NewRecord) -> None:

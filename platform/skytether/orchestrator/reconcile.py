@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 from skytether.api.grant import Grant
@@ -24,7 +25,7 @@ from .moves import Moves, told
 from .placement import UNSTARTED, Decision, Prospect, lacks, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .promises import NOTHING, Promises, Sums
-from .records import Record
+from .records import Change, Record
 from .resizing import Resizing
 from .runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from .security import SecretFileError, Secrets
@@ -52,6 +53,8 @@ _PRUNE = 60.0
 """Seconds between two looks for what is too old to keep."""
 _ACTING = 0.5
 """Seconds for which a pass over a site acts, at most: of a crowd some are ready before the last ones are started."""
+_PLACED_AT_ONCE = 16
+"""Instances that get their sites in one transaction: each takes a server's disk, and keeps others from writing."""
 _BALKS = 5
 """Acts in a row that a site did not answer, after which a pass asks it for nothing more: nor would it answer that."""
 _SHARE = 0.1
@@ -248,11 +251,16 @@ class Reconciler:
             self._promise_anew(live)
             rest = _rest(self._timing.place, time.thread_time() - began)
             self._give_up_siteless([record for record in live if record.site is not None], now)
+        chosen: list[Change] = []
         for action in plan([record for record in live if record.site is None], {}, (), now, self._timing):
             if isinstance(action, Place):
-                self._place(action.record)
+                chosen += self._choose(action.record)
+                if len(chosen) >= _PLACED_AT_ONCE:
+                    self._place(chosen)
+                    chosen = []
             elif isinstance(action, Expire):
                 self._expire(action.record)
+        self._place(chosen)
         if whole or self.moves.warms:
             self.moves.keep_spares()
         if not whole:
@@ -370,18 +378,19 @@ class Reconciler:
         """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
         return 0 < record.start_at - self._clock() <= self._timing.backoff_max
 
-    def _place(self, record: Record) -> None:
+    def _choose(self, record: Record) -> list[Change]:
+        """How an instance gets a site, which is promised to it from then on; nothing: none takes it now."""
         promised = self.promised()
         decision = self.weigh(record, promised)
         untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
         if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
             decision = self.weigh(replace(record, refused=untried), promised)  # it may have been mended
-        smaller: dict[str, Any] = {}
+        smaller, happened = {}, ""
         if decision.site is None and record.size is not None and record.replaces is None:
             as_its_manifest_says = self.weigh(replace(record, size=None), promised)
             if as_its_manifest_says.site is not None:
                 has, gets = record.has, replace(record, size=None).has
-                smaller = {"size": None, "happened": f"has {gets} instead of {has}: {told(record, decision.refused)}"}
+                smaller, happened = {"size": None}, f"has {gets} instead of {has}: {told(record, decision.refused)}"
                 decision = as_its_manifest_says
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
@@ -390,26 +399,36 @@ class Reconciler:
             reason = f"waiting for a site: {told(record, decision.refused)}"
             if reason != record.reason or record.state is not State.PENDING:
                 self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
-            return
-        now = self._clock()
-        chosen = self._store.change(
-            record,
-            now,
-            through=State.PLACING if record.state is State.PENDING else None,
-            state=State.STARTING,
-            reason="",
-            site=decision.site,
-            refused=refused,
-            scores=[score.model_dump() for score in decision.scores],
-            start_at=0.0,
+            return []
+        changes = {
+            "state": State.STARTING,
+            "reason": "",
+            "site": decision.site,
+            "refused": refused,
+            "scores": [score.model_dump() for score in decision.scores],
+            "start_at": 0.0,
             **smaller,
-        )
-        if chosen is not None:
-            self._promises.add(chosen)
-            self._metrics.phase(chosen, "placing", now - record.created_at)
-            site = self.sites.find(decision.site)
-            if site is not None:
-                site.fitness.placed(chosen, self._steady(), now)
+        }
+        self._promises.add(record.after(changes))
+        if (site := self.sites.find(decision.site)) is not None:
+            site.fitness.placed(record, self._steady(), self._clock())
+        return [Change(record, changes, State.PLACING if record.state is State.PENDING else None, happened)]
+
+    def _place(self, chosen: Sequence[Change]) -> None:
+        """Give instances the sites that were chosen for them, unless somebody changed them meanwhile."""
+        if not chosen:
+            return
+        now, placed = self._clock(), list[Record | None]()
+        try:
+            placed = self._store.change_all(chosen, now)
+        finally:
+            for one, record in zip_longest(chosen, placed):
+                if record is None:
+                    self._promises.remove(one.record)
+        for record in filter(None, placed):
+            self._metrics.phase(record, "placing", now - record.created_at)
+        for name in {record.site for record in placed if record is not None}:
+            if (site := self.sites.find(name)) is not None:
                 site.wake()
 
     def _prune(self, now: float) -> None:

@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic_core import to_json
 
 from skytether.api.manifest import Manifest, ServiceSpec
 from skytether.api.rest import Size, State
 
+_REASON_LENGTH = 1024
 MOVES: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.PLACING, State.STOPPED}),
     State.PLACING: frozenset({State.PENDING, State.STARTING, State.STOPPED}),
@@ -138,6 +139,44 @@ class Record:
         if wants is None:
             return has
         return Size(cpu=max(has.cpu, wants.cpu), memory_mb=max(has.memory_mb, wants.memory_mb))
+
+
+class Change(NamedTuple):
+    """What is to become of an instance."""
+
+    record: Record
+    """As it was seen."""
+    columns: dict[str, Any]
+    through: State | None = None
+    """A state that it passes at once."""
+    happened: str = ""
+    """What is told as an event, where neither state nor reason tells it."""
+
+    def draft(self, now: float) -> tuple[Record, dict[str, Any], list[Record]]:
+        """The record as it would be, the columns that change, and what is told of it, in this order.
+
+        Raises:
+            IllegalMoveError: The move of state is not in the table.
+        """
+        record, changes = self.record, self.columns
+        state, reason = changes.get("state", record.state), changes.get("reason", record.reason)[:_REASON_LENGTH]
+        through = {"state": self.through, "reason": "", "updated_at": now}
+        passed = record.after(through) if self.through else record
+        check_move(record.state, passed.state)
+        check_move(passed.state, state)
+        told = state is not record.state or reason != record.reason
+        columns = {
+            **changes,
+            "version": record.version + 1,
+            "reason": reason,
+            "updated_at": now if told else record.updated_at,
+        }
+        new = record.after(columns)
+        events = [passed] if self.through else []
+        events += [new] if told else []
+        if self.happened:
+            events.append(new.after({"reason": self.happened[:_REASON_LENGTH], "updated_at": now}))
+        return new, columns, events
 
 
 @lru_cache(maxsize=256)

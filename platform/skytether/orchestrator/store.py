@@ -43,10 +43,9 @@ from .accounts import MOST_NAMES, Account, merge
 from .discovery import NAME
 from .group_store import GroupStore
 from .models import accounts, events, idempotency, instances, reports
-from .records import Record, check_move
+from .records import Change, Record
 
 _FINAL = [state for state in State if state.final]
-_REASON_LENGTH = 1024
 _SEEN = 65_536
 """Records that are remembered, of what has not ended, so that looking at many again and again reads only those that
 changed."""
@@ -304,26 +303,26 @@ class Store(GroupStore):
         Raises:
             IllegalMoveError: The move of state is not in the table.
         """
-        state, reason = changes.get("state", record.state), changes.get("reason", record.reason)[:_REASON_LENGTH]
-        passed = record.after({"state": through, "reason": "", "updated_at": now}) if through else record
-        check_move(record.state, passed.state)
-        check_move(passed.state, state)
-        told = state is not record.state or reason != record.reason
-        changes |= {"version": record.version + 1, "reason": reason, "updated_at": now if told else record.updated_at}
-        new = record.after(changes)
+        return self.change_all([Change(record, changes, through, happened)], now)[0]
+
+    def change_all(self, asked: Sequence[Change], now: float) -> list[Record | None]:
+        """The same of several, in one transaction: a change by itself takes a server's disk, each time."""
+        drafts = [one.draft(now) for one in asked]
+        done: list[Record | None] = []
+        said: list[dict[str, Any]] = []
         with self._writing() as connection:
-            if connection.execute(_CHANGE, {**changes, **_as_seen(record)}).rowcount == 0:
-                return None
-            if passed is not record:
-                _add_event(connection, passed)
-            if told:
-                _add_event(connection, new)
-            if happened:
-                _add_event(connection, new.after({"reason": happened[:_REASON_LENGTH], "updated_at": now}))
-        self._remember(new)
-        if told or happened:
-            self.on_change(new.id)
-        return new
+            for one, (new, columns, told) in zip(asked, drafts, strict=True):
+                as_seen = connection.execute(_CHANGE, {**columns, **_as_seen(one.record)}).rowcount > 0
+                done.append(new if as_seen else None)
+                said += [_event(record) for record in told] if as_seen else []
+            if said:
+                connection.execute(_EVENT, said)
+        for changed, (_, _, told) in zip(done, drafts, strict=True):
+            if changed is not None:
+                self._remember(changed)
+                if told:
+                    self.on_change(changed.id)
+        return done
 
     def tell(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
         """Keep what the present run of an instance reported, as events, if the instance is still as it was seen.
@@ -569,5 +568,8 @@ def _as_seen(record: Record) -> dict[str, Any]:
 
 
 def _add_event(connection: Connection, record: Record) -> None:
-    row = {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}
-    connection.execute(_EVENT, row)
+    connection.execute(_EVENT, _event(record))
+
+
+def _event(record: Record) -> dict[str, Any]:
+    return {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}
