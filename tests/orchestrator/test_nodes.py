@@ -333,3 +333,26 @@ def test_an_engine_that_goes_away_makes_the_site_unreachable_and_says_why(nodes:
         until(lambda: "the engine there cannot be reached" in nodes.operator.get_site("edge").reason)
         engine.start()
         until(lambda: nodes.state() == "ready")
+
+
+def test_a_node_that_comes_back_under_another_address_is_found_there_and_what_runs_runs_on(nodes: NodeScene) -> None:
+    nodes.join(advertise=None)
+    trust = trusting(nodes.store().authority(), nodes.store().identity)
+    with program(nodes.store()) as linked:
+        until(lambda: linked and nodes.state() == "ready")
+        made = nodes.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=1000))
+        nodes.operator.wait_running(made.id)
+    calls.call(nodes.url, trust, Link(address="192.0.2.9"), Linked)
+    assert nodes.operator.get_site("edge").options["advertise_host"] == "192.0.2.9"
+    with program(nodes.store()) as linked:  # and this machine's own again
+        until(lambda: linked and nodes.state() == "ready")
+        assert nodes.operator.get_site("edge").options["advertise_host"] == "127.0.0.1"
+        after = nodes.operator.get_instance(made.id)
+        assert (after.state, after.restarts) == (State.RUNNING, 0)
+
+
+def test_an_address_that_somebody_named_stays(nodes: NodeScene) -> None:
+    nodes.join(advertise="127.0.0.1")
+    trust = trusting(nodes.store().authority(), nodes.store().identity)
+    calls.call(nodes.url, trust, Link(address="192.0.2.9"), Linked)
+    assert nodes.operator.get_site("edge").options["advertise_host"] == "127.0.0.1"

@@ -286,6 +286,20 @@ def test_a_thousand_connections_of_one_node_take_nothing_from_another(nodes: Nod
     assert len(linked) == 1
 
 
+def test_a_node_that_links_again_and_again_is_told_to_wait(nodes: NodeScene) -> None:
+    """With another address each time: its site would be opened anew with each."""
+    nodes.join(advertise=None)
+    trust, said = context_of(nodes.store()), []
+    for number in range(door._LINKS + 3):
+        with connection(nodes, trust) as link:
+            link.sendall(line_of(Link(address=f"192.0.2.{number}")))
+            said.append(first_line(link))
+    assert b"too many requests" in said[-1]
+    assert b"too many requests" not in said[0]
+    address = nodes.operator.get_site("edge").options["advertise_host"]
+    assert int(address.rpartition(".")[2]) < 10  # the first few
+
+
 def test_a_copy_of_a_machine_does_not_take_its_place(nodes: NodeScene) -> None:
     """A disk that was cloned: the same key on another machine, while the first one is there."""
     nodes.join()

@@ -128,6 +128,35 @@ def start(
     console.print(table)
 
 
+@bench.command("join")
+def join(
+    prefix: Annotated[str, typer.Option(help="Of the images' names, which the engine has.")] = "skytether/",
+    json: Annotated[bool, typer.Option("--json", help="Print rows `step, took_s`.")] = False,
+) -> None:
+    """Time from a machine that has nothing but a Docker engine to a robot that is driven from there, by step.
+
+    This machine's engine joins an orchestrator that is started for it; a robot asks for virtual-trail.
+    """
+    from rich.table import Table
+
+    from skytether.lab.bench.join import bench_join
+    from skytether.lab.bench.pair import BenchError
+    from skytether.lab.embedded import EmbeddedError
+
+    try:
+        with console.status("starting ...") as line:
+            rows = bench_join(prefix, line.update)
+    except (BenchError, EmbeddedError) as error:
+        fail(str(error))
+    if json:
+        print_json([row.document() for row in rows])
+        return
+    table = Table("step", "took [s]", title="From an engine to the first velocity command")
+    for row in rows:
+        table.add_row(row.step, f"{row.took_s:.3f}")
+    console.print(table)
+
+
 @bench.command("migrate")
 def migrate(
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Moves.")] = 10,

@@ -61,10 +61,11 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str, service: str) -
         yield ServiceImage(service, image, manifest.spec.topics)
     finally:
         orchestrator.stop()
-        _clean(owner, options["network"])
+        clean(owner, options["network"])
 
 
-def _clean(owner: str, network: str) -> None:
+def clean(owner: str, network: str) -> None:
+    """Remove what a site left on the engine."""
     containers = docker("ps", "-aq", "--filter", f"label=skytether.io/owner={owner}").split()
     if containers:
         docker("rm", "-f", "-v", *containers)

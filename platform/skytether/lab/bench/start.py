@@ -143,7 +143,7 @@ def _starts(
                 time.sleep(rest_s)
             watch = Watch()
             with asking.agent(config, watch) as agent:
-                took, moving = _first_command(agent, watch if asking.moves else None)
+                took, moving = first_command(agent, watch if asking.moves else None)
             yield standby, took, moving
 
 
@@ -159,8 +159,12 @@ def _until_warm(operator: Client) -> None:
         time.sleep(_LOOK_S)
 
 
-def _first_command(agent: Agent, watch: Watch | None) -> tuple[float, float]:
-    """Seconds until the first command, and until the first that moves the robot, where that is watched for."""
+def first_command(agent: Agent, watch: Watch | None) -> tuple[float, float]:
+    """Seconds until the first command, and until the first that moves the robot, where that is watched for.
+
+    Raises:
+        BenchError: There was none.
+    """
     deadline = time.monotonic() + _LIMIT_S
     while time.monotonic() < deadline:
         status = agent.status()

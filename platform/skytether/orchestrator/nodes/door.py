@@ -68,6 +68,10 @@ _GRACE_S = 10.0
 """From when a site is gone until the link of its node is cut: what runs there is removed by way of it."""
 _GUESSES_PER_S, _GUESSES = 0.2, 10
 """Join tokens that one address may try, and at once."""
+_REQUESTS_PER_S, _REQUESTS = 10.0, 60
+"""Requests of one node, ways not counted, and at once."""
+_LINKS_PER_S, _LINKS = 0.5, 20
+"""Of these, links and renewals, which change the database: one that is cut off again and again comes no more often."""
 _AT_ONCE_S = 0.002
 """Seconds between two connections that are taken: a handshake costs a millisecond, and robots' requests are served by
 the same process."""
@@ -109,6 +113,8 @@ class NodeDoor:
         self._clock = clock
         self._book = Book(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
         self._guesses = Throttle(_GUESSES_PER_S, _GUESSES, time.monotonic)
+        self._requests = Throttle(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
+        self._links = Throttle(_LINKS_PER_S, _LINKS, time.monotonic)
         self._told = Throttle(0.2, 20, time.monotonic)
         self._busy: Counter[str] = Counter()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -309,6 +315,11 @@ class NodeDoor:
         if isinstance(request, Way):
             await self._bring(name, certificate, guest, (reader, writer))
             return None
+        wait = self._requests.wait(name)
+        if isinstance(request, Link | Renew):
+            wait = max(wait, self._links.wait(name))
+        if wait:
+            raise TooManyError(wait)
         with self._one_of(name):
             try:
                 known = await asyncio.to_thread(self._enrolment.admit, certificate)

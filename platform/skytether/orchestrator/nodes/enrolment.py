@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -24,6 +25,7 @@ from ..database import Database
 from ..errors import ConflictError, NotFoundError, UnauthenticatedError, UnknownTokenError
 from ..security import PREFIX_LENGTH, TokenHash, new_token
 from ..sites import Sites
+from ..throttle import Throttle
 from .authority import Authority, fingerprint, name_in, requested_key, serial_of
 from .rows import Invitation, Node
 
@@ -34,6 +36,8 @@ RUNTIME = "docker"
 LONGEST_S = 86_400.0
 """Seconds that a token is good for, at most."""
 _DAY = 86_400.0
+_MOVES_PER_S, _MOVES = 0.1, 5
+"""Changes of address of one node, and at once: with each its site is opened anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +88,7 @@ class Enrolment:
         self._clock = clock
         self._days = days
         self._renew_s = renew_days * _DAY
+        self._moves = Throttle(_MOVES_PER_S, _MOVES, time.monotonic)
         self.urls = urls
 
     # Invitations
@@ -242,7 +247,9 @@ class Enrolment:
         if address is None or not known.node.follow:
             return
         site = self._sites().find_anew(known.name)
-        if site is not None and site.asked.options.get("advertise_host") != address:
+        if site is None or site.asked.options.get("advertise_host") == address:
+            return
+        if not self._moves.wait(known.name):
             before = site.asked.options.get("advertise_host")
             self._sites().change_options(known.name, {"advertise_host": address})
             log.warning("site %s came back under another address: %s, no longer %s", known.name, address, before)

@@ -1,0 +1,69 @@
+"""A node of several orchestrators over one PostgreSQL database: whichever leads has its engine. Real programs."""
+
+from __future__ import annotations
+
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from node_scene import MadeUpEngine, program, until
+from orchestrator_program import Program
+
+from skytether.api.client import Client
+from skytether.api.rest import Invite
+from skytether.node.join import JoinOptions, join
+from skytether.node.store import NodeStore
+
+pytestmark = [pytest.mark.slow, pytest.mark.postgres]
+ANSWERS = ("ready", "blocked")
+
+
+@pytest.fixture
+def two(tmp_path: Path, postgres: str) -> Iterator[list[Program]]:
+    secrets = tmp_path / "secrets"
+    secrets.mkdir(mode=0o700)
+    made = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        one = Program(tmp_path / name / "state", "--database", postgres, "--secrets-dir", str(secrets))
+        one.environment = {"SKYTETHER_NODES_PORT": "0", "SKYTETHER_LOCAL_SITE": "false"}
+        made.append(one)
+    yield made
+    for one in made:
+        one.clean_up()
+
+
+def client_of(one: Program, secrets: Path) -> Client:
+    one.spawn()
+    until(lambda: (one.folder / "nodes.address").exists() and (one.folder / "address").exists())
+    return Client((one.folder / "address").read_text().strip(), (secrets / "operator.token").read_text().strip())
+
+
+def test_when_the_leader_is_killed_the_next_one_has_the_nodes_engine_at_once(
+    two: list[Program], tmp_path: Path
+) -> None:
+    one, other = two
+    with (
+        client_of(one, tmp_path / "secrets") as first,
+        client_of(other, tmp_path / "secrets") as second,
+        tempfile.TemporaryDirectory(prefix="sky-") as short,
+    ):
+        engine, store = MadeUpEngine(Path(short) / "e.sock"), NodeStore(tmp_path / "node")
+        urls = tuple((program_.folder / "nodes.address").read_text().strip() for program_ in two)
+        try:
+            token = second.invite(Invite(name="ward")).token  # at one, and joined at the other
+            options = JoinOptions(
+                urls, token, f"unix://{engine.path}", "127.0.0.1", echo=None, folder=store.folder, unit=False
+            )
+            assert join(options).stands.state in ANSWERS
+            with program(store) as linked:
+                until(lambda: set(linked) >= set(urls))
+                for client in (first, second):
+                    until(lambda client=client: client.get_site("ward").state in ANSWERS)  # type: ignore[misc]
+                one.end(signal.SIGKILL)
+                assert second.get_site("ward").state in ANSWERS
+                until(lambda: 'skytether_site_up{site="ward"} 1.0' in second.metrics())
+        finally:
+            engine.stop()
