@@ -32,7 +32,7 @@ module "node" {
   orchestrator = "https://10.86.9.1"
   ssh_from     = ["10.86.9.1/32"]
   ssh_keys     = [trimspace(file("${var.folder}/key.pub"))]
-  package      = { source = "/opt/wheels/${var.wheel}", options = ["--no-index", "--find-links=/opt/wheels"] }
+  package      = { source = "/opt/wheels/${var.wheel}", options = ["--no-index", "--find-links=/opt/wheels", "--no-compile"] }
   images       = ["/opt/images.tar"]
 }
 

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -156,6 +157,7 @@ def main() -> None:
     if missing:
         sys.exit(f"error: missing here: {', '.join(missing)}")
     WORK.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("error: ended from outside"))  # with all that it started
     steps = Steps()
     wheel = disk(steps)
     with ExitStack() as stack:

@@ -76,7 +76,7 @@ locals {
       }
     },
     var.token_command == null ? {} : {
-      "/usr/local/sbin/skytether-token" = { mode = "0755", content = "#!/bin/sh\nset -eu\n${var.token_command}\n" }
+      "/usr/local/sbin/skytether-token" = { mode = "0700", content = "#!/bin/sh\nset -eu\n${var.token_command}\n" }
       "/etc/systemd/system/skytether-join.service" = {
         mode    = "0644"
         content = file("${path.module}/files/skytether-join.service")

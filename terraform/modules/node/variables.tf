@@ -1,20 +1,20 @@
 variable "name" {
-  description = "Name of the machine, and of the site that it becomes."
+  description = "Name of the machine, and of the site that it becomes. `@SKYTETHER_NAME@` where a group makes machines (docs/groups.md)."
   type        = string
 
   validation {
-    condition     = can(regex("^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", var.name))
+    condition     = var.name == "@SKYTETHER_NAME@" || can(regex("^[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?$", var.name))
     error_message = "name is lower-case letters, digits and '-' (63 at most, '-' neither first nor last), such as \"ward-3\": it is the host name and the site's name."
   }
 }
 
 variable "orchestrator" {
-  description = "Where the orchestrator takes nodes: https://HOST, or https://HOST:PORT if that is not 8603 (`nodes.port`). Null: the machine joins nothing."
+  description = "Where the orchestrator takes nodes: https://HOST, or https://HOST:PORT if that is not 8603 (`nodes.port`); `@SKYTETHER_URL@` for a group. Null: the machine joins nothing."
   type        = string
   default     = null
 
   validation {
-    condition     = var.orchestrator == null || can(regex("^https://[A-Za-z0-9.-]+(:[0-9]{1,5})?$|^https://\\[[0-9a-f:]+\\](:[0-9]{1,5})?$", var.orchestrator))
+    condition     = var.orchestrator == null || var.orchestrator == "@SKYTETHER_URL@" || can(regex("^https://[A-Za-z0-9.-]+(:[0-9]{1,5})?$|^https://\\[[0-9a-f:]+\\](:[0-9]{1,5})?$", var.orchestrator))
     error_message = "orchestrator is https://HOST or https://HOST:PORT, without a path: a join token is shown to nobody over plain HTTP."
   }
 }
@@ -167,7 +167,7 @@ variable "reboot_at" {
 }
 
 variable "token_command" {
-  description = "Command on the machine that prints its join token, for a machine that nobody reaches: from the cloud's store of secrets, by the machine's own identity. It is tried every 10 s until the machine has joined. Null: the token is brought by SSH (module `site`)."
+  description = "Command on the machine that prints its join token, for a machine that nobody reaches: from the cloud's store of secrets, by the machine's own identity; `echo @SKYTETHER_TOKEN@` for a group. It is tried every 10 s until the machine has joined. Null: the token is brought by SSH (module `site`)."
   type        = string
   default     = null
 

@@ -89,6 +89,26 @@ run "a_site_that_nobody_reaches" {
   }
 }
 
+run "machines_that_a_group_makes" {
+  variables {
+    name          = "@SKYTETHER_NAME@"
+    orchestrator  = "@SKYTETHER_URL@"
+    token_command = "echo @SKYTETHER_TOKEN@"
+  }
+
+  assert {
+    condition = alltrue([for text in ["\"@SKYTETHER_NAME@\"", "site join @SKYTETHER_URL@ --ports", "echo @SKYTETHER_TOKEN@"] :
+    strcontains(output.user_data, text)])
+    error_message = "the orchestrator puts each machine's own words in"
+  }
+  assert {
+    condition = one([
+      for file in yamldecode(output.user_data).write_files : file.permissions if file.path == "/usr/local/sbin/skytether-token"
+    ]) == "0700"
+    error_message = "root alone reads the token"
+  }
+}
+
 run "an_orchestrators_machine" {
   variables {
     engine = false
