@@ -76,6 +76,12 @@ def test_a_service_from_file_to_log(run: Run, tmp_path: Path) -> None:
     assert made["id"] in run("instance", "list").stdout
     assert run("instance", "logs", made["id"]).stdout == "hello [there]\n"
     assert good(run("instance", "logs", made["id"], "--json"))["lines"] == ["hello [there]"]
+    resized = good(run("instance", "resize", made["id"], "--cpu", "0.5", "--memory", "200", "--json"))
+    assert (resized["id"], resized["size"], resized["resize"]) == (made["id"], {"cpu": 0.5, "memory_mb": 200}, None)
+    events = run("instance", "events", made["id"]).stdout
+    assert "has 0.5 cores and 200 MiB instead of 0.1 cores and 128 MiB: operator asked for it" in events
+    assert "say what it is to have" in bad(run("instance", "resize", made["id"]), 2)
+    assert "would have 5000 cores, and may have 16" in bad(run("instance", "resize", made["id"], "--cpu", "5000"))
     assert run("instance", "delete", made["id"]).exit_code == 0
     assert run("instance", "delete", made["id"]).exit_code == 0
     assert run("service", "delete", "toy").exit_code == 0

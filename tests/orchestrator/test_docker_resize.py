@@ -189,6 +189,20 @@ def test_a_change_by_somebody_else_is_overruled(house: House) -> None:
     assert len(house.told(instance)) == 1
 
 
+def test_an_instance_that_is_busy_gets_more_within_its_bounds(house: House) -> None:
+    toy = house.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
+    # Little, for the machine may be busy with other things: what a container does not get it does not use.
+    toy["spec"]["needs"] |= {"cpu": 0.05, "scaling": {"cpu": {"min": 0.05, "max": 0.2}}}
+    house.core.catalogue.put("toy", Manifest.model_validate(toy))
+    instance = house.ask()
+    (container,) = house.docker.containers()
+    docker("exec", "-d", container, "sh", "-c", "while :; do :; done & while :; do :; done")
+    until(lambda: house.record(instance).has.cpu == 0.2)
+    assert inspected(container)["HostConfig"]["CpuShares"] == 204
+    assert house.record(instance).attempt == 1
+    assert all("cores are busy" in text for text in house.told(instance))
+
+
 def test_a_leader_that_was_followed_changes_nothing(docker_site: DockerSite, tmp_path: Path) -> None:
     first, second = docker_site.open(tmp_path), docker_site.open(tmp_path)
     try:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from skytether.api.service_report import pull_step_s
 from skytether.messages import LaserScan, Twist, Vector3, decode, encode
 from skytether.wire.events import Connected, Disconnected
 
@@ -99,6 +100,22 @@ def test_a_slow_step_does_not_delay_the_bridge(grant, robot, spawn, tmp_path) ->
     _, stderr = child.communicate(timeout=10)
     assert child.returncode == 0
     assert "closing what is open" in stderr
+
+
+def test_how_long_steps_take_is_told_where_it_is_wanted(grant, robot, spawn, tmp_path) -> None:
+    write_module(tmp_path, "time.sleep(0.03)")
+    child = spawn("under_test", grant(step_times=True), tmp_path)
+    wait_ready(child, grant.ready)
+    reports = grant.ready.with_name("reports.json")
+    deadline = time.monotonic() + 10
+    while not reports.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    told = pull_step_s(json.loads(reports.read_text()))
+    assert told is not None
+    assert told >= 0.03
+    child.terminate()
+    child.communicate(timeout=10)
 
 
 def test_wrong_params_end_with_one_sentence_and_status_2(grant, spawn) -> None:
