@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 
 from .node import ANSWER_S
 
 PIECE = 1 << 16
 _TURNS = 5
+_QUIET_S = 15
+"""Seconds: NATs forget TCP connections after minutes."""
+_UNHEARD_S = 20
+"""Seconds without a sign that what was sent has arrived, after which a connection is dead."""
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
@@ -29,6 +34,21 @@ async def splice(one: Stream, other: Stream) -> None:
         for way in ways:
             way.cancel()
         await asyncio.gather(*ways, return_exceptions=True)
+
+
+def keep_alive(connection: socket.socket) -> None:
+    """Have the kernel say something while nobody else does, lest a NAT on the way forgets the connection.
+
+    Ways to an engine wait for minutes; whoever gets one that is dead would wait for an answer that never comes.
+    """
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        (socket.TCP_KEEPIDLE, _QUIET_S),
+        (socket.TCP_KEEPINTVL, _QUIET_S // 3),
+        (socket.TCP_KEEPCNT, 3),
+        (socket.TCP_USER_TIMEOUT, 1000 * _UNHEARD_S),
+    ):
+        connection.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
 async def closed() -> None:

@@ -35,7 +35,7 @@ from skytether.api.node import (
     Way,
     line_of,
 )
-from skytether.api.splice import PIECE, Stream, closed, splice
+from skytether.api.splice import PIECE, Stream, closed, keep_alive, splice
 
 from . import calls
 from .calls import RefusedError, address_of, explained, read_answer, trusting
@@ -136,6 +136,7 @@ class NodeProgram:
         try:
             async with asyncio.timeout(ANSWER_S):
                 reader, writer = await asyncio.open_connection(host, port, limit=MOST_LINE)
+                keep_alive(writer.get_extra_info("socket"))
                 await writer.start_tls(self._trust, server_hostname=SERVER_NAME)
         except BaseException as error:
             if writer is not None:

@@ -43,7 +43,7 @@ from skytether.api.node import (
     line_of,
     read_request,
 )
-from skytether.api.splice import closed
+from skytether.api.splice import closed, keep_alive
 from skytether.bridge.echo import EchoClient
 
 from ..db import GONE
@@ -199,6 +199,8 @@ class NodeDoor:
             await asyncio.sleep(_AT_ONCE_S)
 
     def _admit(self, taken: socket.socket, address: str) -> None:
+        with contextlib.suppress(OSError):  # it is gone already
+            keep_alive(taken)
         has_room, gives_way = self._book.room(address)
         if gives_way is not None:
             self._end(gives_way)

@@ -185,7 +185,11 @@ class Enrolment:
         def put(site: SiteCreate) -> bool:
             return self._rows.join(invitation, site, node, fingerprint(key))
 
-        self._sites().add(site, put=put)
+        try:
+            self._sites().add(site, put=put)
+        except ConflictError:
+            self.look(asked.token)  # somebody else was quicker with this token, or with this name: it says which
+            raise
         log.info("site %s joined from %s, invited by %s", name, seen_as, invitation.by)
         return node, Issued(name=name, certificate=_pem(certificate), urls=self.urls)
 

@@ -197,12 +197,12 @@ class Ways:
     def _close_socket(self, node: LinkedNode, why: str) -> None:
         listener, node.listener = node.listener, None
         folder = self._folder / node.name
-        if folder.is_dir():  # else the site is gone
-            (folder / ENGINE_AWAY).write_text(why)
         if listener is not None:
             asyncio.get_running_loop().remove_reader(listener.fileno())
             listener.close()
+        with contextlib.suppress(OSError):  # the site is gone, or the disk full
             (folder / ENGINE_SOCKET).unlink(missing_ok=True)
+            (folder / ENGINE_AWAY).write_text(why)
 
     def _take(self, node: LinkedNode, listener: socket.socket) -> None:
         """Somebody here wants to ask a node's engine. asyncio's own servers lose whom they take as they are closed."""
