@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import socket
+import threading
 from collections.abc import Callable
 from typing import Any
 
 import pytest
-from node_scene import NodeScene, program, until
+from node_scene import NodeScene, ReachedRuntime, program, until
 
 from skytether.api.client import ApiError, Client
 from skytether.api.node import Issued, Join, Leave, Link, Linked, Stands
@@ -356,3 +358,34 @@ def test_an_address_that_somebody_named_stays(nodes: NodeScene) -> None:
     trust = trusting(nodes.store().authority(), nodes.store().identity)
     calls.call(nodes.url, trust, Link(address="192.0.2.9"), Linked)
     assert nodes.operator.get_site("edge").options["advertise_host"] == "127.0.0.1"
+
+
+def test_the_echo_of_a_machine_that_joins_answers_the_orchestrator_or_it_is_told(nodes: NodeScene) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("0.0.0.0", 0))
+        port = free.getsockname()[1]
+    assert nodes.join(echo=port).stands.echo is True
+    nodes.engine("other")
+    # Robots would be told an address at which nobody passes on what comes for this machine.
+    assert (
+        join.join(nodes.options(nodes.invite("other"), "other", echo=port, advertise="192.0.2.1")).stands.echo is False
+    )
+
+
+def test_who_leaves_waits_until_nothing_of_the_site_is_left(nodes: NodeScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes.join()
+    emptied, told = threading.Event(), []
+    monkeypatch.setattr(ReachedRuntime, "dismantle", lambda _: emptied.wait(30))
+    with nodes.running() as linked:
+        until(lambda: linked and nodes.state() == "ready")
+        thread = threading.Thread(target=nodes.core.sites.delete, args=("edge",))
+        thread.start()
+        until(lambda: not nodes.core.nodes.all())
+
+        def tell(text: str) -> None:
+            told.append(text)
+            emptied.set()
+
+        assert leave(nodes.store(), force=False, timeout_s=20, tell=tell) is None
+        thread.join()
+    assert told == ["what is left here is being removed"]

@@ -47,7 +47,7 @@ def test_what_runs_at_a_node_that_is_unplugged_runs_on_and_is_found_again(
     assert joined.stands.state == "ready", joined.stands.reason
     with program(house.store()) as linked:
         until(lambda: linked and house.state() == "ready")
-        made = house.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=15))
+        made = house.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=1000))
         before = house.operator.wait_running(made.id)
         assert before.session is not None
         assert before.session.host == "127.0.0.1"

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skytether.api.node import Invited, Issued, Join, Leave, Look, Standing, Stands
+from skytether.bridge.echo import EchoServer
 
 from . import checks, unit
 from .calls import RefusedError, Seen, UnreachableError, address_of, call, first_call, trusting
@@ -246,7 +247,7 @@ def _until_there(store: NodeStore, url: str) -> Stands:
 @contextmanager
 def _linked(store: NodeStore) -> Iterator[None]:
     """Run the node here for a moment."""
-    program, loop = NodeProgram(store), asyncio.new_event_loop()
+    program, loop, echo = NodeProgram(store), asyncio.new_event_loop(), store.config().echo
     task = loop.create_task(program.run())
 
     def run() -> None:
@@ -258,7 +259,11 @@ def _linked(store: NodeStore) -> Iterator[None]:
     thread = threading.Thread(target=run, name="node", daemon=True)
     thread.start()
     try:
-        yield
+        with contextlib.ExitStack() as stack:
+            if echo is not None:
+                with contextlib.suppress(OSError):  # taken just now: the orchestrator says that nobody answers
+                    stack.enter_context(EchoServer("0.0.0.0", echo))  # noqa: S104 (it is for robots)
+            yield
     finally:
         loop.call_soon_threadsafe(task.cancel)
         thread.join()
@@ -310,7 +315,8 @@ def _leave(
         stands = _ask_any(config, trust, Leave(force=force))
         if stands.state == "gone":
             return
-        text = f"{stands.instances} instances are here still" + (f": {stands.reason}" if stands.reason else "")
+        here = f"{stands.instances} instances are here still" if stands.instances else ""
+        text = ": ".join(filter(None, (here, stands.reason))) or "the site goes"
         if text != told:
             tell(text)
             told = text

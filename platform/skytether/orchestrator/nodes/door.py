@@ -64,7 +64,7 @@ _MOST, _STRANGERS = 8192, 128
 """Connections in all, and those that have shown no certificate."""
 _LOOK_S = 2.0
 """Between two looks which nodes are sites still."""
-_GRACE_S = 10.0
+_GRACE_S = 30.0
 """From when a site is gone until the link of its node is cut: what runs there is removed by way of it."""
 _GUESSES_PER_S, _GUESSES = 0.2, 10
 """Join tokens that one address may try, and at once."""
@@ -326,9 +326,11 @@ class NodeDoor:
             try:
                 known = await asyncio.to_thread(self._enrolment.admit, certificate)
             except RemovedError:
-                if isinstance(request, Leave | Standing):
+                if not isinstance(request, Leave | Standing):
+                    raise
+                if self._ways.get(name) is None:
                     return Stands(state="gone")
-                raise
+                return Stands(state="blocked", reason="what is left here is being removed", draining=True)
             guest.know(f"node:{name}")
             if isinstance(request, Renew):
                 issued = await asyncio.to_thread(self._enrolment.renew, known, request.request)
