@@ -17,7 +17,7 @@ from skytether.orchestrator.groups import Groups
 from skytether.orchestrator.leader import ALONE, Lead
 from skytether.orchestrator.metrics import Metrics
 from skytether.orchestrator.moves import Moves
-from skytether.orchestrator.providers.base import Provider
+from skytether.orchestrator.providers.base import Invitation, Provider
 from skytether.orchestrator.reconcile import Reconciler
 from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
@@ -100,6 +100,7 @@ class GroupsBench:
             self.demand,
             self.lead,
             clock,
+            lambda machine, group, options: Invitation("https://orchestrator", f"token-of-{machine}"),
             steady=clock.steady,
         )
         self.reconciler.prospects = self.demand.prospects

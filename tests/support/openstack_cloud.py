@@ -10,6 +10,7 @@ import json
 import re
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
@@ -54,6 +55,8 @@ class Nova:
     lose: set[str] = field(default_factory=set)
     """Of those the answer is lost, after what was asked is done."""
     calls: list[str] = field(default_factory=list)
+    on_created: Callable[[str, Document], None] = lambda id_, asked: None
+    """Called with id and body of each server that was made."""
     ids: count[int] = field(default_factory=lambda: count(1))
 
 
@@ -256,4 +259,5 @@ class _Handler(BaseHTTPRequestHandler):
             server["fault"] = {"code": 500, "message": "No valid host was found. There are not enough hosts available."}
         nova.servers[id_] = server
         nova.created.append(asked)
+        nova.on_created(id_, asked)
         return 202, {"server": {"id": id_, "links": [], "adminPass": "x"}}, {}

@@ -35,6 +35,7 @@ from .moves import Moves
 from .nodes.authority import KEY as NODES_KEY
 from .nodes.authority import Authority
 from .nodes.enrolment import Enrolment
+from .nodes.machines import MachineInvites
 from .providers.base import Provider
 from .quotas import Quotas
 from .reconcile import Reconciler
@@ -162,6 +163,7 @@ class Orchestrator:
             settings.weights,
         )
         self.reconciler.moves = moves
+        invites = MachineInvites(self.nodes, settings.nodes.urls)
         demand = Demand(
             self.store,
             lambda: self.groups,
@@ -178,12 +180,17 @@ class Orchestrator:
             demand,
             self.leadership,
             clock,
+            invites,
             wake_placer=self._wake_placer,
             forget_site=self.metrics.forget_site,
         )
         self.reconciler.prospects = demand.prospects
         self.groups = Groups(
-            settings.state_dir / "groups", self.store, self._unless_outdated(self.scaler.turn), find_provider
+            settings.state_dir / "groups",
+            self.store,
+            self._unless_outdated(self.scaler.turn),
+            find_provider,
+            invites.lacks,
         )
         self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)

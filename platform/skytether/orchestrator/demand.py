@@ -71,7 +71,8 @@ class Demand:
     def _view(self, own: SiteGroup, row: MachineRow, promised: Sums) -> MachineView:
         site = self._sites().find(row.name)
         used = promised.get(row.name, NOTHING)
-        total = site.capacity if site and not site.unreachable and not site.draining else None
+        takes = site is not None and not (site.unreachable or site.draining or site.evacuating)
+        total = site.capacity if site is not None and takes else None
         free = Capacity(total.cpu - used.cpu, total.memory_mb - used.memory_mb, total.gpu - used.gpu) if total else None
         idle_since = None
         if row.stage is not Stage.READY or used.instances:

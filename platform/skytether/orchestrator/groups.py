@@ -122,8 +122,18 @@ class Groups:
         store: Store,
         step: Callable[[SiteGroup], float],
         find_provider: Callable[[str], type[Provider]] = load_provider,
+        lacks: Callable[[], str] = str,
     ) -> None:
-        """``step`` is what each group's thread does again and again."""
+        """What it works with.
+
+        Args:
+            folder: Where the providers keep what they note.
+            store: The database.
+            step: What each group's thread does again and again.
+            find_provider: Gives a provider by its name.
+            lacks: What is to be set before machines can join by themselves; empty: nothing.
+        """
+        self._lacks = lacks
         self._folder = folder
         self._store = store
         self._step = step
@@ -274,6 +284,9 @@ class Groups:
 
     def _make_provider(self, row: GroupRow) -> Provider:
         kind = self._find_provider(row.asked.provider)
+        if kind.joins and (lacks := self._lacks()):
+            text = f"machines of '{row.asked.provider}' join by themselves: first set {lacks}"
+            raise InvalidError([Fault("provider", text)])
         options = parse(kind.Options, row.asked.options, prefix=("options",))
         folder = self._folder / row.name
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

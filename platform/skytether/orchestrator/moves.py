@@ -303,7 +303,7 @@ class Moves:
         if site is None:
             return ""
         drained = f"site {site.name} is being drained" if site.evacuating else ""
-        return site.leaving.get(record.id, "") or site.emptied or drained
+        return site.leaving.get(record.id, "") or drained
 
     def _reachable(self, record: Record) -> bool:
         site = self._sites().find(record.site)

@@ -52,15 +52,6 @@ class Invites(Protocol):
         ...
 
 
-def no_invitations(machine: str, group: GroupCreate, options: Mapping[str, Any]) -> Invitation:  # noqa: ARG001
-    """Where machines cannot join.
-
-    Raises:
-        ProviderFailure: Always.
-    """
-    raise ProviderFailure(f"machines of '{group.provider}' join by themselves, which this orchestrator does not offer")
-
-
 class Scaler:
     """Called by each group's thread, with the group."""
 
@@ -73,7 +64,7 @@ class Scaler:
         demand: Demand,
         lead: Lead,
         clock: Callable[[], float],
-        invite: Invites = no_invitations,
+        invite: Invites,
         wake_placer: Callable[[], None] = lambda: None,
         forget_site: Callable[[str], None] = lambda _: None,
         steady: Callable[[], float] = time.monotonic,
@@ -185,7 +176,7 @@ class Scaler:
                 why = machine.reason or "it is a site no more"
                 self._store.advance_machine(machine.name, Stage.REMOVING, self._clock(), why)
             elif machine.stage is Stage.DRAINING:
-                self._empty(site, f"machine {machine.name} is given back")
+                self._empty(site)
             elif site.draining:
                 self._store.advance_machine(machine.name, Stage.DRAINING, self._clock(), "its site is drained")
 
@@ -229,7 +220,7 @@ class Scaler:
             return
         for record in self._store.live_at(site.name):
             self._moves.displace(record, f"the machine of site {site.name} is gone")
-        self._empty(site, f"machine {machine.name} is gone")
+        self._empty(site)
         self._wake_placer()
 
     def _follow_joining(self, group: SiteGroup, row: GroupRow, machine: MachineRow, site: Site | None) -> None:
@@ -265,10 +256,11 @@ class Scaler:
             log.warning("group %s: %s is no site: %s", group.name, name, error)
             return None
 
-    def _empty(self, site: Site, why: str) -> None:
+    def _empty(self, site: Site) -> None:
         """Have a site go, and what runs there moved before."""
-        site.emptied = why
         try:
+            if not site.evacuating:
+                self._sites().evacuate(site.name)
             if not site.draining and self._sites().drain(site.name):
                 self._forget_site(site.name)
         except NotFoundError:
@@ -279,7 +271,7 @@ class Scaler:
     def _remove(self, group: SiteGroup, machine: MachineRow, found: Sequence[Found]) -> None:
         site = self._sites().find(machine.name)
         if site is not None:  # it became one in the last moment, or is not empty yet
-            self._empty(site, f"machine {machine.name} is given back")
+            self._empty(site)
             return
         for one in found:
             if one.condition is not Condition.GOING:
@@ -317,7 +309,7 @@ class Scaler:
                 self._tell(group, f"{step.machine} is given back: {step.why}")
                 site = self._sites().find(step.machine)
                 if site is not None:
-                    self._empty(site, f"machine {step.machine} is given back")
+                    self._empty(site)
         elif self._store.advance_machine(step.machine, Stage.REMOVING, now, step.why):
             self._tell(group, f"{step.machine} is given back: {step.why}")
             if step.failed:

@@ -129,8 +129,6 @@ class Site:
         """It takes no more instances, and is deleted with its last one."""
         self.group = ""
         """Whose machine it is, for whoever leads; empty: of no group."""
-        self.emptied = ""
-        """Why what runs here is moved, as a sentence; empty: it stays."""
         self.evacuating = False
         """It takes no more instances, and those that are there are moved elsewhere."""
         self.called = False
