@@ -25,8 +25,8 @@ from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
 
 _TOKEN = re.compile(r"sky-[0-9a-f]{64}\.[0-9a-f]{64}")
 _POLL_S = 0.1
-_READY_S = 60.0
-"""By when a site that joined has answered."""
+_READY_S = 180.0
+"""By when a site that joined has answered: a small or an emulated machine takes a minute to load the program."""
 
 
 class ChecksError(NodeError):
