@@ -18,7 +18,7 @@ cp -r /etc/apt/. "$root/etc/apt"
 # Nothing is started in a folder.
 printf '#!/bin/sh\nexit 101\n' >"$root/usr/sbin/policy-rc.d"
 chmod 0755 "$root/usr/sbin/policy-rc.d"
-chroot "$root" sh -c 'apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends cloud-init docker.io unattended-upgrades' >>"$root.log" 2>&1 ||
+chroot "$root" sh -c 'apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends cloud-init docker.io apparmor unattended-upgrades' >>"$root.log" 2>&1 ||
   { tail -n 5 "$root.log" >&2; exit 1; }
 rm -rf "$root/etc/apt"
 mv "$root/etc/apt.own" "$root/etc/apt"

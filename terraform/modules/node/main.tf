@@ -31,7 +31,8 @@ locals {
   packages = distinct(concat(
     ["nftables", "unattended-upgrades", "ca-certificates"],
     var.package == null ? [] : ["python3", "python3-venv"],
-    var.engine ? ["docker.io"] : [],
+    # Debian's kernel has AppArmor switched on, and an engine that cannot load its profile starts nothing: only recommended.
+    var.engine ? ["docker.io", "apparmor"] : [],
     var.packages,
   ))
 

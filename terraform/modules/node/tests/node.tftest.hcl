@@ -22,6 +22,10 @@ run "a_machine_that_joins_nothing" {
     error_message = "the session ports are open"
   }
   assert {
+    condition     = strcontains(output.user_data, "docker.io apparmor")
+    error_message = "without AppArmor's parser no container starts on Debian's kernel"
+  }
+  assert {
     condition     = yamldecode(output.user_data).ssh_pwauth == false
     error_message = "no password opens the machine"
   }
