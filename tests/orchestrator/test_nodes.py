@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import socket
 import threading
@@ -243,7 +244,7 @@ def test_a_join_that_fails_late_leaves_nothing_on_either_side(
 ) -> None:
     nodes.engine()
 
-    def fail(*_: Any) -> Stands:
+    def fail(*_: Any, **__: Any) -> Stands:
         raise NodeError("the site did not answer")
 
     with monkeypatch.context() as patch:
@@ -389,3 +390,48 @@ def test_who_leaves_waits_until_nothing_of_the_site_is_left(nodes: NodeScene, mo
         assert leave(nodes.store(), force=False, timeout_s=20, tell=tell) is None
         thread.join()
     assert told == ["what is left here is being removed"]
+
+
+class MadeUpSystemd:
+    """Runs the node of a unit as systemd would, or says that it does not come up."""
+
+    def __init__(self, nodes: NodeScene, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.stack = contextlib.ExitStack()
+        self.texts: list[str] = []
+        self.trouble = ""
+        self._nodes = nodes
+        monkeypatch.setattr(join.checks, "look_at_rights", lambda *_, **__: join.Finding("rights", "made up"))
+        monkeypatch.setattr(join.unit, "install", self.install)
+        monkeypatch.setattr(join.unit, "remove", self.stack.close)
+        monkeypatch.setattr(join.unit, "trouble", lambda: self.trouble)
+        monkeypatch.setattr(join, "_LOOK_S", 0.05)
+
+    def install(self, text: str) -> None:
+        self.texts.append(text)
+        if not self.trouble:
+            self.stack.enter_context(program(self._nodes.store()))
+
+
+def test_a_unit_runs_the_node_and_is_gone_when_the_machine_leaves(
+    nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes.engine()
+    systemd = MadeUpSystemd(nodes, monkeypatch)
+    joined = join.join(nodes.options(nodes.invite(), unit=True, program="/opt/skytether/bin/skytether"))
+    assert joined.stands.state == "ready"
+    (text,) = systemd.texts
+    assert f"ExecStart=/opt/skytether/bin/skytether site run --folder {nodes.store().folder}\n" in text
+    assert f"ReadWritePaths={nodes.store().folder}\n" in text
+    assert leave(nodes.store(), force=False, timeout_s=10) is None
+    assert nothing_is_left(nodes)
+
+
+def test_a_unit_that_does_not_come_up_is_told_of_before_long_and_nothing_is_left(
+    nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes.engine()
+    systemd = MadeUpSystemd(nodes, monkeypatch)
+    systemd.trouble = "skytether-node.service ended 3 times; its log ends with: no module named x"
+    why = said(lambda: join.join(nodes.options(nodes.invite(), unit=True)))
+    assert "ended 3 times; its log ends with: no module named x); nothing is left of the join" in why
+    assert nothing_is_left(nodes)

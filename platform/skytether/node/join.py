@@ -25,8 +25,10 @@ from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
 
 _TOKEN = re.compile(r"sky-[0-9a-f]{64}\.[0-9a-f]{64}")
 _POLL_S = 0.1
-_READY_S = 180.0
-"""By when a site that joined has answered: a small or an emulated machine takes a minute to load the program."""
+_READY_S = 300.0
+"""By when a site that joined has answered: a slow machine takes a minute to start a program."""
+_LOOK_S = 5.0
+"""Between two looks whether the unit comes up at all."""
 
 
 class ChecksError(NodeError):
@@ -130,7 +132,7 @@ def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: Non
             if options.unit:
                 unit.install(unit.unit(options.program or unit.own_program(), options.folder, path))
         with steps.step("site"), contextlib.nullcontext() if options.unit else _linked(store):
-            stands = _until_there(store, url)
+            stands = _until_there(store, url, by_unit=options.unit)
     except BaseException as error:
         _take_back(store, url)
         if isinstance(error, OSError):
@@ -222,11 +224,16 @@ def _ask_twice(url: str, trust: ssl.SSLContext, asked: Join) -> Issued:
         return call(url, trust, asked, Issued)
 
 
-def _until_there(store: NodeStore, url: str) -> Stands:
-    """Wait until the site answers at the orchestrator."""
-    deadline = time.monotonic() + _READY_S
+def _until_there(store: NodeStore, url: str, *, by_unit: bool = False) -> Stands:
+    """Wait until the site answers at the orchestrator; ``by_unit``: a unit of systemd runs the node."""
+    began = looked_at = time.monotonic()
     trust, last = trusting(store.authority(), store.identity), ""
-    while time.monotonic() < deadline:
+    while time.monotonic() < began + _READY_S:
+        if by_unit and time.monotonic() >= looked_at + _LOOK_S:
+            looked_at = time.monotonic()
+            if why := unit.trouble():
+                last = why
+                break
         try:
             stands = call(url, trust, Standing(), Stands)
         except UnreachableError as error:
@@ -239,8 +246,8 @@ def _until_there(store: NodeStore, url: str) -> Stands:
                 break
         time.sleep(_POLL_S)
     raise NodeError(
-        f"the site did not answer within {_READY_S:.0f} s ({last}); nothing is left of the join, the token is used up: "
-        "`journalctl -u skytether-node` may say more"
+        f"the site did not answer within {time.monotonic() - began:.0f} s ({last}); nothing is left of the join, and "
+        "the token is used up; `journalctl -u skytether-node` may say more"
     )
 
 

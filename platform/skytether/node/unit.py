@@ -12,6 +12,8 @@ from .store import DEFAULT_FOLDER, NodeError
 NAME = "skytether-node.service"
 UNITS = Path("/etc/systemd/system")
 _PATIENCE_S = 60.0
+_TOO_OFTEN = 3
+"""Starts of a unit after which it is no accident."""
 _TEXT = """\
 # A machine that joined an orchestrator as a site: it calls there, and nothing calls it but probes of its echo.
 # Written by `skytether site join`; `skytether site leave` takes it away.
@@ -53,7 +55,8 @@ SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
 SystemCallErrorNumber=EPERM
 MemoryMax=512M
-TasksMax=64
+TasksMax=256
+Environment=OPENBLAS_NUM_THREADS=1
 
 [Install]
 WantedBy=multi-user.target
@@ -99,6 +102,18 @@ def install(text: str, units: Path = UNITS) -> None:
         raise NodeError(f"the unit {path} cannot be started: {error}") from error
 
 
+def trouble() -> str:
+    """Why the unit does not come up, where it was begun again and again; empty: nothing says so."""
+    try:
+        shown = _systemctl("show", "--property=NRestarts", "--value", NAME)
+        if int(shown or 0) < _TOO_OFTEN:
+            return ""
+        last = _said("journalctl", "-u", NAME, "-n", "3", "-o", "cat", "--no-pager")
+    except (NodeError, ValueError):
+        return ""
+    return f"{NAME} ended {shown} times; its log ends with: {' / '.join(last.splitlines())[-500:]}"
+
+
 def remove(units: Path = UNITS) -> None:
     """End it, and take it away. May be called again."""
     path = units / NAME
@@ -112,18 +127,22 @@ def remove(units: Path = UNITS) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _systemctl(*words: str) -> None:
+def _systemctl(*words: str) -> str:
+    return _said("systemctl", *words)
+
+
+def _said(*words: str) -> str:
     try:
         done = subprocess.run(
-            ["systemctl", *words],  # noqa: S607 (systemd's own)
+            words,
             capture_output=True,
             text=True,
             timeout=_PATIENCE_S,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise NodeError(f"systemctl: {error}") from error
+        raise NodeError(f"{words[0]}: {error}") from error
     if done.returncode:
-        raise NodeError(
-            f"systemctl {' '.join(words)}: {done.stderr.strip().splitlines()[-1] if done.stderr else done.returncode}"
-        )
+        why = done.stderr.strip().splitlines()
+        raise NodeError(f"{' '.join(words)}: {why[-1] if why else f'exit status {done.returncode}'}")
+    return done.stdout.strip()
