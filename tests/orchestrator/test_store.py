@@ -118,9 +118,7 @@ def test_a_change_needs_to_have_seen_the_last_one(store: Store, new_record: NewR
     assert store.get("i1") == second
 
 
-def test_of_several_changes_at_once_those_are_made_that_have_seen_the_last_one(
-    store: Store, new_record: NewRecord
-) -> None:
+def _change_several(store: Store, new_record: NewRecord) -> None:
     told: list[str] = []
     store.on_change = told.append
     seen = [store.add(new_record(name), "operator", None, "") for name in ("i1", "i2", "i3")]
@@ -131,9 +129,30 @@ def test_of_several_changes_at_once_those_are_made_that_have_seen_the_last_one(
     assert [store.get(name) for name in ("i1", "i2", "i3")] == [done[0], ended, done[2]]
     assert [event.state for event in store.events("i3", 0)] == ["pending", "placing", "starting"]
     assert told == ["i1", "i2", "i3", "i2", "i1", "i3"]
+    more = [store.add(new_record(name), "operator", None, "") for name in ("i4", "i5")]
+    assert [store.get(one.id) for one in more] == more
+    assert store.change_all([Change(one, to, State.PLACING) for one in more], NOW + 2) == [
+        store.get("i4"),
+        store.get("i5"),
+    ]
+    assert [event.state for event in store.events("i5", 0)] == ["pending", "placing", "starting"]
     with pytest.raises(IllegalMoveError):
         store.change_all([Change(done[0], {"reason": "x"}), Change(ended, {"state": State.RUNNING})], NOW + 3)  # type: ignore[arg-type]
     assert store.get("i1") == done[0]
+
+
+def test_of_several_changes_at_once_those_are_made_that_have_seen_the_last_one(
+    store: Store, new_record: NewRecord
+) -> None:
+    _change_several(store, new_record)
+
+
+@pytest.mark.postgres
+@pytest.mark.slow
+def test_and_so_in_postgresql(postgres: str, new_record: NewRecord) -> None:
+    with closing(Store(postgres)) as store:
+        store.migrate()
+        _change_several(store, new_record)
 
 
 def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_record: NewRecord) -> None:

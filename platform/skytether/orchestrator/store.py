@@ -166,6 +166,10 @@ _LIVE_SPARES = _versions(_LIVE, instances.c.spare)
 _SPARES = _versions(instances.c.spare, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
 
 
+class _ChangedMeanwhileError(Exception):
+    """Somebody else has changed what was to be changed."""
+
+
 class KeyReusedError(Exception):
     """An idempotency key came again with another body."""
 
@@ -308,21 +312,40 @@ class Store(GroupStore):
     def change_all(self, asked: Sequence[Change], now: float) -> list[Record | None]:
         """The same of several, in one transaction: a change by itself takes a server's disk, each time."""
         drafts = [one.draft(now) for one in asked]
-        done: list[Record | None] = []
-        said: list[dict[str, Any]] = []
-        with self._writing() as connection:
-            for one, (new, columns, told) in zip(asked, drafts, strict=True):
-                as_seen = connection.execute(_CHANGE, {**columns, **_as_seen(one.record)}).rowcount > 0
-                done.append(new if as_seen else None)
-                said += [_event(record) for record in told] if as_seen else []
-            if said:
-                connection.execute(_EVENT, said)
-        for changed, (_, _, told) in zip(done, drafts, strict=True):
+        rows = [{**columns, **_as_seen(one.record)} for one, (_, columns, _) in zip(asked, drafts, strict=True)]
+        events = [[_event(record) for record in told] for _, _, told in drafts]
+        try:
+            as_seen = self._change_rows(rows, events, at_once=len(rows) > 1)
+        except _ChangedMeanwhileError:
+            as_seen = self._change_rows(rows, events, at_once=False)
+        done = [new if same else None for (new, _, _), same in zip(drafts, as_seen, strict=True)]
+        for changed, told in zip(done, events, strict=True):
             if changed is not None:
                 self._remember(changed)
                 if told:
                     self.on_change(changed.id)
         return done
+
+    def _change_rows(
+        self, rows: Sequence[dict[str, Any]], events: Sequence[list[dict[str, Any]]], *, at_once: bool
+    ) -> list[bool]:
+        """Change rows, and add events of each that is still as it was seen; which these are.
+
+        Raises:
+            _ChangedMeanwhileError: Some are not, and nothing was changed; only ``at_once``: then a server is waited for
+                once, not for each row, and says how many it has changed, not which.
+        """
+        with self._writing() as connection:
+            if at_once and len({frozenset(row) for row in rows}) == 1:
+                if connection.execute(_CHANGE, rows).rowcount != len(rows):
+                    raise _ChangedMeanwhileError
+                as_seen = [True] * len(rows)
+            else:
+                as_seen = [connection.execute(_CHANGE, row).rowcount > 0 for row in rows]
+            said = [event for told, same in zip(events, as_seen, strict=True) if same for event in told]
+            if said:
+                connection.execute(_EVENT, said)
+        return as_seen
 
     def tell(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
         """Keep what the present run of an instance reported, as events, if the instance is still as it was seen.
