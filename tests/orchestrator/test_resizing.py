@@ -413,3 +413,24 @@ def test_a_move_by_hand_takes_the_size_along(served: Any) -> None:
     served.operator.resize_instance(made.id, Resize(cpu=2, memory_mb=256))
     until(lambda: served.operator.get_instance(made.id).size.cpu == 2)
     assert served.operator.migrate_instance(made.id).size == Size(cpu=2, memory_mb=256)
+
+
+def test_a_standby_that_takes_over_gets_the_size_that_was_there(served: Any, manifest: Any) -> None:
+    fake = served.site(cpu=16)
+    served.operator.put_service("toy", manifest(needs={"cpu": 1, "standby": 1}))
+
+    def warm() -> Any:
+        there = served.operator.instances()
+        return next((i.id for i in there if not i.robot and i.state is State.RUNNING), None)
+
+    until(warm)
+    made = ask(served)
+    served.operator.resize_instance(made.id, Resize(cpu=2))
+    until(lambda: served.operator.get_instance(made.id).size.cpu == 2)
+    spare = until(warm)
+    fake.crash(made.id)
+    until(lambda: served.operator.get_instance(made.id).successor == spare)
+    coming = until(lambda: (i := served.operator.get_instance(spare)).size.cpu == 2 and i)
+    assert (coming.replaces, coming.restarts) == (made.id, 0)
+    events = [event.reason for event in served.core.store.events(spare, 0)]
+    assert events[-1].endswith(f"instead of 1 core and 128 MiB: instance {made.id} had that")
