@@ -301,6 +301,25 @@ def test_one_that_somebody_deleted_is_noticed_and_what_ran_there_is_placed_anew(
     assert f"{lost} is lost: somebody has deleted it" in bench.told()
 
 
+def test_one_that_fell_silent_stays_with_what_runs_there_and_goes_without(made: Made) -> None:
+    bench = made(max=1)
+    bench.ask("a")
+    bench.step(4)
+    (first,) = bench.cloud.names()
+    bench.silent.add(first)
+    bench.step(100)
+    assert bench.states() == {"a": "running"}
+    bench.silent.clear()
+    bench.end("a")
+    bench.step(3)
+    bench.silent.add(first)
+    bench.step()
+    bench.ask("b")
+    bench.step(70)
+    assert first not in bench.cloud.names()
+    assert bench.states() == {"b": "running"}
+
+
 def test_one_that_is_not_listed_but_answers_is_there(made: Made) -> None:
     bench = made()
     bench.ask("a")

@@ -224,9 +224,21 @@ def test_a_group_that_is_to_be_deleted_gives_all_back_and_makes_none() -> None:
 
 
 def test_a_site_that_does_not_answer_is_no_room_but_a_machine() -> None:
-    silent = MachineView("a", Stage.READY, NOW - 100, 0, None, 0.0, NOW - 1e5)
+    silent = MachineView("a", Stage.READY, NOW - 100, 1, None, 0.0)
     assert made(decide([group(silent)], [waits()], NOW)) == ["cloud"]
     assert decide([group(silent, max=1)], [waits()], NOW) == []
+
+
+def test_a_site_that_does_not_answer_goes_when_nothing_has_run_there_for_long_and_another_comes() -> None:
+    """Where something runs it stays: it may be cut off, and drive a robot all the while."""
+    silent = MachineView("a", Stage.READY, NOW - 1000, 0, None, 0.0, NOW - 600)
+    steps = decide([group(silent, min=1, max=1)], [], NOW)
+    assert steps == [
+        Drain("cloud", "a", "its site takes nothing, and nothing runs there"),
+        Make("cloud", "1 are always there"),
+    ]
+    assert decide([group(silent, min=1, max=1)], [], NOW - 1) == []
+    assert decide([group(MachineView("a", Stage.READY, NOW - 1e6, 1, None), max=1)], [], NOW) == []
 
 
 stages = st.sampled_from(Stage)

@@ -201,13 +201,16 @@ def has_headroom(headroom: Headroom, free: Sequence[tuple[float, float]], cores:
 
 
 def _overdue(view: GroupView, now: float) -> list[Drain | Drop]:
-    """What did not become a site in time, and what is too many."""
+    """What did not become a site in time, or is none that is of use; and what is too many."""
     asked, steps = view.asked, list[Drain | Drop]()
     for one in view.machines:
         waited = now - one.since
         if one.stage is Stage.JOINING and waited >= asked.join_timeout_s:
             why = f"it did not become a site within {asked.join_timeout_s:g} s"
             steps.append(Drop(asked.name, one.name, why, failed=True))
+        elif one.stage is Stage.READY and one.free is None and _idle(view, one, now):
+            # It counts towards max and is of no use; one where something runs may be cut off, and drive a robot.
+            steps.append(Drain(asked.name, one.name, "its site takes nothing, and nothing runs there"))
     gone = {step.machine for step in steps}
     there = [one for one in view.machines if one.stage.counts and one.name not in gone]
     # Those first that are furthest from use.
@@ -215,6 +218,10 @@ def _overdue(view: GroupView, now: float) -> list[Drain | Drop]:
     for one in there[: max(0, len(there) - asked.max)]:
         steps.append(_give_back(view, one, f"the group may have {asked.max} machines"))
     return steps
+
+
+def _idle(view: GroupView, one: MachineView, now: float) -> bool:
+    return one.idle_since is not None and now - one.idle_since >= view.asked.idle_s
 
 
 def _all_of(view: GroupView) -> list[Drain | Drop]:
@@ -301,7 +308,7 @@ def _shrunk(plan: _Plan, now: float) -> list[Step]:
     view, asked = plan.view, plan.view.asked
     ready = {one.name: one for one in view.machines if one.stage is Stage.READY and one.free is not None}
     rooms = [room for room in plan.rooms if room.machine in ready]
-    idle = [one for one in ready.values() if one.idle_since is not None and now - one.idle_since >= asked.idle_s]
+    idle = [one for one in ready.values() if _idle(view, one, now)]
     idle.sort(key=lambda one: (one.idle_since or 0.0, one.name))
     steps: list[Step] = []
     for one in idle:
