@@ -35,7 +35,9 @@ def test_a_typo_deep_in_a_manifest_names_the_key_and_the_nearest(manifest: Any) 
 
 def test_an_unknown_key_far_from_all_names_all(manifest: Any) -> None:
     text = told(Manifest, manifest(needs={"zzz": 1}))
-    known = "architectures, compute_ms, cpu, devices, egress, gpu, max_loss, max_rtt_ms, memory_mb, standby, tiers"
+    known = (
+        "architectures, compute_ms, cpu, devices, egress, gpu, max_loss, max_rtt_ms, memory_mb, scaling, standby, tiers"
+    )
     assert text == f"spec.needs.zzz: unknown key; known are {known}"
 
 
