@@ -22,8 +22,9 @@ import pytest
 from docker_site import DockerSite, Images
 
 from skytether.api.client import Client
+from skytether.api.groups import GroupCreate
 from skytether.api.manifest import Manifest
-from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, RobotCreate, SiteCreate, TopicReport
+from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, Resize, RobotCreate, SiteCreate, TopicReport
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.compose]
 
@@ -225,6 +226,8 @@ def test_an_instance_runs_and_prometheus_knows_all_that_the_dashboard_asks(
         asked_for = {"robot": "walker", "service": "virtual-trail", "lease_s": 600, "params": {"report": "at work"}}
         made = client.create_instance(InstanceCreate.model_validate(asked_for))
         assert client.wait_running(made.id, timeout=PATIENCE).placement.site == "edge"
+        client.resize_instance(made.id, Resize(cpu=0.75))
+        client.create_group(GroupCreate(name="more", provider="local", tier="edge", max=1))
         until(lambda: len(stack.query("up == 1")) == 2)
         assert [row["metric"]["instance"] for row in stack.query('up{job="skytether"}')] == ["orchestrator:8600"]
 

@@ -18,7 +18,7 @@ import sys
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -49,7 +49,8 @@ class MadeUpCluster:
         self._objects: dict[str, dict[str, Document]] = {}
         """By kind and name."""
         self._version = 0
-        self._watchers: list[asyncio.Queue[bytes | None]] = []
+        self._watchers: list[tuple[Mapping[str, str], asyncio.Queue[bytes | None]]] = []
+        """Of pods, each with the labels that it follows."""
         self._ports: set[tuple[str, int]] = set()
         self._turns = itertools.cycle(range(_NODES))
         self._due: list[tuple[float, int, str, str]] = []
@@ -86,8 +87,9 @@ class MadeUpCluster:
         document["metadata"]["resourceVersion"] = str(self._version)
         if kind == "pods":
             line = json.dumps({"type": event, "object": document}).encode() + b"\n"
-            for watcher in self._watchers:
-                watcher.put_nowait(line)
+            for labels, watcher in self._watchers:
+                if _has(document, labels):
+                    watcher.put_nowait(line)
 
     def create(self, kind: str, document: Document) -> Document | None:
         """None: its name is taken."""
@@ -145,11 +147,11 @@ class MadeUpCluster:
                     pod["status"] = _ended() if pod["spec"].get("activeDeadlineSeconds") else _running()
                     self._changed("pods", pod, "MODIFIED")
 
-    async def follow(self, kind: str, until: float) -> AsyncIterator[bytes]:
+    async def follow(self, kind: str, labels: Mapping[str, str], until: float) -> AsyncIterator[bytes]:
         """What changes from now on, line by line, with a bookmark now and then; of anything but pods nothing does."""
         queue: asyncio.Queue[bytes | None] = asyncio.Queue()
         watchers = self._watchers if kind == "pods" else []
-        watchers.append(queue)
+        watchers.append((labels, queue))
         try:
             while (left := until - self._clock()) > 0:
                 try:
@@ -162,7 +164,11 @@ class MadeUpCluster:
                     return
                 yield line
         finally:
-            watchers.remove(queue)
+            watchers.remove((labels, queue))
+
+
+def _has(document: Document, labels: Mapping[str, str]) -> bool:
+    return all(document["metadata"]["labels"].get(key) == value for key, value in labels.items())
 
 
 def _now() -> str:
@@ -255,13 +261,13 @@ class Answers:
 
     def _all(self, kind: str, request: Request) -> Response:
         asked = request.query_params
+        wanted = dict(part.split("=", 1) for part in asked.get("labelSelector", "").split(",") if part)
         if asked.get("watch"):
             until = time.monotonic() + float(asked.get("timeoutSeconds", "300"))
-            return StreamingResponse(self._cluster.follow(kind, until), media_type="application/json")
+            return StreamingResponse(self._cluster.follow(kind, wanted, until), media_type="application/json")
         if kind == "nodes":
             return JSONResponse({"items": [_node(n) for n in range(_NODES)], "metadata": {"resourceVersion": "1"}})
-        wanted = dict(part.split("=", 1) for part in asked.get("labelSelector", "").split(",") if part)
-        found = [one for one in self._cluster.of(kind).values() if wanted.items() <= one["metadata"]["labels"].items()]
+        found = [one for one in self._cluster.of(kind).values() if _has(one, wanted)]
         first, most = int(asked.get("continue", "0")), int(asked.get("limit", "0")) or len(found)
         more = str(first + most) if first + most < len(found) else ""
         meta = {"resourceVersion": self._cluster.version, "continue": more}
