@@ -212,7 +212,13 @@ class NodeDoor:
         self._book.come(guest)
         task = self._loop.create_task(self._greet(taken, guest))
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+
+        def over(done: asyncio.Task[None]) -> None:
+            self._tasks.discard(done)
+            if guest.socket is taken:  # it was cancelled before it began
+                taken.close()
+
+        task.add_done_callback(over)
         task.add_done_callback(
             lambda _: taken.close() if guest.socket is taken else None
         )  # it was ended before it began
