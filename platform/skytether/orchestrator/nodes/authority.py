@@ -64,7 +64,7 @@ class Authority:
             raise SecretFileError(f"{path} holds another kind of key than was made there: put it back")
         self._key = key
         self.certificate = self._own()
-        self.pem = _pem(self.certificate)
+        self.pem = pem_of(self.certificate)
         self.pin = pin_of(self.certificate)
         """SHA-256 of the public key, hexadecimal: in each join token, so that a node knows whom it talks to."""
 
@@ -139,7 +139,7 @@ class Authority:
         context.load_verify_locations(cadata=self.pem)
         file = os.memfd_create("nodes", os.MFD_CLOEXEC)  # the key is on no disk
         try:
-            os.write(file, _private_pem(key) + leaf.public_bytes(serialization.Encoding.PEM) + self.pem.encode())
+            os.write(file, _private_pem(key) + (pem_of(leaf) + self.pem).encode())
             context.load_cert_chain(f"/proc/self/fd/{file}")
         finally:
             os.close(file)
@@ -210,7 +210,8 @@ def _spki(public: object) -> bytes:
     )
 
 
-def _pem(certificate: x509.Certificate) -> str:
+def pem_of(certificate: x509.Certificate) -> str:
+    """As it is sent, and kept in files."""
     return certificate.public_bytes(serialization.Encoding.PEM).decode()
 
 

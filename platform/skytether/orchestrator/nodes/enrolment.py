@@ -16,7 +16,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding
 
 from skytether.api.node import Address, Issued, Join, Machine
 from skytether.api.rest import SiteCreate
@@ -26,7 +25,7 @@ from ..errors import ConflictError, NotFoundError, UnauthenticatedError, Unknown
 from ..security import PREFIX_LENGTH, TokenHash, new_token
 from ..sites import Sites
 from ..throttle import Throttle
-from .authority import Authority, fingerprint, name_in, requested_key, serial_of
+from .authority import Authority, fingerprint, name_in, pem_of, requested_key, serial_of
 from .rows import Invitation, Node
 
 log = logging.getLogger(__name__)
@@ -191,7 +190,7 @@ class Enrolment:
             self.look(asked.token)  # somebody else was quicker with this token, or with this name: it says which
             raise
         log.info("site %s joined from %s, invited by %s", name, seen_as, invitation.by)
-        return node, Issued(name=name, certificate=_pem(certificate), urls=self.urls)
+        return node, Issued(name=name, certificate=pem_of(certificate), urls=self.urls)
 
     def _options(self, site: SiteCreate, address: Address, ports: tuple[int, int] | None) -> dict[str, Any]:
         """What whoever invited gave goes before what the machine says."""
@@ -243,7 +242,7 @@ class Enrolment:
         certificate = self._authority.sign(request, node.site, self._days)
         if not self._rows.promise(node.site, serial_of(certificate), node.next_serial):
             raise ConflictError("another certificate was made for this node at the same moment: ask again")
-        return Issued(name=node.site, certificate=_pem(certificate), urls=self.urls)
+        return Issued(name=node.site, certificate=pem_of(certificate), urls=self.urls)
 
     def linked(self, known: Known, machine: Machine, address: str | None, seen_as: str) -> None:
         """A node is here, and says how it is now. Robots are told another address if it follows the machine's."""
@@ -287,7 +286,3 @@ def _another(name: str) -> str:
 
 def _when(at: float) -> str:
     return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
-def _pem(certificate: x509.Certificate) -> str:
-    return certificate.public_bytes(Encoding.PEM).decode()
