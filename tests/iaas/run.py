@@ -193,6 +193,10 @@ def drive(stack: ExitStack, steps: Steps, wheel: str) -> None:
     def skytether(*asked: str) -> str:
         return run(*inside, *SKYTETHER, *asked, env=environment)
 
+    def sites_that_run() -> list[str]:
+        instances = json.loads(skytether("instance", "list", "--json"))
+        return [one["placement"]["site"] for one in instances if one["state"] == "running"]
+
     address = state / "address"
     until(address.exists, 60, "the orchestrator answers")
     token = skytether("robot", "add", "walker").strip()
@@ -231,19 +235,18 @@ def drive(stack: ExitStack, steps: Steps, wheel: str) -> None:
         sys.exit("error: the walker was not driven; see build/iaas/orchestrator.log")
     steps.done("the walker asks: to its first velocity command")
     steps.add("**from no machine to the first velocity command**", time.monotonic() - began)
-    where = json.loads(skytether("instance", "list", "--json"))
     time.sleep(DRIVEN_S)
-    steps.done(f"it is driven, by the site {where[0]['site']}")
+    steps.done(f"it is driven, by the site {', '.join(sites_that_run())}")
     options = ("--option", "bind_host=10.86.9.1", "--option", "advertise_host=10.86.9.1")
     skytether("site", "add", "house", "--runtime", "process", *options)
     (WORK / "destroy.log").write_text(terraform("destroy", "-auto-approve", *chosen))
     steps.done("terraform destroy: drained, the walker driven by another site, the machine gone")
-    where = json.loads(skytether("instance", "list", "--json"))
+    at_work = sites_that_run()
     walker.stdin.close()
     facts = json.loads(walker.stdout.readline())
     sites = [site["name"] for site in json.loads(skytether("site", "list", "--json"))]
-    if sites != ["house"] or [one["site"] for one in where if one["state"] == "running"] != ["house"]:
-        sys.exit(f"error: sites {sites}, instances {where}")
+    if sites != ["house"] or at_work != ["house"]:
+        sys.exit(f"error: sites {sites}, instances run at {at_work}")
     first_s = json.loads(first)["first_command_s"]
     sys.stdout.write(
         f"the walker's first command came after {first_s} s; it was driven for {facts['driven_s']} s, of which "

@@ -69,7 +69,7 @@ def test_robots_vanish_in_every_phase(programs: Any) -> None:
         scene = Scene.begin(client, program)
         successor = client.migrate_instance(moving).id
         vanished = [*vars(scene).values(), warm, moving, successor]
-        for instance in vanished:
+        for instance in set(vanished) - {scene.stopping}:  # that one may have ended by now
             client.renew_instance(instance, Renew(lease_s=1))
         left = assert_nothing_lost(told(client), dict.fromkeys(vanished, State.STOPPED), runs)
         spares = [i.id for i in client.instances() if i.id not in vanished]

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from node_scene import MadeUpEngine, program, until
-from orchestrator_program import Program
+from node_scene import MadeUpEngine, program
+from orchestrator_program import Program, until
 
 from skytether.api.client import Client
 from skytether.api.rest import Invite
@@ -37,8 +37,8 @@ def two(tmp_path: Path, postgres: str) -> Iterator[list[Program]]:
 
 def client_of(one: Program, secrets: Path) -> Client:
     one.spawn()
-    until(lambda: (one.folder / "nodes.address").exists() and (one.folder / "address").exists())
-    return Client((one.folder / "address").read_text().strip(), (secrets / "operator.token").read_text().strip())
+    until(lambda: (one.folder / "nodes.address").exists() and (one.folder / "address").exists(), one)
+    return one.client((secrets / "operator.token").read_text().strip())
 
 
 def test_when_the_leader_is_killed_the_next_one_has_the_nodes_engine_at_once(
