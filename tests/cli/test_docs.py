@@ -134,3 +134,16 @@ def test_the_page_of_navigation_has_a_row_for_each_code() -> None:
     table = (ROOT / "docs" / "navigation.md").read_text().partition("| `code` | |\n")[2].partition("\n\n")[0]
     told = [code for row in table.splitlines() for code in re.findall(r"`(\w+)`", row.split("|")[1])]
     assert sorted(told) == sorted(code.value for code in Code if code is not Code.OK)
+
+
+def test_each_rule_of_the_bridge_that_the_code_cites_is_on_its_page() -> None:
+    rules = dict(re.findall(r"^### Rule (\d+): (.+)$", (ROOT / "docs" / "bridge.md").read_text(), re.MULTILINE))
+    assert list(rules) == [str(number) for number in range(1, len(rules) + 1)], "a rule keeps its number"
+    cited = {
+        (path.stem, number)
+        for package in ("wire", "bridge")
+        for path in (ROOT / "platform" / "skytether" / package).rglob("*.py")
+        for number in re.findall(r"rule (\d+)", path.read_text())
+    }
+    assert len(cited) > 20
+    assert {number for _, number in cited} <= rules.keys()
