@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine-ros1 slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs licences audit lock clean
+.PHONY: demo test slow-engine slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs licences audit lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -17,18 +17,19 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) -n 2 --dist loadfile
 	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
-	@failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine-ros1 slow-others || failed=1; \
+	@export SKYTETHER_TEST_IMAGES=skytether-test-$$$$/; trap '.ci/remove-images "$$SKYTETHER_TEST_IMAGES"' EXIT; \
+		failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine slow-others || failed=1; \
 		echo "The other slow tests, one at a time ..."; $(SLOW) and not together and not kubernetes" || failed=1; \
 		echo "A cluster, for the tests that need one ..."; $(MAKE) --no-print-directory slow-kubernetes || failed=1; exit $$failed
 
-slow-engine-ros1: $(READY)
-	$(SLOW) and together and not kubernetes and (docker or ros1)"
+slow-engine: $(READY)
+	$(SLOW) and together and not kubernetes and docker"
 
 slow-kubernetes: $(READY)
 	$(SLOW) and kubernetes"
 
 slow-others: $(READY)
-	$(SLOW) and together and not docker and not ros1"
+	$(SLOW) and together and not docker and not kubernetes"
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile

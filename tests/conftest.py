@@ -385,22 +385,26 @@ def compose_programs() -> None:
 
 @pytest.fixture(scope="session")
 def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Images]:
-    """The base image, the network's guard, one service and the toy, built from this very code."""
+    """The base image, the network's guard, one service and the toy, built from this very code.
+
+    ``SKYTETHER_TEST_IMAGES`` names what they begin with, if several runs are to share them: nobody removes them then.
+    """
     from docker_site import TOY, Images, build
 
-    prefix = f"skytether-test-{secrets.token_hex(4)}/"
+    shared = os.environ.get("SKYTETHER_TEST_IMAGES", "")
+    images = Images(shared or f"skytether-test-{secrets.token_hex(4)}/", [], kept=bool(shared))
     names = ["base", "guard", "virtual-trail"]
     try:
-        images = Images(prefix, build(prefix, *names))
+        images.rows.extend(build(images.prefix, *names))
         folder = tmp_path_factory.mktemp("toy")
         (folder / "Dockerfile").write_text(TOY)
         command = ["docker", "build", "-q", "-t", images.toy, "--build-arg", f"BASE={images.name('base')}", str(folder)]
         subprocess.run(command, check=True, capture_output=True, env={**os.environ, "DOCKER_BUILDKIT": "0"})
         yield images
     finally:
-        made = [f"{prefix}{name}:1" for name in ("toy", *reversed(names))]
-        subprocess.run(["docker", "image", "rm", "-f", *made], capture_output=True)
-        subprocess.run(["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True)
+        images.remove("toy", *reversed(names))
+        if not shared:
+            subprocess.run(["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True)
 
 
 @pytest.fixture(scope="session")

@@ -109,7 +109,8 @@ def stack(compose_programs: None, docker_images: Images) -> Iterator[Stack]:
         yield stack
     finally:
         stack.compose("down", "--volumes", "--timeout", "2")
-        run("docker", "image", "rm", "-f", stand_in, docker_images.name("orchestrator"))
+        run("docker", "image", "rm", "-f", stand_in)
+        docker_images.remove("orchestrator")
 
 
 @pytest.mark.parametrize("service", STARTED)

@@ -28,11 +28,12 @@ def build(prefix: str, *names: str) -> list[dict[str, object]]:
 
 @dataclass(frozen=True)
 class Images:
-    """The images of one run of the tests, removed at its end."""
+    """The images of one run of the tests, removed at its end, unless the next run is to have them."""
 
     prefix: str
     rows: list[dict[str, object]]
     """What ``images/build.py --json`` told of them."""
+    kept: bool = False
 
     @property
     def toy(self) -> str:
@@ -50,7 +51,12 @@ class Images:
             return
         build(self.prefix, image)
         yield self.name(image)
-        subprocess.run(["docker", "image", "rm", "-f", self.name(image)], capture_output=True)
+        self.remove(image)
+
+    def remove(self, *images: str) -> None:
+        """Remove them from the engine, with the layers that are nobody else's."""
+        if not self.kept:
+            subprocess.run(["docker", "image", "rm", "-f", *map(self.name, images)], capture_output=True)
 
 
 TOY = """\
