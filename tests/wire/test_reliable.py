@@ -17,7 +17,6 @@ from skytether.wire.control import (
     push_forward,
     push_missing,
 )
-from skytether.wire.epoch import SendTopic
 from skytether.wire.fragment import shape_for
 from skytether.wire.measure import Outbound
 from skytether.wire.packet import SHARD_AT, pull_header, push_common
@@ -49,7 +48,7 @@ def test_control_messages_travel_in_a_packet(ack, missing, forward):
 def outbox(**options):
     topic = Topic("t", "a/b", Direction.IN, **{"lifespan": 10.0, "depth": 5000, "reliable": True, **options})
     box = Outbox(topic, Outbound(), RoundTrip())
-    box.start_epoch(SendTopic(1, topic, box.counters), 0.0, newcomer=True)
+    box.start_epoch(1, topic, box.counters, 0.0, newcomer=True)
     return box
 
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING
 
 from .ciphers import Ciphers
 from .config import MAX_REKEY_BYTES
 from .measure import Inbound, Outbound, SequenceTracker
+from .reliable import Inbox, Outbox
 from .replay import PacketWindow, ReplayWindow
 from .topic import Direction, PathUse, Topic
-
-if TYPE_CHECKING:
-    from .reliable import Inbox, Outbox
 
 CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)
 """Pings, reports and goodbye: sealed and numbered like a topic, both ways."""

@@ -16,7 +16,6 @@ from collections import deque
 
 from .compression import original_size
 from .control import Ack
-from .epoch import SendTopic
 from .measure import Outbound
 from .parcel import Parcel
 from .reassembly import Entry
@@ -78,14 +77,14 @@ class Outbox:
 
     __slots__ = (
         "_again", "_flying", "_flying_bytes", "_kept", "_next", "_round_trip", "_timers", "_waiting", "_waiting_bytes",
-        "counters", "forward_at", "queued", "send", "topic",
+        "counters", "forward_at", "index", "queued", "topic",
     )  # fmt: skip
 
     def __init__(self, topic: Topic, counters: Outbound, round_trip: RoundTrip) -> None:
         self.topic = topic
         self.counters = counters
-        self.send: SendTopic | None = None
-        """Of the epoch in use; None while there is none, or the peer does not take the topic."""
+        self.index: int | None = None
+        """Of the topic, in the epoch in use; None while there is none, or the peer does not take the topic."""
         self.queued = False
         """Whether the send queue has it."""
         self.forward_at = math.inf
@@ -113,7 +112,7 @@ class Outbox:
     @property
     def ready(self) -> bool:
         """Whether `next` has something."""
-        return self.send is not None and bool(self._again or (self._waiting and self._room()))
+        return self.index is not None and bool(self._again or (self._waiting and self._room()))
 
     @property
     def used(self) -> int:
@@ -164,19 +163,23 @@ class Outbox:
         self._waiting_bytes += len(payload)
         return True
 
-    def start_epoch(self, send: SendTopic | None, now: float, newcomer: bool) -> None:
-        """Other keys are in use, or none: everything is sealed and sent anew, with the numbers that it had.
+    def pause(self) -> None:
+        """No keys are in use, or the peer does not take the topic: the messages have to wait."""
+        self.index = None
+        self.queued = False
+
+    def start_epoch(self, index: int, topic: Topic, counters: Outbound, now: float, newcomer: bool) -> None:
+        """Other keys are in use: everything is sealed and sent anew, with the numbers that it had.
 
         Args:
-            send: The topic in the new epoch; None while the messages have to wait.
+            index: Of the topic in the new epoch.
+            topic: Its row, as agreed.
+            counters: Its counters.
             now: Time.
             newcomer: Whether the peer is another one than before.
         """
-        self.send = send
+        self.index, self.topic, self.counters = index, topic, counters
         self.queued = False
-        if send is None:
-            return
-        self.topic, self.counters = send.topic, send.counters
         if newcomer and self._kept is not None and not self._flying and not self._waiting:
             self._flying[self._kept.sequence] = self._kept
             self._flying_bytes += len(self._kept.payload)
@@ -273,7 +276,7 @@ class Outbox:
         if now < self.forward_at:
             return False
         self.forward_at = now + self._round_trip.wait(1)
-        return self.send is not None
+        return self.index is not None
 
     def _remind(self, letter: Letter, now: float) -> None:
         letter.due = math.inf

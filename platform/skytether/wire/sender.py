@@ -267,7 +267,7 @@ class Sender:
     def _send_letter(self, epoch: Epoch, outbox: Outbox, lane: Lane, batches: Batches, now: float) -> int:
         """The next of a reliable topic: seal it, or go on with the shards of a large one. Returns bytes sent."""
         outbox.queued = False
-        letter, topic = outbox.next(now), outbox.send
+        letter, topic = outbox.next(now), epoch.send.get(outbox.topic.name)
         if outbox.ready:
             self.put_outbox(outbox)
         if letter is None or topic is None:

@@ -67,7 +67,7 @@ class Streams:
         """
         for outbox in self._outboxes.values():
             if epoch is None or outbox.topic.name not in epoch.send:
-                outbox.start_epoch(None, now, newcomer=False)
+                outbox.pause()
         self._owing.clear()  # without these keys nothing can be acknowledged; what is missed is sent again
         if epoch is None:
             return False
@@ -88,7 +88,7 @@ class Streams:
         for name, send in sending.items():
             send.outbox = outbox = self._outboxes.get(name) or Outbox(send.topic, send.counters, self.round_trip)
             self._outboxes[name] = outbox
-            outbox.start_epoch(send, now, newcomer)
+            outbox.start_epoch(send.index, send.topic, send.counters, now, newcomer)
             self._stir(outbox)
         return restarted
 
@@ -122,8 +122,8 @@ class Streams:
         for outbox in list(self._busy):
             if outbox.due <= now:
                 outbox.handle_timer(now)
-                if outbox.forwarding(now) and outbox.send is not None:
-                    yield push_forward(Forward(outbox.send.index, outbox.base))
+                if outbox.forwarding(now) and outbox.index is not None:
+                    yield push_forward(Forward(outbox.index, outbox.base))
             self._stir(outbox)
         for inbox in [i for i in self._owing if i.due <= now]:
             self._owing.discard(inbox)
