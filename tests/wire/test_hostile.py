@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Role, packet
-from skytether.wire.sender import OVERHEAD
+from skytether.wire.plaintext import OVERHEAD
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 SESSION_ID = 0x1122334455667788

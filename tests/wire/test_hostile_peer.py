@@ -10,7 +10,7 @@ from skytether.wire import Role, control, packet
 from skytether.wire.ciphers import HandshakeTags
 from skytether.wire.message import Message
 from skytether.wire.paths import MAX_PATHS
-from skytether.wire.sender import INNER
+from skytether.wire.plaintext import INNER
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 

@@ -21,7 +21,8 @@ from skytether.wire.fragment import shape_for
 from skytether.wire.measure import Outbound
 from skytether.wire.packet import SHARD_AT, pull_header, push_common
 from skytether.wire.parcel import Parcel
-from skytether.wire.reliable import PREFIX, WINDOW, WINDOW_BYTES, Inbox, Outbox
+from skytether.wire.plaintext import PREFIX
+from skytether.wire.reliable import WINDOW, WINDOW_BYTES, Inbox, Outbox
 from skytether.wire.retransmit import FIRST, LONGEST, RoundTrip
 from skytether.wire.tags import SECRET_SIZE, Tags
 from skytether.wire.topic import Direction, Topic

@@ -7,9 +7,8 @@ import hmac
 import numpy as np
 
 from . import crypto
-from .fragment import Tagger
 from .packet import HEADER_SIZE, NONCE_AT, SHARD_AT, TAG_SIZE, TIME_AT
-from .tags import SECRET_SIZE, Bools, Rows, Tags, Words
+from .tags import SECRET_SIZE, Bools, Rows, Tagger, Tags, Words
 
 _PAD = bytes(12 - (TIME_AT - NONCE_AT))
 _NUMBER_SIZE = 12

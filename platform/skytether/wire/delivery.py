@@ -14,7 +14,7 @@ from .compression import FLAG, Packed, decompress, unpacked_size
 from .control import Forward
 from .epoch import Epoch, ReceiveTopic
 from .events import Event, MessageReceived
-from .sender import INNER
+from .plaintext import INNER
 
 COPY_BELOW = 4096
 """Payloads up to this size are handed over as bytes, larger ones as a view that saves the copy."""

@@ -8,29 +8,18 @@ two numbers. Parity is that of `reed_solomon`.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from .packet import COMMON_SIZE, HEADER_SIZE, INDEX_AT, NUMBER_AT, SHARD_AT, TIME_AT
 from .reed_solomon import Bytes, encode
+from .tags import Tagger, Words
 
 Positions = npt.NDArray[np.intp]
 """Of data shards in their message."""
-Sums = npt.NDArray[np.uint64]
 AHEAD = 64
 """Shards hashed at a time: many at once cost less each, and nothing waits long for them."""
-
-
-class Tagger(Protocol):
-    """Makes the tags of packets, one in each row."""
-
-    def sums(self, heads: Bytes, shards: Bytes) -> Sums | None:
-        """What can be known of them before they are sent: of their headers up to the block, and their shards."""
-
-    def put(self, rows: Bytes, sums: Sums | None = None) -> None:
-        """Write them in their place, with the `sums` of these packets or without."""
 
 
 BLOCK_SHARDS = 100
@@ -136,7 +125,7 @@ class Shards:
         self._tails = _order(shape.shards, parity)
         self._parity: dict[tuple[int, int], bytes] = {}
         self._sent = 0
-        self._sums: Sums | None = None
+        self._sums: Words | None = None
         """Of data shards."""
         self._summed = 0
         """Of how many."""
@@ -188,7 +177,7 @@ class Shards:
         self.tagger.put(rows, None if sums is None else sums[positions])
         return rows.reshape(-1).data
 
-    def _sums_of(self, start: int, end: int) -> Sums | None:
+    def _sums_of(self, start: int, end: int) -> Words | None:
         """Of these data shards."""
         first = self._summed
         if end > first:

@@ -10,9 +10,10 @@ import numpy as np
 
 from .ciphers import Ciphers
 from .crypto import TAG_SIZE
-from .fragment import Shape, Shards, Tagger, shape_for
+from .fragment import Shape, Shards, shape_for
 from .packet import DATA, SHARD, push_common, push_shard
 from .packet import TAG_SIZE as SHARD_TAG_SIZE
+from .tags import Tagger
 
 
 class Message:

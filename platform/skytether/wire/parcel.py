@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .fragment import Positions, Shape, Shards, Tagger
+from .fragment import Positions, Shape, Shards
+from .tags import Tagger
 
 
 class Parcel(Shards):

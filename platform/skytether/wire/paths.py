@@ -19,8 +19,8 @@ from .liveness import HURRY, Health
 from .mtu import SMALL
 from .packet import HEADER_SIZE
 from .path import Path
+from .plaintext import INNER
 from .seeker import patience
-from .sender import INNER
 from .stats import PathStats
 
 MAX_PATHS = 8

@@ -34,10 +34,9 @@ from .packet import (
     pull_packets,
 )
 from .path import Path
+from .plaintext import INNER, OVERHEAD, PREFIX
 from .reassembly import Entry, Reassembly
-from .reliable import PREFIX
 from .replay import Seen
-from .sender import INNER, OVERHEAD
 
 FAR_AHEAD = 65_536
 """An incomplete message whose number is further than this above the highest authentic one is refused."""

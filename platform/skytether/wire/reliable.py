@@ -11,19 +11,17 @@ from __future__ import annotations
 
 import heapq
 import math
-import struct
 from collections import deque
 
 from .compression import original_size
 from .control import Ack
 from .measure import Outbound
 from .parcel import Parcel
+from .plaintext import PREFIX
 from .reassembly import Entry
 from .retransmit import ACK_DELAY, RoundTrip
 from .topic import Topic
 
-PREFIX = struct.Struct(">QI")
-"""Sequence number; how far below it the lowest number is that the sender has not given up."""
 WINDOW = 1024
 """Messages of a topic that may be under way; an acknowledgement has a bit for each."""
 WINDOW_BYTES = 2**20
@@ -322,7 +320,7 @@ class Outbox:
 
 
 Delivery = tuple[int, int, bytes]
-"""Sequence number, time of publishing as it came (`sender.INNER`), payload."""
+"""Sequence number, time of publishing as it came (`plaintext.INNER`), payload."""
 
 
 class Inbox:

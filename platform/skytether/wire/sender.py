@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import heapq
 import math
-import struct
 from collections import deque
 from collections.abc import Callable, Container, Hashable, Iterable
 from functools import partial
 
-from .compression import FLAG, Compressed, original_size
+from .compression import original_size
 from .config import Config
-from .crypto import TAG_SIZE
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
 from .fragment import Shards, encode_sealed
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
@@ -25,14 +23,11 @@ from .message import LoneShard, Message
 from .packet import SHARD_AT, ticks
 from .parcel import Parcel
 from .path import Path, Transmit
+from .plaintext import push_inner
 from .queue import SendQueue
 from .redundancy import Copies
 from .reliable import NUMBER_SPAN, Outbox
 
-INNER = struct.Struct(">IQ")
-"""Start of the plaintext: topic sequence, time of publishing in microseconds of the sender's clock with the highest
-bit set if the payload is compressed."""
-OVERHEAD = INNER.size + TAG_SIZE
 NO_WAVES = Copies(0, 0.0)
 MAX_ASTRAY = 16
 """Packets to unproven addresses that may wait for the socket."""
@@ -281,7 +276,7 @@ class Sender:
             parcel.cancel()
             parcel = letter.parcel = None
         if parcel is None:
-            plaintext = _inner(letter.sequence, letter.published_at, letter.payload)
+            plaintext = push_inner(letter.sequence, letter.published_at, letter.payload)
             plaintext += outbox.prefix(letter) + letter.payload
             message = self._number(epoch, topic, plaintext)
             if message.size <= lane.room:
@@ -297,7 +292,7 @@ class Sender:
 
     def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> Message:
         """A topic's next message."""
-        plaintext = _inner(topic.sequence, published_at, payload) + payload
+        plaintext = push_inner(topic.sequence, published_at, payload) + payload
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         counters = topic.counters
         counters.sent += 1
@@ -359,9 +354,3 @@ class Sender:
 def _control() -> SendTopic:
     """What an epoch's control messages are sent as; nobody reads their counters."""
     return SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
-
-
-def _inner(sequence: int, published_at: float, payload: bytes) -> bytes:
-    """Start of a plaintext."""
-    flag = FLAG if isinstance(payload, Compressed) else 0
-    return INNER.pack(sequence & 0xFFFFFFFF, int(published_at * 1e6) | flag)

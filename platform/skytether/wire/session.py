@@ -20,13 +20,14 @@ from .handshake import Doorkeeper
 from .ledger import Ledger
 from .path import Path, Transmit
 from .paths import Choice, Paths
+from .plaintext import INNER
 from .receiver import Receiver
 from .seeker import Seeker
-from .sender import INNER, Sender
+from .sender import Sender
 from .stats import SessionStats
 from .streams import Streams
-from .table import ANY, index_topics
-from .topic import Role, Topic
+from .table import index_topics
+from .topic import ANY, Role, Topic
 
 GOODBYES = 3
 """Nobody asks for a lost goodbye."""

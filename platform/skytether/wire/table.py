@@ -14,10 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from .topic import Direction, PathUse, Topic
+from .topic import ANY, Direction, PathUse, Topic
 
-ANY = "*"
-"""Name and type of a service's row that takes every topic the robot offers."""
 MAX_TOPICS = 65_535
 MAX_TEXT = 4 * 2**20
 """Bytes of a table before compression: more than 10,000 topics."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hmac
 import struct
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -68,6 +68,16 @@ class _Plan(NamedTuple):
     blocks: memoryview
     made: memoryview
     tags: Words
+
+
+class Tagger(Protocol):
+    """Makes the tags of packets, one in each row."""
+
+    def sums(self, heads: Rows, shards: Rows) -> Words | None:
+        """What can be known of them before they are sent: of their headers up to the block, and their shards."""
+
+    def put(self, rows: Rows, sums: Words | None = None) -> None:
+        """Write them in their place, with the `sums` of these packets or without."""
 
 
 class Tags:

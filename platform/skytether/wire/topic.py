@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+ANY = "*"
+"""Name and type of a service's row that takes every topic the robot offers."""
 MAX_PRIORITY = 127
 COMPRESSIONS = ("", "zstd")
 

@@ -23,8 +23,7 @@ from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as TF_STATIC
 from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
-from skytether.wire.table import ANY
-from skytether.wire.topic import Direction, Role, Topic
+from skytether.wire.topic import ANY, Direction, Role, Topic
 
 from .master import MasterError, RefusedError
 from .node import Node

@@ -18,8 +18,7 @@ from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
-from skytether.wire.table import ANY
-from skytether.wire.topic import Role, Topic
+from skytether.wire.topic import ANY, Role, Topic
 
 from .dialect import Endpoint, Kind
 from .endpoints import Client, Handle, Publication
