@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.wire import Direction, Topic
+from skytether.wire.counters import Outbound
 from skytether.wire.epoch import SendTopic
-from skytether.wire.measure import Outbound
 from skytether.wire.queue import SendQueue
 
 

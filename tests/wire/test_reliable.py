@@ -17,8 +17,8 @@ from skytether.wire.control import (
     push_forward,
     push_missing,
 )
+from skytether.wire.counters import Outbound
 from skytether.wire.fragment import shape_for
-from skytether.wire.measure import Outbound
 from skytether.wire.packet import SHARD_AT, pull_header, push_common
 from skytether.wire.parcel import Parcel
 from skytether.wire.plaintext import PREFIX

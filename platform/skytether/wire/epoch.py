@@ -7,9 +7,10 @@ from collections import deque
 
 from .ciphers import Ciphers
 from .config import MAX_REKEY_BYTES
-from .measure import Inbound, Outbound, SequenceTracker
+from .counters import Inbound, Outbound
 from .reliable import Inbox, Outbox
 from .replay import PacketWindow, ReplayWindow
+from .sequence import SequenceTracker
 from .topic import Direction, PathUse, Topic
 
 CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from .control import ReceiverRow, Report, SenderRow
+from .counters import Inbound, Outbound
 from .epoch import Epoch, ReceiveTopic, SendTopic
-from .measure import Inbound, Outbound
 from .stats import TopicStats
 from .topic import Role, Topic
 

@@ -15,9 +15,9 @@ from .claims import Claims
 from .config import Config
 from .congestion import RateControl
 from .control import MOST_ASTRAY, MOST_RUN, Feedback
+from .histogram import Histogram
 from .liveness import Liveness
 from .loss import LossEstimate, Sums
-from .measure import Histogram
 from .mtu import MtuSearch
 from .pacer import Pacer
 from .redundancy import Redundancy

@@ -15,7 +15,7 @@ from collections import deque
 
 from .compression import original_size
 from .control import Ack
-from .measure import Outbound
+from .counters import Outbound
 from .parcel import Parcel
 from .plaintext import PREFIX
 from .reassembly import Entry

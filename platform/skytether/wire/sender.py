@@ -15,10 +15,10 @@ from functools import partial
 
 from .compression import original_size
 from .config import Config
+from .counters import Outbound
 from .epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
 from .fragment import Shards, encode_sealed
 from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
-from .measure import Outbound
 from .message import LoneShard, Message
 from .packet import SHARD_AT, ticks
 from .parcel import Parcel
