@@ -6,7 +6,8 @@ import socket
 import pytest
 
 from skytether.bridge.datagrams import DatagramSocket
-from skytether.wire import Config, Session, packet
+from skytether.wire import Config, Session
+from skytether.wire.codec import packet
 from skytether.wire.events import Connected, Disconnected, PeerMoved
 from skytether.wire.topic import Role
 

@@ -16,9 +16,10 @@ from random import Random
 import numpy as np
 
 from skytether.bridge.relay_table import AMPLIFICATION, Prefix, RelayLimits, RelayTable, same_session
-from skytether.wire import Config, Direction, Role, Session, Topic, control, packet
-from skytether.wire.fragment import MAX_SHARDS
-from skytether.wire.handshake import (
+from skytether.wire import Config, Direction, Role, Session, Topic
+from skytether.wire.codec import control, packet
+from skytether.wire.codec.table import MAX_TOPICS, index_topics, pull_answer, pull_offer
+from skytether.wire.connect.handshake import (
     _HELLO,
     _WELCOME,
     LIFE_SIZE,
@@ -31,10 +32,10 @@ from skytether.wire.handshake import (
     _key,
     _pack,
 )
-from skytether.wire.message import Message
-from skytether.wire.reassembly import Reassembly
-from skytether.wire.receiver import Receiver
-from skytether.wire.table import MAX_TOPICS, index_topics, pull_answer, pull_offer
+from skytether.wire.fec.fragment import MAX_SHARDS
+from skytether.wire.fec.reassembly import Reassembly
+from skytether.wire.receive.receiver import Receiver
+from skytether.wire.send.message import Message
 
 KEY = bytes(range(32))
 SESSION_ID = 0x1122334455667788

@@ -12,7 +12,7 @@ from skytether.cli.lab import app as cli
 from skytether.lab.bench import authentication
 from skytether.lab.bench.authentication import bench_authentication
 from skytether.lab.bench.pair import BenchError
-from skytether.wire.tags import Tags
+from skytether.wire.codec.tags import Tags
 
 
 def test_each_size_is_timed_and_its_tags_are_a_part(monkeypatch: pytest.MonkeyPatch) -> None:

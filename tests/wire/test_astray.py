@@ -5,7 +5,8 @@ from functools import partial
 import pytest
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Direction, PeerMoved, Role, Topic, packet
+from skytether.wire import Direction, PeerMoved, Role, Topic
+from skytether.wire.codec import packet
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 DELAY = LinkConditions(delay=0.02)

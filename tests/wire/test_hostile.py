@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Config, Role, packet
-from skytether.wire.plaintext import OVERHEAD
+from skytether.wire import Config, Role
+from skytether.wire.codec import packet
+from skytether.wire.codec.plaintext import OVERHEAD
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 SESSION_ID = 0x1122334455667788

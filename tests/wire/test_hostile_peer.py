@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Role, control, packet
-from skytether.wire.ciphers import HandshakeTags
-from skytether.wire.message import Message
-from skytether.wire.paths import MAX_PATHS
-from skytether.wire.plaintext import INNER
+from skytether.wire import Role
+from skytether.wire.codec import control, packet
+from skytether.wire.codec.ciphers import HandshakeTags
+from skytether.wire.codec.plaintext import INNER
+from skytether.wire.connect.paths import MAX_PATHS
+from skytether.wire.send.message import Message
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Config, Role, packet
+from skytether.wire import Config, Role
+from skytether.wire.codec import packet
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 DELAY = LinkConditions(delay=0.02)

@@ -5,8 +5,9 @@ from itertools import pairwise
 import pytest
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Config, Connected, Direction, Disconnected, Role, Topic, packet
-from skytether.wire.epoch import MAX_BYTES, Epoch
+from skytether.wire import Config, Connected, Direction, Disconnected, Role, Topic
+from skytether.wire.codec import packet
+from skytether.wire.state.epoch import MAX_BYTES, Epoch
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 LINK = {"up": LinkConditions(delay=0.03), "down": LinkConditions(delay=0.03)}

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Config, PeerMoved, Role, packet
+from skytether.wire import Config, PeerMoved, Role
+from skytether.wire.codec import packet
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Role
-from skytether.wire.clock import MAX_DRIFT
+from skytether.wire.measure.clock import MAX_DRIFT
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 MICRO = 2e-6

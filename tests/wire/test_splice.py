@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.lab.link_model import LinkConditions
-from skytether.wire import Config, Connected, Disconnected, Role, crypto, packet
+from skytether.wire import Config, Connected, Disconnected, Role
+from skytether.wire.codec import crypto, packet
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 OTHER = {ROBOT: SERVICE, SERVICE: ROBOT}

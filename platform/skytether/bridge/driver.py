@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, cast
 
-from skytether.wire import Session
+from skytether.wire import Session, Transmit
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived
-from skytether.wire.path import Transmit
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role, Topic
 

@@ -21,7 +21,7 @@ from dataclasses import replace
 from types import TracebackType
 
 from skytether.wire import Config, Session
-from skytether.wire.compression import compress
+from skytether.wire.codec.compression import compress
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
 

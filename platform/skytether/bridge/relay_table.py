@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from skytether.wire.packet import HEADER_SIZE, peek_id
+from skytether.wire.codec.packet import HEADER_SIZE, peek_id
 
 from .datagrams import Address
 

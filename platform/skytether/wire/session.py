@@ -6,27 +6,27 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Sequence
 
-from . import control
-from .ciphers import HandshakeTags
-from .compression import Compressed, compress
+from .codec import control
+from .codec.ciphers import HandshakeTags
+from .codec.compression import Compressed, compress
+from .codec.control import Forward, Goodbye, Ping, Report
+from .codec.crypto import KEY_SIZE, TAG_SIZE
+from .codec.plaintext import INNER
+from .codec.table import index_topics
 from .config import Config
-from .control import Forward, Goodbye, Ping, Report
-from .crypto import KEY_SIZE, TAG_SIZE
-from .delivery import Delivery
-from .epoch import Epoch
+from .connect.greeter import Greeter, Times
+from .connect.handshake import Doorkeeper
+from .connect.paths import Choice, Paths
+from .connect.seeker import Seeker
 from .events import Connected, Disconnected, Event, MessageReceived
-from .greeter import Greeter, Times
-from .handshake import Doorkeeper
-from .ledger import Ledger
-from .path import Path, Transmit
-from .paths import Choice, Paths
-from .plaintext import INNER
-from .receiver import Receiver
-from .seeker import Seeker
-from .sender import Sender
+from .path.path import Path, Transmit
+from .receive.delivery import Delivery
+from .receive.receiver import Receiver
+from .send.sender import Sender
+from .state.epoch import Epoch
+from .state.ledger import Ledger
+from .state.streams import Streams
 from .stats import SessionStats
-from .streams import Streams
-from .table import index_topics
 from .topic import ANY, Role, Topic
 
 GOODBYES = 3

@@ -14,9 +14,9 @@ from random import Random
 import numpy as np
 
 from skytether.wire import Config, Direction, MessageReceived, Role, Session, Topic
-from skytether.wire.crypto import KEY_SIZE, TAG_SIZE, Aead
-from skytether.wire.packet import DATA, HEADER_SIZE, SHARD
-from skytether.wire.tags import SECRET_SIZE, Tags
+from skytether.wire.codec.crypto import KEY_SIZE, TAG_SIZE, Aead
+from skytether.wire.codec.packet import DATA, HEADER_SIZE, SHARD
+from skytether.wire.codec.tags import SECRET_SIZE, Tags
 
 from .pair import BenchError
 

@@ -1,0 +1,196 @@
+"""The conversation around a handshake: what is said and answered, by which path, to which address (rule 1).
+
+The messages themselves are made and read in `handshake`, when to speak first is decided in `seeker`, and what new
+keys begin is the session's business.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Hashable
+
+from ..codec.ciphers import HandshakeTags
+from ..codec.packet import HELLO, SHARD_AT, WELCOME
+from ..config import MIN_MTU
+from ..events import Event, Refused
+from ..path.path import Path, Transmit
+from ..send.sender import Sender
+from ..state.epoch import Epoch
+from ..state.ledger import Ledger
+from .handshake import MAX_REASON, NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
+from .paths import Paths
+from .seeker import Seeker
+
+AMPLIFICATION = 3
+"""Bytes of an answer for each that was asked with, for nobody knows yet who asks."""
+MAX_RAW = 8
+"""Handshake messages waiting to be sent: answers to a flood of repeated HELLOs stop here."""
+
+Times = tuple[float, float, float]
+"""t1, t2, t3 in seconds, the first by the robot's clock."""
+
+
+class Greeter:
+    """Handshakes of one end, on its paths.
+
+    Args:
+        door: Of the service's end; None at the robot's.
+        seeker: Of the robot's end; the service's never speaks first.
+        paths: Where to send.
+        sender: Seals what is said under keys.
+        ledger: For the topics of a new epoch.
+        tags: Of handshake packets that this end sends.
+        events: Where refusals go.
+        rejected: Counters of what is refused.
+        welcomed: Called at the robot's end with the epoch that a handshake made, time stamps of that round trip (None
+            if nobody knows which HELLO was answered), and the time.
+    """
+
+    def __init__(
+        self,
+        door: Doorkeeper | None,
+        seeker: Seeker,
+        paths: Paths,
+        sender: Sender,
+        ledger: Ledger,
+        tags: HandshakeTags,
+        events: deque[Event],
+        rejected: Counter[str],
+        welcomed: Callable[[Epoch, Times | None, float], None],
+    ) -> None:
+        self._door = door
+        self._seeker = seeker
+        self._paths = paths
+        self._sender = sender
+        self._ledger = ledger
+        self._tags = tags
+        self._events = events
+        self._rejected = rejected
+        self._welcomed = welcomed
+        self._refusal = ""
+        """Latest reason told, so that it is told once."""
+        self.waiting: deque[Transmit] = deque()
+        """Packets on their way before everything else."""
+
+    def seek(self, epoch: Epoch | None, last_heard: float, now: float) -> None:
+        """The robot's end: ask for the service, or whether it still knows the keys in use."""
+        held = None if epoch is None else epoch.ciphers
+        hello = self._seeker.seek(held, last_heard, now)
+        if hello is not None:
+            for path in self._paths:
+                if path.peer is not None:
+                    self._send(hello.common, hello.message, path, path.peer)
+                if held is not None:
+                    self._paths.ping(path, now)
+
+    def take(
+        self,
+        kind: int,
+        common: bytes,
+        message: bytes,
+        path: int,
+        address: Hashable,
+        epoch: Epoch | None,
+        previous: Epoch | None,
+        now: float,
+    ) -> None:
+        """Take a complete, not yet authenticated handshake message.
+
+        Args:
+            kind: Type of its packets.
+            common: Common part of their header.
+            message: The message.
+            path: By which path it came.
+            address: From where.
+            epoch: Keys in use, if any.
+            previous: Those before, if still kept.
+            now: Time.
+        """
+        if kind == HELLO and self._door is not None:
+            self._on_hello(self._door, common, message, path, address, epoch, previous, now)
+        elif kind == WELCOME and self._seeker.hello is not None:
+            self._on_welcome(self._seeker.hello, common, message, path, now)
+        else:
+            self._rejected["unasked"] += 1
+
+    def done(self) -> None:
+        """New keys are in use."""
+        self._refusal = ""
+
+    def _on_hello(
+        self,
+        door: Doorkeeper,
+        common: bytes,
+        message: bytes,
+        path: int,
+        address: Hashable,
+        epoch: Epoch | None,
+        previous: Epoch | None,
+        now: float,
+    ) -> None:
+        held = NO_KEYS if epoch is None or epoch.spent else epoch.ciphers.resume
+        taken = {e.id for e in (epoch, previous) if e is not None}
+        answer = door.answer(common, message, held, taken, now)
+        if isinstance(answer, str):
+            self._rejected[answer] += 1
+        elif isinstance(answer, Resume):
+            for each in self._paths:
+                self._paths.ping_soon(each, now)
+            self._resume(path, address, now)
+        else:
+            if answer.outcome is not None and answer.epoch is None:
+                answer.epoch = self._make_epoch(answer.outcome)
+            if answer.reason:
+                self._refuse(answer.reason)
+            answer.asked(address)
+            most = AMPLIFICATION * len(message)
+            self._send(answer.common, answer.message, self._paths.choice.active, address, most)
+
+    def _on_welcome(self, hello: Hello, common: bytes, message: bytes, path: int, now: float) -> None:
+        welcome = hello.open(common, message)
+        if welcome is None:
+            self._rejected["welcome_forged"] += 1
+            return
+        if welcome.outcome is None:
+            self._refuse(welcome.reason)
+            self._seeker.refused(now)
+            return
+        sole = hello.sent == 1  # else nobody knows which one was answered, and the first ping will tell more
+        self._welcomed(self._make_epoch(welcome.outcome), welcome.times if sole else None, now)
+        came_by = self._paths.get(path)
+        if came_by is not None:
+            if came_by.peer is not None:  # it answers what was sent there, wherever the answer comes from
+                came_by.address = came_by.peer
+            if sole:
+                came_by.echo = welcome.times[2], now
+        for each in self._paths:
+            self._paths.ping(each, now)
+
+    def _resume(self, path: int, address: Hashable, now: float) -> None:
+        """Tell a robot that holds the keys, where it asks for them: that need not be where it was last heard."""
+        known = self._paths.get(path) or self._paths.choice.active
+        if address != known.address:
+            self._paths.ping_to(address, known, now)
+
+    def _refuse(self, reason: str) -> None:
+        reason = "".join(c if c.isprintable() else "?" for c in reason[:MAX_REASON])  # the peer's words, for a log
+        if reason != self._refusal:
+            self._refusal = reason
+            self._events.append(Refused(reason))
+
+    def _make_epoch(self, outcome: Outcome) -> Epoch:
+        send, receive = self._ledger.topics(outcome.topics)
+        return Epoch(outcome.epoch, outcome.ciphers, tuple(t for _, t in outcome.topics), send, receive, outcome.life)
+
+    def _send(self, common: bytes, message: bytes, path: Path, address: Hashable, most: float = math.inf) -> None:
+        """At most so many bytes: parity, which comes last, is left out first."""
+        if len(self.waiting) >= MAX_RAW:
+            return
+        packets, size = cut(common, message, MIN_MTU - SHARD_AT, path.redundancy.parity, self._tags)
+        if len(packets) > most:
+            packets = packets[: int(most // size) * size]
+        path.pacer.spend(len(packets))
+        path.packets_sent += -(-len(packets) // size)
+        path.bytes_sent += len(packets)
+        self.waiting.append(Transmit(path.id, address, packets, size if len(packets) > size else None))

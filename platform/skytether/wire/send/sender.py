@@ -1,0 +1,356 @@
+"""The sending half of a session: queue -> seal -> shards -> paced batches.
+
+A message is sealed when it leaves the queue; what was replaced or expired before has no sequence number. Large
+messages that are on their way form a stack: a higher priority interrupts a lower one after its burst. The active path
+empties the queue; what it has sealed may go by another one too (rule 8).
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Callable, Container, Hashable, Iterable
+from functools import partial
+
+from ..codec.compression import original_size
+from ..codec.packet import SHARD_AT, ticks
+from ..codec.plaintext import push_inner
+from ..config import Config
+from ..fec.fragment import Shards, encode_sealed
+from ..fec.redundancy import Copies
+from ..measure.counters import Outbound
+from ..path.path import Path, Transmit
+from ..reliable.parcel import Parcel
+from ..reliable.reliable import NUMBER_SPAN, Outbox
+from ..state.epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
+from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
+from .message import LoneShard, Message
+from .queue import SendQueue
+
+NO_WAVES = Copies(0, 0.0)
+MAX_ASTRAY = 16
+"""Packets to unproven addresses that may wait for the socket."""
+MAX_BATCH = 65_507
+"""Bytes of such a batch: it is one IP packet to the kernel until it is cut."""
+
+
+class Sender:
+    """Sends on the paths that `use` names.
+
+    Args:
+        config: Settings.
+        path: The only one at first.
+    """
+
+    def __init__(self, config: Config, path: Path) -> None:
+        self._config = config
+        self.epoch: Epoch | None = None
+        self._control = _control()
+        self._lanes = {path.id: Lane(path, config.queue_limit)}
+        self._active = self._lanes[path.id]
+        self._other: Lane | None = None
+        self._doubled = False
+        self.astray: deque[Transmit] = deque()
+        """Packets to other addresses than those of their paths."""
+
+    @property
+    def queue(self) -> SendQueue[Copy | Outbox]:
+        """Messages that are not sealed yet."""
+        return self._active.queue
+
+    def use(self, paths: Iterable[Path], active: Path, other: Path | None, doubled: bool, now: float) -> None:
+        """Send on these from now on.
+
+        Args:
+            paths: All there are; what waits for any other is dropped.
+            active: By which messages go.
+            other: By which copies go, and topics that ask for two paths; None if there is none.
+            doubled: Whether everything goes by both.
+            now: Time.
+        """
+        before, already = self._active, self._doubled
+        self._lanes = {p.id: self._lane(p) for p in paths}
+        self._active = self._lanes[active.id]
+        self._other = self._lanes[other.id] if other is not None else None
+        self._doubled = doubled
+        if self._active is not before:
+            before.queue, self._active.queue = self._active.queue, before.queue
+            before.land_parcels(now)
+            if not already:
+                before.repeat(self._active, before.path.liveness.confirmed_at, now)
+        elif self._other is not None and doubled and not already:
+            before.repeat(self._other, before.path.liveness.confirmed_at, now)
+
+    def start_epoch(self, epoch: Epoch | None) -> None:
+        """Use other keys from now on; what was queued or under way for the old ones is dropped."""
+        for lane in self._lanes.values():
+            lane.clear()
+        self.astray.clear()
+        self.epoch = epoch
+        self._control = _control()
+
+    def change_keys(self, epoch: Epoch) -> None:
+        """Seal with other keys from now on; what was sealed before is sent as it is."""
+        self.epoch = epoch
+
+    def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
+        """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
+        self._active.queue.put(topic, payload, published_at, extra)
+
+    def put_outbox(self, outbox: Outbox) -> None:
+        """Queue a reliable topic that has something to send."""
+        outbox.queued = True
+        self._active.queue.put_other(outbox.topic.priority, outbox)
+
+    def tell(self, message: bytes, now: float) -> None:
+        """Queue a control message, once: the next one of its kind makes up for its loss."""
+        self.put(self._control, message, now, extra=0)
+
+    def say(self, path: Path, message: bytes, now: float) -> None:
+        """Send a control message of one packet by that path, once and at once, however large the packet."""
+        packet = self._packet(message, path, path.number, now)
+        if packet is not None:
+            self._lane(path).say(packet)
+
+    def say_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
+        """The same to some address, which need not be the path's; returns its bytes, 0 if it cannot be sent."""
+        number = partial(path.number_astray, now)
+        packet = self._packet(message, path, number, now) if len(self.astray) < MAX_ASTRAY else None
+        if packet is None:
+            return 0
+        path.bytes_sent += len(packet)
+        self.astray.append(Transmit(path.id, address, packet, None))
+        return len(packet)
+
+    def repeat(self, path: Path, since: float, now: float) -> None:
+        """The peer moved: send again what went where it was not any more, of topics that ask for every effort."""
+        lane = self._lane(path)
+        lane.repeat(lane, since, now)
+
+    def _packet(self, message: bytes, path: Path, number: Callable[[], int], now: float) -> bytes | None:
+        """Seal a control message of one packet, which gets that number; None if there are no keys."""
+        epoch, topic = self.epoch, self._control
+        if epoch is None or epoch.spent:
+            return None
+        packet = self._next(epoch, topic, message, now).packet(path.id, number(), ticks(now))
+        topic.counters.bytes_sent += len(packet)
+        return packet
+
+    def _lane(self, path: Path) -> Lane:
+        lane = self._lanes.get(path.id)
+        if lane is None or lane.path is not path:
+            lane = self._lanes[path.id] = Lane(path, self._config.queue_limit)
+        return lane
+
+    def next_timer(self, full: Container[int] = ()) -> float:
+        """When `transmit` will have something to send by paths not ``full``; 0 for at once, inf for never."""
+        due = math.inf
+        if self.epoch is not None and self.epoch.spent:
+            return due
+        for lane in self._lanes.values():
+            path = lane.path
+            if path.address is not None and path.id not in full:
+                due = min(due, lane.next_timer())
+        return due
+
+    def transmit(self, path: Path, now: float) -> list[Transmit]:
+        """What may be sent now, at most a burst."""
+        epoch, address = self.epoch, path.address
+        if epoch is None or address is None or epoch.spent:
+            return []
+        lane = self._lane(path)
+        queue, flights, copies = lane.queue, lane.flights, lane.copies
+        lane.wake = math.inf
+        if not (queue or flights or lane.urgent or (copies and copies[0].due <= now)):
+            return []
+        while copies and copies[0].due <= now:
+            copy = heapq.heappop(copies)
+            queue.put_other(copy.topic.priority, copy)
+        pacer = path.pacer
+        left = min(pacer.budget(now), self._config.burst)
+        batches = Batches(path.id, address)
+        for packet in lane.urgent:
+            batches.add(packet)
+            left -= len(packet)
+            path.bytes_sent += len(packet)
+            epoch.bytes_sent += len(packet)
+            pacer.spend(len(packet))
+        lane.urgent.clear()
+        while (priority := queue.priority) >= 0 or flights:
+            if flights and flights[-1].topic.priority >= priority:
+                flight = flights[-1]
+                shards = flight.shards
+                if flight.deadline < now:
+                    flights.pop()
+                    flight.topic.counters.expired += 1
+                    continue
+                if not shards.remaining:  # delivered or given up meanwhile
+                    flights.pop()
+                    shards.land(now)
+                    continue
+                size = shards.packet_size
+                need = min(shards.remaining * size, max(size, pacer.quantum // size * size))
+                if left < need:
+                    lane.wake = pacer.ready_at(need)
+                    break
+                path.large = True
+                flight.sent_at = now
+                count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
+                counters = flight.topic.counters
+                counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
+                batches.add_run(shards.take(count, path.id, path.number(count), ticks(now)), size)
+                shards.sent(count, now)
+                sent = count * size
+                counters.bytes_sent += sent
+                if not shards.remaining:
+                    flights.pop()
+                    shards.land(now)
+            elif left <= 0 and priority < CONTROL_PRIORITY:
+                lane.wake = pacer.ready_at(1)
+                break
+            else:
+                item = queue.pop(now)
+                if isinstance(item, Copy):
+                    sent = self._send_copy(item, lane, batches, now)
+                elif isinstance(item, Outbox):
+                    sent = self._send_letter(epoch, item, lane, batches, now)
+                elif item is not None:
+                    sent = self._send_first(epoch, *item, lane, batches, now)
+                else:
+                    continue
+            left -= sent
+            path.bytes_sent += sent
+            epoch.bytes_sent += sent
+            pacer.spend(sent)
+        batches.flush()
+        return batches.done
+
+    def _send_first(
+        self,
+        epoch: Epoch,
+        topic: SendTopic,
+        payload: bytes,
+        published_at: float,
+        extra: int | None,
+        lane: Lane,
+        batches: Batches,
+        now: float,
+    ) -> int:
+        """Seal a message; send it if it is one shard, else put it on top of the flights. Returns bytes sent."""
+        message = self._next(epoch, topic, payload, published_at)
+        if message.size <= lane.room:
+            return self._send_small(topic, message, published_at + topic.lifespan, extra, lane, batches, now)
+        common, sealed, shape = message.seal(lane.shard_room)
+        tagger = message.ciphers.tagger
+        redundancy, k, deadline = lane.path.redundancy, shape.block_k(0), now + topic.lifespan
+        waves = redundancy.waves(k, topic.delivery, topic.lifespan) if shape.blocks == 1 else NO_WAVES
+        parity = 0 if waves.more else redundancy.parity(k, shape.blocks, topic.delivery)
+        rows = range(k, k + k * waves.more)
+        for row, shard in zip(rows, encode_sealed(sealed, shape, rows), strict=True):
+            due = now + (row // k) * waves.spacing
+            lone = LoneShard(common, row, shard, tagger)
+            heapq.heappush(lane.copies, Copy(topic, lone, 1, waves.spacing, due, deadline))
+        flight = Flight(topic, Shards(common, sealed, shape, parity, tagger), deadline)
+        lane.flights.append(flight)
+        if self._other is not None or topic.redundant:
+            lane.remember(flight, now)
+        if self._other is not None and (self._doubled or topic.redundant):
+            self._other.take(flight, now)
+        return 0
+
+    def _send_letter(self, epoch: Epoch, outbox: Outbox, lane: Lane, batches: Batches, now: float) -> int:
+        """The next of a reliable topic: seal it, or go on with the shards of a large one. Returns bytes sent."""
+        outbox.queued = False
+        letter, topic = outbox.next(now), epoch.send.get(outbox.topic.name)
+        if outbox.ready:
+            self.put_outbox(outbox)
+        if letter is None or topic is None:
+            return 0
+        parcel = letter.parcel
+        if parcel is not None and (
+            parcel.number + NUMBER_SPAN < epoch.next_number
+            or parcel.packet_size > lane.shard_room + SHARD_AT
+            or (parcel.tagger is not epoch.ciphers.tagger and not parcel.flying)
+        ):
+            parcel.cancel()
+            parcel = letter.parcel = None
+        if parcel is None:
+            plaintext = push_inner(letter.sequence, letter.published_at, letter.payload)
+            plaintext += outbox.prefix(letter) + letter.payload
+            message = self._number(epoch, topic, plaintext)
+            if message.size <= lane.room:
+                outbox.sent(letter, now)
+                return self._send_small(topic, message, letter.deadline, None, lane, batches, now)
+            landed = partial(outbox.landed, letter)
+            sealed = message.seal(lane.shard_room)
+            parcel = letter.parcel = Parcel(message.number, *sealed, message.ciphers.tagger, landed)
+        if not parcel.flying:
+            parcel.flying = True
+            lane.flights.append(Flight(topic, parcel, math.inf))
+        return 0
+
+    def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> Message:
+        """A topic's next message."""
+        plaintext = push_inner(topic.sequence, published_at, payload) + payload
+        topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
+        counters = topic.counters
+        counters.sent += 1
+        counters.payload_sent += original_size(payload)
+        return self._number(epoch, topic, plaintext)
+
+    @staticmethod
+    def _number(epoch: Epoch, topic: SendTopic, plaintext: bytes) -> Message:
+        """Give a plaintext its message number."""
+        number = epoch.next_number
+        epoch.next_number = number + 1
+        return Message(epoch.ciphers, epoch.id, number, topic.index, plaintext)
+
+    def _send_small(
+        self,
+        topic: SendTopic,
+        message: Message,
+        deadline: float,
+        extra: int | None,
+        lane: Lane,
+        batches: Batches,
+        now: float,
+    ) -> int:
+        """Send a message of one packet, and plan its copies. Returns bytes sent."""
+        other = self._other
+        planned, spacing = lane.path.redundancy.copies(topic.delivery, topic.lifespan)
+        extra = planned if extra is None else extra
+        if other is not None or topic.redundant:
+            sent = Copy(topic, message, 0, spacing, 0.0, deadline)
+            lane.remember(sent, now)
+            # every second copy goes by the other path, one at once
+            if other is not None and (self._doubled or topic.redundant or (extra and message.size <= other.room)):
+                there = max(1, (extra + 1) // 2)
+                other.take(sent, now, there)
+                extra = max(0, extra - there)
+        if extra:
+            heapq.heappush(lane.copies, Copy(topic, message, extra, spacing, now + spacing, deadline))
+        return self._send_packet(topic, message, lane.path, batches, now)
+
+    def _send_copy(self, copy: Copy, lane: Lane, batches: Batches, now: float) -> int:
+        if copy.deadline < now:
+            return 0
+        copy.left -= 1
+        if copy.left:
+            copy.due = now + copy.spacing
+            heapq.heappush(lane.copies, copy)
+        size = self._send_packet(copy.topic, copy.content, lane.path, batches, now)
+        copy.topic.counters.bytes_redundant += size
+        return size
+
+    @staticmethod
+    def _send_packet(topic: SendTopic, content: Message | LoneShard, path: Path, batches: Batches, now: float) -> int:
+        packet = content.packet(path.id, path.number(), ticks(now))
+        topic.counters.bytes_sent += len(packet)
+        batches.add(packet)
+        return len(packet)
+
+
+def _control() -> SendTopic:
+    """What an epoch's control messages are sent as; nobody reads their counters."""
+    return SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)
