@@ -29,6 +29,8 @@ settings.register_profile(
 )
 settings.load_profile("skytether")
 
+pytest.register_assert_rewrite("skytether.testing.runtime_contract")
+
 # A run under nohup ignores it, and so would every program that a test starts.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 

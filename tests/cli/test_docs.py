@@ -19,6 +19,7 @@ from skytether.cli.config_file import check_config
 from skytether.cli.gate_config import inherit
 from skytether.cli.relay_config import RelayConfig
 from skytether.cli.robot_config import RobotConfig
+from skytether.orchestrator.runtimes.base import Runtime
 from skytether_services.navigation.status import Code
 
 ROOT = Path(__file__).parents[2]
@@ -147,3 +148,14 @@ def test_each_rule_of_the_bridge_that_the_code_cites_is_on_its_page() -> None:
     }
     assert len(cited) > 20
     assert {number for _, number in cited} <= rules.keys()
+
+
+def test_the_page_of_runtimes_shows_its_example_as_it_is() -> None:
+    page = (ROOT / "docs" / "writing-a-runtime.md").read_text()
+    example = (ROOT / "docs" / "examples" / "plain_site" / "test_plain_site.py").read_text()
+    shown = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(shown) == 1
+    assert shown[0].strip() in example
+    told = page.partition("Eight methods must be there:")[2].partition("\n\nThe others")[0]
+    must = set(re.findall(r"^\| `(\w+)\(", told, re.MULTILINE))
+    assert must == {"__init__", *Runtime.__abstractmethods__}

@@ -1,10 +1,7 @@
-"""What each runtime brings to the contract's suite. A new runtime adds a kit, and nothing else."""
+"""What each runtime of ours brings to the contract's suite. A new runtime adds a kit, and nothing else."""
 
 from __future__ import annotations
 
-import base64
-import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from skytether.api.grant import GRANT_VARIABLE, Grant
-from skytether.api.manifest import ServiceSpec
-from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, Runtime
+from skytether.api.grant import GRANT_VARIABLE
+from skytether.orchestrator.runtimes.base import Runtime
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 from skytether.orchestrator.runtimes.procfs import ProcessStat
+from skytether.testing.runtime_contract import RuntimeKit
 from skytether.testing.runtimes import (
     CrashingRuntime,
     FakeOptions,
@@ -26,66 +23,8 @@ from skytether.testing.runtimes import (
     StubbornRuntime,
 )
 
-TOY = "skytether.testing.toy_service"
 
-
-class Kit(ABC):
-    """One kind of runtime, and how to get services of it that behave in a certain way."""
-
-    patience = 30.0
-    """Seconds that a run may take to become what it should."""
-    image = "toy"
-
-    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
-        self.folder = folder
-        self.runtimes: list[Runtime] = []
-
-    @abstractmethod
-    def open(self, behaviour: str = "good") -> Runtime:
-        """A runtime over the same site each time; ``good``, ``stubborn`` or ``crashing`` services."""
-
-    @abstractmethod
-    def running(self, instance: str = "i1") -> int:
-        """How many runs of an instance the machine has now, whatever any runtime says."""
-
-    def launch(self, instance: str = "i1", attempt: int = 1, behaviour: str = "good") -> Launch:
-        params: dict[str, Any] = {
-            "good": {"say": f"run {attempt}", "report": f"run {attempt} is up"},
-            "stubborn": {"ignore_sigterm": True},
-            "crashing": {"exit_status": 1, "say": "boom"},
-        }[behaviour]
-        grant = Grant(
-            instance=instance,
-            service="toy",
-            robot="walker",
-            params=params,
-            session_id="00112233445566aa",
-            session_key=base64.b64encode(bytes(range(32))).decode(),
-            topics=(),
-        )
-        return Launch(attempt, ServiceSpec(entrypoint=TOY, image=self.image), grant)
-
-    def until(self, runtime: Runtime, phase: Phase | None, instance: str = "i1") -> Observation | None:
-        """Look until the instance is in this phase; None: until it is not there."""
-        deadline = time.monotonic() + self.patience
-        while True:
-            seen = runtime.observe().get(instance)
-            if (seen and seen.phase) == phase:
-                return seen
-            assert time.monotonic() < deadline, f"{instance} is {seen}, not {phase}"
-            time.sleep(0.005)
-
-    def close(self) -> None:
-        """Leave nothing behind."""
-        cleaner = self.open()  # of no leader
-        for instance in list(cleaner.observe()):
-            cleaner.remove(instance)
-        for runtime in self.runtimes:
-            runtime.observe()  # what it began and another ended is waited for
-            runtime.close()
-
-
-class ProcessKit(Kit):
+class ProcessKit(RuntimeKit):
     def open(self, behaviour: str = "good") -> Runtime:
         runtime = ProcessRuntime("lab", self.folder, ProcessOptions())
         self.runtimes.append(runtime)
@@ -102,10 +41,10 @@ class ProcessKit(Kit):
         return found
 
 
-class DockerKit(Kit):
-    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
-        super().__init__(folder, request)
-        self.site: Any = request.getfixturevalue("docker_site")
+class DockerKit(RuntimeKit):
+    def __init__(self, folder: Path, site: Any) -> None:
+        super().__init__(folder)
+        self.site = site
         self.image = self.site.images.toy
 
     def open(self, behaviour: str = "good") -> Runtime:
@@ -117,12 +56,12 @@ class DockerKit(Kit):
         return len(self.site.labelled(f"skytether.io/instance={instance}", "status=running"))
 
 
-class KubernetesKit(Kit):
+class KubernetesKit(RuntimeKit):
     patience = 90.0
 
-    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
-        super().__init__(folder, request)
-        self.site: Any = request.getfixturevalue("kubernetes_site")
+    def __init__(self, folder: Path, site: Any) -> None:
+        super().__init__(folder)
+        self.site = site
         self.image = self.site.images.toy
 
     def open(self, behaviour: str = "good") -> Runtime:
@@ -136,11 +75,11 @@ class KubernetesKit(Kit):
         return sum("running" in state for state in states)
 
 
-class FakeKit(Kit):
+class FakeKit(RuntimeKit):
     kind: type[FakeRuntime] = FakeRuntime
 
-    def __init__(self, folder: Path, request: pytest.FixtureRequest) -> None:
-        super().__init__(folder, request)
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
         self.world = FakeWorld()
 
     def open(self, behaviour: str = "good") -> Runtime:
@@ -159,16 +98,19 @@ class SlowKit(FakeKit):
 
 @pytest.fixture(
     params=[
-        pytest.param(ProcessKit, id="process", marks=pytest.mark.slow),
-        pytest.param(DockerKit, id="docker", marks=[pytest.mark.slow, pytest.mark.docker]),
+        pytest.param((ProcessKit, ""), id="process", marks=pytest.mark.slow),
+        pytest.param((DockerKit, "docker_site"), id="docker", marks=[pytest.mark.slow, pytest.mark.docker]),
         pytest.param(
-            KubernetesKit, id="kubernetes", marks=[pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
+            (KubernetesKit, "kubernetes_site"),
+            id="kubernetes",
+            marks=[pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes],
         ),
-        pytest.param(FakeKit, id="fake"),
-        pytest.param(SlowKit, id="slow"),
+        pytest.param((FakeKit, ""), id="fake"),
+        pytest.param((SlowKit, ""), id="slow"),
     ]
 )
-def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kit]:
-    kit = request.param(tmp_path, request)
+def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[RuntimeKit]:
+    kind, site = request.param
+    kit = kind(tmp_path, request.getfixturevalue(site)) if site else kind(tmp_path)
     yield kit
     kit.close()

@@ -1,6 +1,6 @@
 """Runtimes that run nothing, named by how they fail: for tests of what stands above a runtime.
 
-They keep the contract of :mod:`skytether.orchestrator.runtimes.base`, which ``tests/contracts`` checks; so they also
+They keep the contract of :mod:`skytether.orchestrator.runtimes.base`, as :mod:`.runtime_contract` checks; so they also
 show the least that a runtime of one's own has to do.
 """
 

@@ -9,8 +9,8 @@ Several orchestrators may have the same site open, and for a short time two of t
 frozen, or has lost its database. So a runtime never trusts its memory about what is at the site, and refuses what it is
 asked on behalf of a leader that another one has followed (``lead``).
 
-A runtime is found by its entry point in group ``skytether.runtimes``; ``tests/contracts`` is the suite each must
-pass.
+A runtime is found by its entry point in group ``skytether.runtimes``; :mod:`skytether.testing.runtime_contract` is the
+suite each must pass, and docs/writing-a-runtime.md says how to write one.
 """
 
 from __future__ import annotations
