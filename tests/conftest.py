@@ -52,6 +52,7 @@ TOGETHER = (
     "e2e/test_demo.py::test_demo_prints_one_json_object",
     "e2e/test_navigation_guide.py",
     "e2e/test_replay.py",
+    "e2e/test_rolling_nodes.py",
     "jepsen/",
     "lab/test_bench_bridge.py",
     "lab/test_bench_face.py",

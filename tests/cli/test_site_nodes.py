@@ -66,7 +66,7 @@ def test_a_machine_joins_runs_leaves_and_joins_again(orchestrator: Program, tmp_
                 again = run("site", "join", *common, given=token)
                 assert (again.returncode, "is the site 'ward' already" in again.stderr) == (1, True)
                 assert run("site", "drain", "ward").returncode == 0
-                assert "takes instances again" in run("site", "resume", "ward").stderr
+                assert "takes instances again" in run("site", "resume", "ward", "--no-wait").stderr
                 left = run("site", "leave", "--folder", str(folder))
                 assert (left.returncode, left.stderr) == (0, "this machine is no site any more\n")
             finally:

@@ -29,7 +29,7 @@ _LONGEST = 4096
 """Characters of what an orchestrator says is wrong; some are lists of what a manifest lacks."""
 AWAY = (502, 503, 504)
 """Statuses of an orchestrator, or of a proxy before it, that cannot serve now; another one may."""
-_REPEATABLE = ("/renew", "/migrate", "/session")
+_REPEATABLE = ("/renew", "/migrate", "/session", "/drain", "/resume")
 """Ends of paths to which a request that comes twice does what it would do once."""
 
 

@@ -51,6 +51,8 @@ class Machine(Strict):
     """Free, where the engine keeps what it has."""
     engine: Annotated[str, Field(max_length=120)] = ""
     """Its version."""
+    version: Annotated[str, Field(max_length=64)] = ""
+    """Of Skytether there."""
     echo: Port | None = None
     """UDP port of the echo for robots' probes; None: it has none."""
 

@@ -426,6 +426,8 @@ class NodeState(Strict):
     """Free, where its engine keeps what it has."""
     engine: str = ""
     """Its version."""
+    version: str = ""
+    """Of Skytether there."""
     echo: int | None = None
     """UDP port of its echo for probes."""
 

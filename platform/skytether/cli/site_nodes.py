@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ from .output import console, fail, fail_all, plain, print_json
 from .resources import SiteName, options_of
 
 if TYPE_CHECKING:
+    from skytether.api.client import Client
     from skytether.api.rest import Site
     from skytether.node.checks import Finding
     from skytether.node.join import Joined
@@ -304,21 +306,38 @@ def drain_site(
         site = client.drain_site(name)
         deadline, told = time.monotonic() + timeout_s, ""
         while wait and site.instances:
-            told = _tell(site, told)
+            told = _tell(_left(site), told)
             if time.monotonic() >= deadline:
                 fail(f"{_left(site)}; `skytether instance list` says why")
             time.sleep(_POLL_S)
-            site = client.get_site(name)
+            site = _look(client, name) or site
     if json:
         print_json(plain(site))
     else:
         console.print(f"site {name} takes no more instances; {site.instances} are there", markup=False)
 
 
-def resume_site(name: SiteName, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
-    """Have a site that was drained take instances again."""
+def resume_site(
+    name: SiteName,
+    wait: Annotated[bool, typer.Option(help="Wait until instances can be started there.")] = True,
+    timeout_s: Annotated[float, typer.Option("--timeout-s", min=0, help="How long to wait for that.")] = 300.0,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Have a site that was drained take instances again, and wait until it can: before the next one is drained.
+
+    One that does not come back is told of, with status 1; it takes instances as soon as it does.
+    """
     with connected(url, token_file) as client:
         site = client.resume_site(name)
+        deadline, told = time.monotonic() + timeout_s, ""
+        while wait and site.state != "ready":
+            told = _tell(text := f"site {name} is {site.state}: {site.reason}", told)
+            if time.monotonic() >= deadline:
+                fail(text)
+            time.sleep(_POLL_S)
+            site = _look(client, name) or site
     if json:
         print_json(plain(site))
     else:
@@ -348,14 +367,14 @@ def remove_site(
             deadline, told = time.monotonic() + timeout_s, ""
             while wait and not gone:
                 try:
-                    site = client.get_site(name)
+                    left = _left(site) if (site := _look(client, name)) else "no orchestrator answers"
                 except ApiError as error:
-                    if error.problem.status != 404:
+                    if error.problem.status != HTTPStatus.NOT_FOUND:
                         raise
                     break
-                told = _tell(site, told)
+                told = _tell(left, told)
                 if time.monotonic() >= deadline:
-                    fail(f"{_left(site)}: it goes with the last one; with --force it goes now")
+                    fail(f"{left}: site {name} goes with its last instance; with --force it goes now")
                 time.sleep(_POLL_S)
             if not wait and not gone:
                 console.print(f"site {name} goes when what runs there was moved, or has ended", markup=False)
@@ -367,8 +386,25 @@ def _left(site: Site) -> str:
     return f"{site.instances} instances are at site {site.name} still"
 
 
-def _tell(site: Site, told: str) -> str:
-    text = _left(site)
+def _look(client: Client, name: str) -> Site | None:
+    """A site as it is now; None: no orchestrator answers, as while it is updated.
+
+    Raises:
+        ApiError: There is no such site, or we may not see it.
+    """
+    from skytether.api.client import ApiError, Unreachable
+
+    try:
+        return client.get_site(name)
+    except Unreachable:
+        return None
+    except ApiError as error:
+        if error.problem.status != HTTPStatus.SERVICE_UNAVAILABLE:
+            raise
+        return None
+
+
+def _tell(text: str, told: str) -> str:
     if text != told:
         console.print(text, markup=False)
     return text

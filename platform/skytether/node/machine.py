@@ -16,6 +16,7 @@ from typing import Any
 import psutil
 from typing_extensions import override
 
+from skytether import __version__
 from skytether.api.node import Machine
 
 from .calls import address_of
@@ -109,6 +110,7 @@ def describe(engine: EngineInfo | None, echo: int | None) -> Machine:
         memory_mb=engine.memory_mb if engine else psutil.virtual_memory().total >> 20,
         disk_mb=free_mb(engine.folder if engine else "/") or 0,
         engine=engine.version if engine else "",
+        version=__version__,
         echo=echo,
     )
 
