@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs licences audit lock clean
+.PHONY: demo test slow-engine slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs site licences audit lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -69,9 +69,14 @@ fmt: $(READY) ## format, and mend what can be mended
 
 docs: $(READY) ## the pages that are made from the code
 	$(BIN)/skytether orchestrator config --markdown > docs/configuration.md
+	$(BIN)/python .ci/rest_api.py > docs/rest-api.md
 	$(BIN)/python .ci/chart.py
 	$(BIN)/python .ci/terraform_docs.py
 	for service in navigation follow-in-front; do $(BIN)/python .ci/parameters.py $$service > docs/$$service-parameters.md || exit; done
+
+site: $(READY) ## the documentation as a site in build/site; a link that leads nowhere ends it, or a page that none leads to
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -c docs -d build/site-cache . build/site
+	@echo "The site's first page: build/site/index.html"
 
 licences: $(READY) ## the licences of all that requirements.lock names, as a page
 	$(BIN)/python .ci/licences.py > docs/licences.md

@@ -18,6 +18,7 @@ CLOSER_LOOK = re.compile(r"GPL|General Public|MPL|Mozilla|EPL|Eclipse|Proprietar
 NOTES = {
     "apsw": "used by rosbags; its user chooses any licence that the OSI approved",
     "certifi": "a list of authorities; unchanged",
+    "docutils": "for `make site`; only its modes for Emacs are under the GPL",
     "eclipse-zenoh": "its user chooses Apache-2.0",
     "psycopg": "extra `postgres`; LGPL: used unchanged as a library, replaceable",
     "psycopg-binary": "extra `postgres`; LGPL: used unchanged as a library, replaceable",

@@ -407,7 +407,9 @@ def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) 
     finally:
         images.remove("toy", *reversed(names))
         if not shared:
-            subprocess.run(["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True)
+            subprocess.run(
+                ["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True
+            )
 
 
 @pytest.fixture(scope="session")

@@ -88,7 +88,7 @@ class Goal(Generic[G, R, F]):
 
     @property
     def cancel_requested(self) -> bool:
-        """Whether the client wants it to be called off: the service ends it with `cancel`, or as it likes."""
+        """Whether the client wants it to be called off; the service ends it with `cancel`, or as it likes."""
         return self.state in (State.PREEMPTING, State.RECALLING)
 
     def accept(self, text: str = "") -> None:

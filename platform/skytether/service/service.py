@@ -32,7 +32,7 @@ class Context:
     data_dir: Path = Path()
     """For what it produces (recordings); nothing else on the file system is its own."""
     epoch: float = 0.0
-    """Unix time at which the monotonic clock stood at 0: add it to ``now`` to get a date."""
+    """Unix time at which the monotonic clock stood at 0; with ``now`` added it is a date."""
 
 
 class Service(ABC, Generic[P]):
@@ -47,7 +47,7 @@ class Service(ABC, Generic[P]):
     rate_hz: float | None = None
     """Steps per second, at absolute times. `start` may set it, from a parameter."""
     trigger: ClassVar[str | None] = None
-    """Instead of a rate: the topic of an `Input`; one step for its newest message, whenever there is a new one."""
+    """The topic of an `Input`, instead of a rate; one step for its newest message, whenever there is a new one."""
 
     params_type: ClassVar[type[Any]] = NoParams
     declared: ClassVar[tuple[Declared, ...]] = ()
