@@ -23,7 +23,7 @@ from skytether.orchestrator.runtimes.base import Runtime
 from skytether_services.navigation.status import Code
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FILES = [*sorted((ROOT / "docs").rglob("*.service")), *sorted((ROOT / "ros1").rglob("*.service"))]
 ROBOT = {"robot": "walker", "orchestrator": "https://cloud:8600", "token_file": "t", "service": "s", "ros1": {}}
 TOPIC = {"name": "a", "type": "m/msg/M", "direction": "in"}
