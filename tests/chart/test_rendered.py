@@ -19,6 +19,7 @@ from skytether.api.rest import SiteCreate
 from skytether.cli.relay_config import RelayConfig
 from skytether.orchestrator.config import load
 from skytether.orchestrator.declared import read_sites, stored_as
+from skytether.orchestrator.nodes.authority import Authority
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.security import Secrets, new_token
 from skytether.orchestrator.settings import Settings
@@ -231,6 +232,27 @@ def test_secrets_are_made_of_256_random_bits_and_never_the_same() -> None:
             assert one[name].startswith("sky-")
 
 
+def test_machines_that_join_find_the_door_and_know_it_by_a_key_that_outlives_the_pod(tmp_path: Path) -> None:
+    found = rendered("nodes")
+    given = yaml.safe_load(found["ConfigMap/orchestrator"]["data"]["orchestrator.yaml"])["nodes"]
+    nodes = Settings.model_validate({"nodes": given}).nodes
+    assert (nodes.port, nodes.host, nodes.certificate_days) == (8603, "0.0.0.0", 7)
+    assert nodes.urls == ("https://nodes.example.org:443",)
+    keys = [base64.b64decode(objects(SETS["nodes"])["Secret/secrets"]["data"]["nodes.key"]) for _ in range(2)]
+    assert keys[0] != keys[1]
+    (tmp_path / "nodes.key").write_bytes(keys[0])
+    (tmp_path / "nodes.key").chmod(0o600)
+    pins = {Authority(tmp_path, lambda: 1.8e9).pin for _ in range(2)}
+    assert len(pins) == 1
+    script = at(found["Deployment/orchestrator"], "spec template spec initContainers secrets args 0")
+    script = script.replace("/from/", f"{tmp_path}/").replace("/run/", f"{tmp_path}/run/")
+    (tmp_path / "secrets").mkdir()
+    refused = subprocess.run(["/bin/sh", "-ceu", script], capture_output=True, text=True)
+    assert (refused.returncode, "the Secret demo-skytether-secrets has no nodes.key" in refused.stderr) == (1, True)
+    assert not (tmp_path / "run").exists()
+    assert "skytether site invite ward" in files(SETS["nodes"])["NOTES.txt"]
+
+
 def test_a_pods_own_copies_of_secrets_are_its_own_alone_and_the_database_is_whatever_its_secret_says(
     tmp_path: Path,
 ) -> None:
@@ -270,6 +292,10 @@ def test_nothing_secret_is_in_an_argument_or_a_variable() -> None:
     ("values", "says"),
     [
         ({"orchestrator": {"replicas": 2}}, "orchestrator.replicas is 2, and SQLite serves one: name the Secret"),
+        (
+            {**SETS["postgres"], "nodes": {"enabled": True}},
+            "orchestrator.replicas is 3 with nodes.enabled: a node is linked with each orchestrator at an address of",
+        ),
         ({"ingress": {"enabled": True}}, "ingress.enabled: name at least one of ingress.hosts"),
         ({"gateway": {"enabled": True}}, "gateway.enabled: name the Gateway in gateway.parentRefs"),
         (
@@ -328,6 +354,10 @@ def test_the_notes_say_what_an_old_cluster_does_not_know() -> None:
         (
             {"database": {"existingSecret": "pg"}, "persistence": {"existingClaim": "a"}},
             "persistence.existingClaim is not used",
+        ),
+        (
+            {"nodes": {"enabled": True}},
+            "nodes.enabled: `helm uninstall` does not reach what runs at machines that joined",
         ),
         ({"relay": {"enabled": True}}, "relay is enabled and no site uses it"),
         (

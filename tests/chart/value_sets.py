@@ -111,6 +111,14 @@ SETS: dict[str, dict[str, Any]] = {
         },
         "catalogue": {"trail": MANIFEST},
     },
+    "nodes": {
+        "nodes": {
+            "enabled": True,
+            "urls": ["https://nodes.example.org:443"],
+            "certificate_days": 7,
+            "service": {"port": 443, "annotations": {"lb": "tcp"}, "loadBalancerSourceRanges": ["192.0.2.0/24"]},
+        },
+    },
     "no-sites": {"sites": {"cluster": None}},
     "own-accounts": {
         "rbac": {"nodes": False},
@@ -337,6 +345,16 @@ CASES: list[tuple[str, str, str, Any]] = [
     ("sites", "RoleBinding/uninstall@ward", "subjects 0 name", "demo-skytether-uninstall"),
     ("sites", _ORCHESTRATOR, f"{_BOX} volumeMounts catalogue mountPath", "/etc/skytether/catalogue"),
     ("sites", _ORCHESTRATOR, f"{_POD} volumes catalogue configMap name", "demo-skytether-catalogue"),
+    # Machines that join.
+    ("defaults", "Service/nodes", "", None),
+    ("nodes", "Service/nodes", "spec type", "LoadBalancer"),
+    ("nodes", "Service/nodes", "spec ports 0 port", 443),
+    ("nodes", "Service/nodes", "spec ports 0 targetPort", "nodes"),
+    ("nodes", "Service/nodes", "spec loadBalancerSourceRanges", ["192.0.2.0/24"]),
+    ("nodes", "Service/nodes", "metadata annotations lb", "tcp"),
+    ("nodes", _SERVICE, "spec type", "ClusterIP"),
+    ("nodes", _ORCHESTRATOR, f"{_BOX} ports nodes containerPort", 8603),
+    ("nodes", "NetworkPolicy/orchestrator", "spec ingress 1 ports 0 port", 8603),
     ("no-sites", "Role/orchestrator", "", None),
     ("no-sites", "ClusterRole/nodes", "", None),
     ("no-sites", "Job/uninstall", "", None),

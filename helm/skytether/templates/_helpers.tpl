@@ -245,7 +245,7 @@ sites: there is none, so no instance can run; add one to `sites`, or with `skyte
 {{- if and (not $shared) (not .Values.persistence.enabled) }}
 persistence.enabled is false: robots, tokens and instances are forgotten when the orchestrator's pod ends.
 {{- end }}
-{{- if and $shared (lt (int .Values.orchestrator.replicas) 2) }}
+{{- if and $shared (lt (int .Values.orchestrator.replicas) 2) (not .Values.nodes.enabled) }}
 orchestrator.replicas is {{ .Values.orchestrator.replicas }}: PostgreSQL lets two share the work, of which one takes over within 2.4 s.
 {{- end }}
 {{- if and $shared .Values.persistence.existingClaim }}
@@ -260,7 +260,10 @@ config.proxies is empty: behind an ingress or a gateway all robots are one addre
 {{- if and (ne .Values.orchestrator.service.type "ClusterIP") (not .Values.orchestrator.tlsSecret) }}
 orchestrator.service.type is {{ .Values.orchestrator.service.type }} without orchestrator.tlsSecret: tokens and keys of sessions can be read on the way.
 {{- end }}
-{{- range $component := list "orchestrator" "relay" "echo" }}
+{{- if and .Values.nodes.enabled .Values.uninstall.dismantle }}
+nodes.enabled: `helm uninstall` does not reach what runs at machines that joined; `skytether site remove NAME` each before.
+{{- end }}
+{{- range $component := list "orchestrator" "nodes" "relay" "echo" }}
 {{- if and (index $.Values $component "service" "loadBalancerClass") (semverCompare "<1.24-0" $.Capabilities.KubeVersion.Version) }}
 {{ $component }}.service.loadBalancerClass is left out: this cluster is older than Kubernetes 1.24, which begins to know it.
 {{- end }}
