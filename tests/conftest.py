@@ -82,6 +82,7 @@ TOGETHER = (
     "orchestrator/test_faults_engine.py",
     "orchestrator/test_file_log.py",
     "orchestrator/test_follow_image.py",
+    "orchestrator/test_group_end.py",
     "orchestrator/test_group_joins.py",
     "orchestrator/test_groups_docker.py",
     "orchestrator/test_image_push.py",

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .output import console, fail
+
+if TYPE_CHECKING:
+    from skytether.orchestrator.store import Store
 
 app = typer.Typer(help="Run the orchestrator.", no_args_is_help=True)
 
@@ -181,27 +186,69 @@ def rotate(
 def dismantle_sites(
     file: Annotated[Path, typer.Argument(help="YAML of sites, as the setting sites_file has it.")],
     state_dir: StateDir = None,
+    database: Annotated[
+        str | None,
+        typer.Option(
+            help="PostgreSQL that the orchestrators had, which knows the machines of groups; without it the SQLite of "
+            "the state folder.",
+            envvar="SKYTETHER_DATABASE_URL",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Also where no database says which machines the groups have: they stay.")
+    ] = False,
 ) -> None:
-    """End and remove all that is at the sites of a file. For when their orchestrators are gone for good."""
+    """End and remove all that is at the sites of a file, and destroy the machines of its groups.
+
+    For when their orchestrators are gone for good: whatever runs there ends.
+    """
     from skytether.orchestrator.declared import read_groups, read_sites
     from skytether.orchestrator.defaults import default_state_dir
-    from skytether.orchestrator.errors import InvalidError
+    from skytether.orchestrator.errors import ConflictError, InvalidError
+    from skytether.orchestrator.group_end import end_groups
     from skytether.orchestrator.runtimes.base import RuntimeFailure
     from skytether.orchestrator.sites import dismantle
 
+    folder = (state_dir or default_state_dir()).expanduser()
     try:
-        declared = read_sites(file)
-        if groups := [one.name for one in read_groups(file)]:
-            text = (
-                f"machines of {', '.join(groups)} are known to the orchestrators' database only, and stay: delete them"
-            )
-            console.print(f"warning: {text} with `skytether group delete NAME --drain` while one runs", markup=False)
-        dismantle(declared, (state_dir or default_state_dir()).expanduser() / "sites")
+        declared, groups = read_sites(file), [one.name for one in read_groups(file)]
+        if groups and database is None and not (folder / "state.db").exists():
+            text = f"machines of {', '.join(groups)} are known to the orchestrators' database only"
+            if not force:
+                fail(f"{text}: name it (--database), or its folder (--state-dir); with --force they stay")
+            console.print(f"warning: {text}, and stay", markup=False)
+        elif groups:
+            with _store(database or f"sqlite:///{folder / 'state.db'}") as store:
+                ended = end_groups(store, groups, folder / "groups")
+            console.print(f"{len(ended)} machines of {', '.join(groups)} are destroyed", markup=False)
+        dismantle(declared, folder / "sites")
     except InvalidError as error:
         fail(str(error), 2)
-    except RuntimeFailure as error:
+    except (ConflictError, RuntimeFailure) as error:
         fail(str(error))
     console.print(f"nothing is left at {', '.join(one.name for one in declared) or 'no site'}", markup=False)
+
+
+@contextmanager
+def _store(address: str) -> Iterator[Store]:
+    """The database; one that cannot be used ends the command with one sentence."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from skytether.orchestrator.db import AddressError
+    from skytether.orchestrator.errors import OutdatedError
+    from skytether.orchestrator.store import Store
+
+    try:
+        store = Store(address)
+        try:
+            yield store
+        finally:
+            store.close()
+    except (AddressError, OutdatedError) as error:
+        fail(str(error))
+    except SQLAlchemyError as error:
+        fail(f"the database cannot be used: {str(error).splitlines()[0]}")
 
 
 @app.command("backup")
