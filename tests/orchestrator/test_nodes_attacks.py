@@ -9,8 +9,6 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
-from node_scene import NodeScene, until
+from node_scene import NodeScene, connection, context_of, first_line, until
 
 from skytether.api.node import (
     ALPN,
@@ -46,29 +44,9 @@ from skytether.api.node import (
 )
 from skytether.node import calls, join
 from skytether.node.calls import RefusedError, first_call, trusting
-from skytether.node.store import NodeError, NodeStore, new_key, request_for
+from skytether.node.store import NodeError, new_key, request_for
 from skytether.orchestrator.nodes import door, ways
 from skytether.orchestrator.nodes.authority import Authority
-
-
-def context_of(store: NodeStore) -> ssl.SSLContext:
-    return trusting(store.authority(), store.identity)
-
-
-@contextmanager
-def connection(nodes: NodeScene, context: ssl.SSLContext) -> Iterator[ssl.SSLSocket]:
-    plain = socket.create_connection(("127.0.0.1", nodes.port), timeout=10)
-    with plain, context.wrap_socket(plain, server_hostname=SERVER_NAME) as link:
-        yield link
-
-
-def first_line(link: ssl.SSLSocket) -> bytes:
-    """Empty: it was ended without a word."""
-    line = b""
-    with contextlib.suppress(OSError):
-        while not line.endswith(b"\n") and (piece := link.recv(4096)):
-            line += piece
-    return line
 
 
 def unknown_authority(folder: Path) -> ssl.SSLContext:

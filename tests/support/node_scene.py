@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import json
 import platform
+import socket
 import socketserver
+import ssl
 import tempfile
 import threading
 import time
@@ -19,6 +21,8 @@ from typing import Any
 from typing_extensions import override
 
 from skytether.api.manifest import Strict
+from skytether.api.node import SERVER_NAME
+from skytether.node.calls import trusting
 from skytether.node.join import Joined, JoinOptions, join
 from skytether.node.run import NodeProgram
 from skytether.node.store import NodeStore
@@ -244,3 +248,23 @@ def program(store: NodeStore) -> Iterator[list[str]]:
     finally:
         loop.call_soon_threadsafe(task.cancel)
         thread.join()
+
+
+def context_of(store: NodeStore) -> ssl.SSLContext:
+    return trusting(store.authority(), store.identity)
+
+
+@contextmanager
+def connection(nodes: NodeScene, context: ssl.SSLContext) -> Iterator[ssl.SSLSocket]:
+    plain = socket.create_connection(("127.0.0.1", nodes.port), timeout=10)
+    with plain, context.wrap_socket(plain, server_hostname=SERVER_NAME) as link:
+        yield link
+
+
+def first_line(link: ssl.SSLSocket) -> bytes:
+    """Empty: it was ended without a word."""
+    line = b""
+    with contextlib.suppress(OSError):
+        while not line.endswith(b"\n") and (piece := link.recv(4096)):
+            line += piece
+    return line

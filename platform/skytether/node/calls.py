@@ -81,8 +81,8 @@ def first_call(url: str, pin: str) -> Seen:
     context.verify_mode = ssl.CERT_NONE  # nothing is believed yet: the authority that it shows is compared with the pin
     welcome = _call(url, context, Hello(), Welcome)
     try:
-        public = x509.load_pem_x509_certificate(welcome.authority.encode()).public_key()
-        spki = public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+        authority = x509.load_pem_x509_certificate(welcome.authority.encode())
+        spki = authority.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     except ValueError:
         spki = b""
     if hashlib.sha256(spki).hexdigest() != pin:
@@ -90,7 +90,8 @@ def first_call(url: str, pin: str) -> Seen:
             f"whoever answers at {url} is not the orchestrator that made this token: its key is another one; somebody "
             "may be in between, or the address is another orchestrator's"
         )
-    return Seen(welcome.authority, welcome.time - time.time())
+    # This one certificate, and not the text: others may stand behind it there, which the pin says nothing of.
+    return Seen(authority.public_bytes(Encoding.PEM).decode(), welcome.time - time.time())
 
 
 def call(url: str, context: ssl.SSLContext, request: Strict, answer: type[Answer]) -> Answer:
