@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 RUNTIMES = "skytether.runtimes"
 DEFAULT_SITE = SiteCreate(name="local", tier="edge", runtime="process")
 """Made when there is no site at all. Tier ``edge``: the orchestrator's machine is near the robot, not on it."""
+NODE = "node://"
+"""How the engine of a machine that joined begins."""
 _FIRST_LOOK = 1.0
 """Seconds a new site gets to answer before it is listed all the same."""
 _CLOSE_TIMEOUT = 5.0
@@ -119,6 +121,8 @@ class Site:
         """Monotonic seconds of the last look that did not fail."""
         self.seen_since: tuple[int, float] | None = None
         """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
+        self.hosted: frozenset[str] | None = None
+        """Robots that have, or had, an instance here, as far as the store knows; None: it was not asked yet."""
         self.ended: frozenset[str] = frozenset()
         """Those of the observed that the store knows as ended."""
         self.leaving: Mapping[str, str] = {}
@@ -244,6 +248,13 @@ class Sites:
     def stored(self) -> dict[str, Mapping[str, int]]:
         """By site, bytes that services have written there by robot, as far as that is known."""
         return {site.name: site.runtime.stored() for site in self.all()}
+
+    def hosted(self, name: str) -> frozenset[str] | None:
+        """Of a site that is a machine that joined, the robots that had an instance there; None: of no such site."""
+        site = self.find(name)
+        if site is None or not str(site.asked.options.get("engine", "")).startswith(NODE):
+            return None
+        return site.hosted or frozenset()
 
     def refresh(self) -> None:
         """Open and close what another orchestrator over the same database added and deleted."""

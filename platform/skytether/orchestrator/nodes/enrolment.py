@@ -23,7 +23,7 @@ from skytether.api.rest import SiteCreate
 from ..database import Database
 from ..errors import ConflictError, NotFoundError, UnauthenticatedError, UnknownTokenError
 from ..security import PREFIX_LENGTH, TokenHash, new_token
-from ..sites import Sites
+from ..sites import NODE, Sites
 from ..throttle import Throttle
 from .authority import Authority, fingerprint, name_in, pem_of, requested_key, serial_of
 from .rows import Invitation, Node
@@ -154,7 +154,8 @@ class Enrolment:
     def join(self, asked: Join, seen_as: str) -> tuple[Node, Issued]:
         """Make a machine a site, and sign its certificate: all of it, or nothing, and the token is as good as before.
 
-        A machine whose answer was lost may ask again with the same token and key.
+        A machine whose answer was lost may ask again with the same token and key, as long as the site is the one that
+        it made.
 
         Raises:
             UnauthenticatedError: The token is not good.
@@ -162,9 +163,10 @@ class Enrolment:
             InvalidError: The request, or what it says, is wrong.
         """
         invitation, key = self._find(asked.token), requested_key(asked.request)
-        again = invitation.used_at is not None and invitation.used_key == fingerprint(key)
-        if again and (node := self._rows.get(invitation.site.name)) is not None:
-            return node, self._issue(node, asked.request)
+        if invitation.used_key == fingerprint(key):
+            node = self._rows.get(invitation.site.name)
+            if node is not None and node.joined_at == invitation.used_at:
+                return node, self._issue(node, asked.request)
         invitation = self.look(asked.token)
         name, now = invitation.site.name, self._clock()
         certificate = self._authority.sign(asked.request, name, self._days)
@@ -195,7 +197,7 @@ class Enrolment:
     def _options(self, site: SiteCreate, address: Address, ports: tuple[int, int] | None) -> dict[str, Any]:
         """What whoever invited gave goes before what the machine says."""
         own: dict[str, Any] = {"advertise_host": address} | ({"ports": list(ports)} if ports else {})
-        return own | dict(site.options) | {"engine": f"node://{site.name}"}
+        return own | dict(site.options) | {"engine": f"{NODE}{site.name}"}
 
     # Those who have joined
 
