@@ -14,7 +14,7 @@ import pytest
 from uvicorn import Config
 from uvicorn.server import ServerState
 
-from skytether.orchestrator.door import Book, Door, GuardedProtocol, Guest, _place_of
+from skytether.orchestrator.door import Book, Door, GuardedProtocol, Guest, place_of
 from skytether.orchestrator.settings import Limits
 from skytether.orchestrator.strain import Strain
 
@@ -109,10 +109,10 @@ def test_late_is_who_owes_something_or_does_not_take_what_it_was_sent() -> None:
 
 
 def test_one_customers_network_is_one_address() -> None:
-    assert _place_of("2001:db8:1:2:aaaa::1") == _place_of("2001:db8:1:2::9") != _place_of("2001:db8:1:3::9")
-    assert _place_of("::ffff:192.0.2.7") == "192.0.2.7" == _place_of("192.0.2.7")
-    assert _place_of("fe80::1%eth0") == _place_of("fe80::2%eth0")
-    assert _place_of("unix") == "unix"
+    assert place_of("2001:db8:1:2:aaaa::1") == place_of("2001:db8:1:2::9") != place_of("2001:db8:1:3::9")
+    assert place_of("::ffff:192.0.2.7") == "192.0.2.7" == place_of("192.0.2.7")
+    assert place_of("fe80::1%eth0") == place_of("fe80::2%eth0")
+    assert place_of("unix") == "unix"
 
 
 async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtocol) -> tuple[bytes, list[str]]:

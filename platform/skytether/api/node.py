@@ -188,7 +188,7 @@ class Said(Strict):
     pong: int | None = None
     engine: Annotated[str, Field(max_length=300)] | None = None
     """Why its engine cannot be reached; empty: it can."""
-    failed: int | None = None
+    failed: Annotated[int, Field(ge=1, le=MOST_WAYS)] | None = None
     """So many of the ways that were wanted could not be opened."""
 
 

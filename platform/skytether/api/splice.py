@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+from collections.abc import Awaitable, Callable
 
 from .node import ANSWER_S
 
@@ -17,12 +18,13 @@ _UNHEARD_S = 20
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def splice(one: Stream, other: Stream) -> None:
+async def splice(one: Stream, other: Stream, pace: Callable[[int], Awaitable[None]] | None = None) -> None:
     """Pass bytes both ways until one side has ended, and what it said before has arrived.
 
     Neither end of the other side is kept then: who asks an engine over HTTP ends when it has its answer.
+    ``pace`` is awaited with the number of bytes that the other said, before more of it is read.
     """
-    ways = [asyncio.create_task(_pass(one[0], other[1])), asyncio.create_task(_pass(other[0], one[1]))]
+    ways = [asyncio.create_task(_pass(one[0], other[1])), asyncio.create_task(_pass(other[0], one[1], pace))]
     try:
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         for _, writer in (one, other):
@@ -57,7 +59,11 @@ async def closed() -> None:
         await asyncio.sleep(0)
 
 
-async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _pass(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pace: Callable[[int], Awaitable[None]] | None = None
+) -> None:
     while data := await reader.read(PIECE):
         writer.write(data)
         await writer.drain()
+        if pace is not None:
+            await pace(len(data))

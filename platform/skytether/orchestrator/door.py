@@ -376,7 +376,7 @@ class Door:
             self._admit(taken, peer[0])
 
     def _admit(self, taken: socket.socket, host: str) -> None:
-        address, proxy = _place_of(host), self._is_proxy(host)
+        address, proxy = place_of(host), self._is_proxy(host)
         has_room, gives_way = self.book.room(address, free=proxy)
         if gives_way is not None:
             if self.book.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
@@ -469,7 +469,7 @@ def _give_back() -> None:
         trim(0)
 
 
-def _place_of(host: str) -> str:
+def place_of(host: str) -> str:
     """What counts as one address: of IPv6 the network that one customer gets."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])

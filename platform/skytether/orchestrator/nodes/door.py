@@ -47,7 +47,7 @@ from skytether.api.splice import closed, keep_alive
 from skytether.bridge.echo import EchoClient
 
 from ..db import GONE
-from ..door import Book, Guest
+from ..door import Book, Guest, place_of
 from ..errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
 from ..logs import AUDIT
 from ..settings import Limits
@@ -78,6 +78,11 @@ the same process."""
 _AT_ONCE = 4
 """Requests of one node under way, its links and ways not counted."""
 _ECHO_S, _ECHO_TRIES = 0.5, 3
+
+
+class _Guest(Guest):
+    host = ""
+    """Whose connection it is; ``address`` is what of it counts as one."""
 
 
 class NodeDoor:
@@ -198,7 +203,8 @@ class NodeDoor:
             self._admit(taken, str(peer[0]))
             await asyncio.sleep(_AT_ONCE_S)
 
-    def _admit(self, taken: socket.socket, address: str) -> None:
+    def _admit(self, taken: socket.socket, host: str) -> None:
+        address = place_of(host)
         with contextlib.suppress(OSError):  # it is gone already
             keep_alive(taken)
         has_room, gives_way = self._book.room(address)
@@ -207,7 +213,8 @@ class NodeDoor:
         if not has_room:
             taken.close()
             return
-        guest = Guest(address, self._loop.time() + ANSWER_S, self._know)
+        guest = _Guest(address, self._loop.time() + ANSWER_S, self._know)
+        guest.host = host
         guest.socket = taken
         self._book.come(guest)
         task = self._loop.create_task(self._greet(taken, guest))
@@ -219,9 +226,6 @@ class NodeDoor:
                 taken.close()
 
         task.add_done_callback(over)
-        task.add_done_callback(
-            lambda _: taken.close() if guest.socket is taken else None
-        )  # it was ended before it began
 
     def _know(self, guest: Guest, owner: str) -> None:
         self._book.know(guest, owner)
@@ -253,7 +257,7 @@ class NodeDoor:
 
     # One connection
 
-    async def _greet(self, taken: socket.socket, guest: Guest) -> None:
+    async def _greet(self, taken: socket.socket, guest: _Guest) -> None:
         taken.setblocking(False)
         reader = asyncio.StreamReader(limit=MOST_LINE, loop=self._loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=self._loop)
@@ -275,7 +279,7 @@ class NodeDoor:
             else:
                 writer.transport.abort()
 
-    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, guest: Guest) -> None:
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, guest: _Guest) -> None:
         agreed = writer.get_extra_info("ssl_object")
         if agreed.selected_alpn_protocol() != ALPN:
             return  # it wants something else
@@ -306,7 +310,7 @@ class NodeDoor:
         self,
         request: Request,
         shown: bytes | None,
-        guest: Guest,
+        guest: _Guest,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> Strict | None:
@@ -347,7 +351,7 @@ class NodeDoor:
                 return Refused(error=text, final=False, over=True)
             if isinstance(request, Standing):
                 stands = await asyncio.to_thread(self._standing, name)
-                return stands.model_copy(update={"seen_as": guest.address})
+                return stands.model_copy(update={"seen_as": guest.host})
             if isinstance(request, Leave):
                 stands = await asyncio.to_thread(self._leave, name, request.force)
                 self._note(request, guest, "", name)
@@ -375,7 +379,7 @@ class NodeDoor:
             if not self._busy[name]:
                 del self._busy[name]
 
-    async def _let_join(self, request: Look | Join, guest: Guest) -> Strict:
+    async def _let_join(self, request: Look | Join, guest: _Guest) -> Strict:
         if wait := self._guesses.empty(guest.address):
             raise TooManyError(wait)
         try:
@@ -384,7 +388,7 @@ class NodeDoor:
                 site = invitation.site
                 urls = self._enrolment.urls
                 return Invited(name=site.name, tier=site.tier, ends_at=invitation.expires_at, urls=urls)
-            node, issued = await asyncio.to_thread(self._enrolment.join, request, guest.address)
+            node, issued = await asyncio.to_thread(self._enrolment.join, request, guest.host)
         except UnauthenticatedError:
             self._guesses.wait(guest.address)
             raise
@@ -392,7 +396,7 @@ class NodeDoor:
         return issued
 
     async def _link(
-        self, request: Link, known: Known, guest: Guest, writer: asyncio.StreamWriter
+        self, request: Link, known: Known, guest: _Guest, writer: asyncio.StreamWriter
     ) -> LinkedNode | Refused:
         """Begin a node's link, unless another machine has it."""
         name, machine = known.name, request.machine
@@ -403,9 +407,9 @@ class NodeDoor:
                 "`skytether site leave --force` on the one that is to be no site, and invite it under another name",
                 final=False,
             )
-        await asyncio.to_thread(self._enrolment.linked, known, machine, request.address, guest.address)
+        await asyncio.to_thread(self._enrolment.linked, known, machine, request.address, guest.host)
         now = asyncio.get_running_loop().time()
-        node = LinkedNode(name, known.node.serial, machine.id, guest.address, writer, heard_at=now)
+        node = LinkedNode(name, known.node.serial, machine.id, guest.host, writer, heard_at=now)
         writer.write(
             line_of(
                 Linked(time=self._clock(), begins=known.begins_at, ends=known.node.ends_at, urls=self._enrolment.urls)
@@ -418,7 +422,7 @@ class NodeDoor:
         self,
         name: str,
         certificate: x509.Certificate,
-        guest: Guest,
+        guest: _Guest,
         stream: tuple[asyncio.StreamReader, asyncio.StreamWriter],
     ) -> None:
         """A way to the engine of the node whose certificate it is, and of no other."""
@@ -433,13 +437,13 @@ class NodeDoor:
         if not await self._ways.bring(node, stream):
             raise ForbiddenError("nobody asked for this way")
 
-    def _note(self, request: Request | None, guest: Guest, refused: str, name: str = "") -> None:
+    def _note(self, request: Request | None, guest: _Guest, refused: str, name: str = "") -> None:
         """In the audit what somebody did whom we know; strangers are told of elsewhere, a few of them."""
         if request is None or isinstance(request, Way):
             return
         fields: dict[str, Any] = {
             "who": f"node:{name}" if name else "nobody",
-            "address": guest.address,
+            "address": guest.host,
             "method": request.do.upper(),
             "path": f"/nodes/{name}" if name else "/nodes",
             "status": 403 if refused else 200,

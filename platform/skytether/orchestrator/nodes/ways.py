@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import socket
+import time
 from collections import deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,6 +21,7 @@ from skytether.api.node import ANSWER_S, GO, MOST_WAYS, PING_S, SILENT_S, Said, 
 from skytether.api.splice import PIECE, Stream, splice
 
 from ..runtimes.docker.engine import ENGINE_AWAY, ENGINE_SOCKET
+from ..throttle import Throttle
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +30,15 @@ _SPARE = 4
 _MOST_WAITING = 256
 """Who waits for a way of one node at a time; of more, each is refused."""
 _BACKLOG = 128
+_LINES_PER_S, _LINES = 50.0, 2 * MOST_WAYS
+"""What a node may say on its link, and at once: all its ways fail at once where its machine has no room for them."""
+_TURNS_PER_S, _TURNS = 0.5, 10
+"""Of these, those by which its engine goes or comes: with each the socket here goes or comes."""
+_BYTES_PER_S, _BYTES = 8 << 20, 32 << 20
+"""What its engine may say, and at once: a thousand containers tell 3 MiB a second, and all is read in one process,
+where robots' requests are served, too. Beyond that it waits, and so does nobody else."""
+_MOST_UNREAD = 1 << 16
+"""Bytes that a node has not taken of what it was told on its link, some thousand lines."""
 
 
 @dataclass(eq=False)
@@ -69,6 +80,9 @@ class Ways:
         self._nodes: dict[str, LinkedNode] = {}
         self._all: set[asyncio.Task[None]] = set()
         """Of all nodes, also of links that have ended."""
+        self._lines = Throttle(_LINES_PER_S, _LINES, time.monotonic)
+        self._turns = Throttle(_TURNS_PER_S, _TURNS, time.monotonic)
+        self._bytes = Throttle(_BYTES_PER_S, _BYTES, time.monotonic)
 
     def linked(self) -> dict[str, str]:
         """Those that are, each with the address that it is seen as."""
@@ -109,7 +123,13 @@ class Ways:
                 except TimeoutError:
                     return f"it said nothing for {SILENT_S:.0f} s"
                 node.heard_at = asyncio.get_running_loop().time()
-                self._hear(node, Said.model_validate_json(line))
+                said = Said.model_validate_json(line)
+                await _until_free(self._lines, node.name)
+                if said.engine is not None:
+                    await _until_free(self._turns, node.name)
+                self._hear(node, said)
+                if node.writer.transport.get_write_buffer_size() > _MOST_UNREAD:
+                    return "it does not read what it is told"
         except asyncio.IncompleteReadError:
             return "the connection ended"
         except (OSError, ValueError, asyncio.LimitOverrunError) as error:
@@ -253,7 +273,7 @@ class Ways:
             (theirs, them), done = await self._way(node)
             try:
                 them.write(GO)
-                await splice((reader, writer), (theirs, them))
+                await splice((reader, writer), (theirs, them), lambda size: self._heard(node, size))
             finally:
                 them.transport.abort()
         except (OSError, TimeoutError, asyncio.CancelledError):
@@ -262,6 +282,12 @@ class Ways:
             writer.transport.abort()
             if done is not None and not done.done():
                 done.set_result(None)
+
+    async def _heard(self, node: LinkedNode, size: int) -> None:
+        """Its engine has said so many bytes: wait until that is no more than it may."""
+        self._bytes.charge(node.name, size)
+        while wait := self._bytes.empty(node.name):
+            await asyncio.sleep(wait)
 
     async def _way(self, node: LinkedNode) -> tuple[Stream, asyncio.Future[None]]:
         while node.spare:
@@ -286,3 +312,9 @@ class Ways:
                 writer.transport.abort()
                 done.set_result(None)
             raise
+
+
+async def _until_free(throttle: Throttle, name: str) -> None:
+    """Take one of what a node may, and wait for it: meanwhile nothing of it is read, so it waits, too."""
+    while wait := throttle.wait(name):
+        await asyncio.sleep(wait)
