@@ -15,12 +15,14 @@ from typing import Any
 import pytest
 import requests
 import urllib3
+from docker.errors import APIError
 
-from skytether.orchestrator.runtimes.base import SiteSilentError
+from skytether.orchestrator.runtimes.base import RuntimeFailure, SiteSilentError
 from skytether.orchestrator.runtimes.docker import client as clients
-from skytether.orchestrator.runtimes.docker.client import Client
+from skytether.orchestrator.runtimes.docker.client import Client, document
 from skytether.orchestrator.runtimes.docker.engine import Engine
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.volumes import remove_left
 
 CHUNKED = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
 Answer = Callable[[bytes], Iterator[bytes]]
@@ -202,3 +204,70 @@ def test_a_long_story_is_cut(engine: Callable[..., Client], tmp_path: Path) -> N
     with pytest.raises(SiteSilentError) as told:
         ours.api()
     assert len(str(told.value)) < 3000
+
+
+def whole(body: bytes, status: bytes = b"200 OK") -> Answer:
+    head = b"HTTP/1.1 %s\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n" % (status, len(body))
+    return lambda _: iter((head, body))
+
+
+@pytest.mark.parametrize("item", [b"[],", b"{},", b"1.5,"])
+def test_a_document_of_very_many_values_costs_no_memory(item: bytes) -> None:
+    """Each takes 30 times its bytes, and the time of all that is under way."""
+    with pytest.raises(requests.ConnectionError, match="an answer of more than 500000 values"):
+        document(b"[" + 500_000 * item + b"0]")
+
+
+def test_a_message_of_very_many_values_ends_its_stream(engine: Callable[..., Client]) -> None:
+    message = b'{"a": [' + b"[]," * 30_000 + b"0]}\n"
+
+    def answer(_: bytes) -> Iterator[bytes]:
+        yield CHUNKED + b"%x\r\n%s\r\n" % (len(message), message)
+
+    assert list(engine(answer).events(decode=True)) == []
+
+
+def test_half_a_character_is_another_one_and_a_whole_one_stays(engine: Callable[..., Client]) -> None:
+    """No database takes it, and no answer of the API could hold it."""
+    text = rb'{"message": "\ud800 \uDC00 \ud83e\udd16", "number": 7}'
+    assert engine(whole(text)).info() == {"message": "? ? \N{ROBOT FACE}", "number": 7}
+
+
+def test_half_a_character_of_a_refusal_is_another_one(engine: Callable[..., Client]) -> None:
+    with pytest.raises(APIError) as error:
+        engine(whole(rb'{"message": "\ud800"}', b"500 No")).info()
+    assert error.value.explanation == "?"
+
+
+def test_of_a_refusal_less_is_read_than_of_an_answer(
+    engine: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It need not say which characters it is of, and to guess that takes seconds for 32 MiB."""
+    monkeypatch.setattr(clients, "_MOST_REFUSAL", 1000)
+    with pytest.raises(requests.ConnectionError, match="an answer of more than"):
+        engine(whole(bytes(range(256)) * 8, b"500 No")).info()
+
+
+def test_what_is_no_json_is_no_answer(engine: Callable[..., Client]) -> None:
+    with pytest.raises(requests.RequestException, match="an answer that is no JSON"):
+        engine(whole(b"[" * 100_000)).info()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"5", b"null", b"[1]", b'{"Volumes": 5}', b'{"Volumes": [5]}', b'{"Volumes": [{}]}']
+)
+def test_an_answer_of_another_shape_is_the_sites_failure(
+    engine: Callable[..., Client], tmp_path: Path, answer: bytes
+) -> None:
+    """Whatever it is: threads that look at a site ended with it."""
+
+    def say(asked: bytes) -> Iterator[bytes]:
+        return whole(answer if b"volumes" in asked else b'{"ApiVersion": "1.41"}')(asked)
+
+    engine(say)
+    ours = Engine(DockerOptions(engine=f"unix://{tmp_path}/engine.sock"))
+    try:
+        with pytest.raises(RuntimeFailure, match="is not understood"):
+            remove_left(ours, "owner")
+    finally:
+        ours.drop()

@@ -337,6 +337,19 @@ def test_a_container_is_known_by_its_labels() -> None:
     assert parse(foreign) is None
 
 
+@pytest.mark.parametrize("port", ["0", "65536", "-1", "9" * 30])
+def test_no_robot_is_sent_to_what_is_no_port(port: str) -> None:
+    lies = described()
+    lies["NetworkSettings"]["Ports"]["7600/udp"][0]["HostPort"] = port
+    seen = parse(lies)
+    assert seen is not None
+    assert seen.host_port is None
+    lies["NetworkSettings"], lies["Config"]["Labels"]["skytether.io/port"] = {}, port
+    seen = parse(lies)
+    assert seen is not None
+    assert seen.host_port is None
+
+
 def test_who_joins_a_network_says_nothing_of_it_and_is_found_where_that_is_published() -> None:
     made = body(namespace=Namespace("h1", "holder", 40_124))
     assert made["HostConfig"]["NetworkMode"] == "container:h1"
@@ -419,6 +432,19 @@ def test_what_a_container_uses() -> None:
     assert usage_of({**message, "memory_stats": {"usage": 1, "stats": {"total_inactive_file": 7}}}) == Usage(
         1.5, 0, 11, 22
     )
+
+
+@pytest.mark.parametrize("lie", [10**400, -1, 1.5, float("nan"), "7", None])
+def test_what_no_container_can_use_is_not_counted(lie: Any) -> None:
+    """It would be summed up with what is true, and shown with it."""
+    used = {"cpu_stats": {"cpu_usage": {"total_usage": 1}}, "memory_stats": {"usage": 5}}
+    for message in (
+        {**used, "cpu_stats": {"cpu_usage": {"total_usage": lie}}},
+        {**used, "networks": {"eth0": {"rx_bytes": lie, "tx_bytes": 0}}},
+        {**used, "networks": {"eth0": {"rx_bytes": 0, "tx_bytes": lie}}},
+    ):
+        with pytest.raises((ValueError, TypeError)):
+            usage_of(message)
 
 
 def test_the_last_line_that_can_be_read() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import bz2
 import io
 import json
+import lzma
 import tarfile
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -121,6 +123,8 @@ def test_what_is_too_large_is_not_fetched(engine: MadeUpEngine) -> None:
         archive(b"", tarfile.DIRTYPE),
         archive(b"", tarfile.SYMTYPE),
         archive(b" " * (MOST_BYTES + 1)),
+        bz2.compress(archive(json.dumps(ONE).encode())),  # 70 KiB could unpack to gigabytes of heads
+        lzma.compress(archive(json.dumps(ONE).encode())),
     ],
 )
 def test_a_strange_archive_has_no_document(content: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from contextlib import nullcontext
@@ -55,14 +56,21 @@ class FakeEngine:
     def raise_for_status(self) -> None:
         """It was answered."""
 
-    def json(self) -> dict[str, Any]:
-        return self.disk
+    @property
+    def content(self) -> bytes:
+        return json.dumps(self.disk).encode()
 
 
 def test_what_the_engine_says_of_its_volumes() -> None:
     assert sizes(DISK) == {"full": (2 << 20) + 1, "good": 2 << 20, "elsewhere": -1}
     assert sizes({}) == sizes({"Volumes": None}) == sizes({"VolumeUsage": {"TotalCount": 1}}) == {}
     assert sizes({"VolumeUsage": {"Items": DISK["Volumes"]}}) == sizes(DISK), "from version 1.52 on"
+
+
+@pytest.mark.parametrize(("told", "known"), [(10**400, 1 << 50), (float("inf"), None), ("7", None)])
+def test_of_a_volume_that_no_disk_holds_no_more_is_believed(told: Any, known: int | None) -> None:
+    """It would be summed up with what is true, and shown."""
+    assert sizes({"Volumes": [{"Name": "odd", "UsageData": {"Size": told}}]}).get("odd") == known
 
 
 def test_robots_sums_are_made_when_volumes_are_weighed_and_not_when_they_are_asked_for() -> None:

@@ -328,3 +328,25 @@ def test_an_answer_that_took_long_moves_the_clock_no_further_than_it_must() -> N
     took[0], said[0] = 0.0, 1004.5
     clock.look()
     assert clock() == 1004.5
+
+
+def test_a_site_that_hears_of_ever_later_epochs_begins_no_new_one_each_time(
+    bench: Any, new_record: NewRecord, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It may be a machine that lies: with each epoch all leases count anew, and all sites are looked at anew."""
+    b: Bench = bench()
+    lock = b.store.lock()
+    leadership = Leadership(lock, b.reconciler.owe_leases, b.clock.steady)
+    epochs = set()
+    for number in range(1, 100):
+        leadership.step()
+        epochs.add(leadership.epoch)
+        leadership.rise_above(leadership.epoch + number)
+        b.clock.forward(1.0)
+    assert len(epochs) < 10
+    b.clock.forward(3600.0)
+    leadership.step()
+    leadership.rise_above(leadership.epoch + 1000)
+    leadership.step()
+    assert leadership.epoch not in epochs, "one that is right is heard, in time"
+    leadership.end()

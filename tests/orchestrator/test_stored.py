@@ -41,6 +41,20 @@ def test_at_a_full_site_those_end_who_have_more_than_their_share() -> None:
     assert stored.too_much("edge").keys() == {"walker"}
 
 
+def test_of_robots_that_had_nothing_there_the_word_of_a_machine_that_joined_counts_nowhere_else() -> None:
+    """It says of a robot that never was there that it has written too much: wherever that ran, it was ended."""
+    weighed = {"ours": {"walker": 6 * MB}, "theirs": {"walker": 1000 * MB, "runner": 11 * MB, "made-up": MB}}
+    stored = Stored(
+        lambda: weighed,
+        Quotas(robot_data_mb=10, site_data_mb=10_000),
+        lambda site: frozenset({"runner"}) if site == "theirs" else None,
+    )
+    assert stored.by_robot() == {"walker": 6 * MB, "runner": 11 * MB}
+    assert stored.of("walker") == 6 * MB
+    assert stored.too_much("ours").keys() == {"runner"}
+    assert stored.by_site()["theirs"] == 1012 * MB, "it is its own disk"
+
+
 def test_however_many_robots_there_are_sites_are_asked_once() -> None:
     """In each pass they were asked twice for each robot, and a Docker site went through all volumes each time."""
     asked = []

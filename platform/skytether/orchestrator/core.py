@@ -94,7 +94,7 @@ class Orchestrator:
         self.store.key_id = lambda: secrets.fingerprint
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
-        self.stored = Stored(lambda: self.sites.stored(), settings.quotas)
+        self.stored = Stored(lambda: self.sites.stored(), settings.quotas, lambda site: self.sites.hosted(site))
         self.quotas = Quotas(self.store, settings.quotas, self.stored)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)

@@ -27,6 +27,7 @@ from skytether.guard.clock import now as boottime
 
 from .db import GONE
 from .models import leadership
+from .throttle import Throttle
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +61,9 @@ _TAKE_FILE = text(
 )
 _HIGHEST = 1 << 62
 """An epoch that no leader had; the database has room for twice as much."""
+_RISES_PER_S, _RISES = 1 / 600, 5
+"""Epochs that begin because of what sites say, and at once: with each all sites are looked at and all leases count
+anew, and a site may be somebody else's machine, which lies."""
 _EPOCH_NOW = select(leadership.c.epoch)
 _epoch: ContextVar[int] = ContextVar("epoch", default=0)
 
@@ -234,6 +238,7 @@ class Leadership:
         self._lock = lock
         self._on_elected = on_elected
         self._steady = steady
+        self._rises = Throttle(_RISES_PER_S, _RISES, steady)
         self._held = _NOT_HELD
         """Epoch, and until when it takes itself for the leader; both at once, for other threads read them."""
         self._above = 0
@@ -251,7 +256,7 @@ class Leadership:
 
     def rise_above(self, epoch: int) -> None:
         """See ``Lead``; from any thread. What cannot be a leader's is left as it is."""
-        if self._above < epoch < _HIGHEST:
+        if self._above < epoch < _HIGHEST and not self._rises.wait("all"):
             log.warning("a site has heard of epoch %d, which cannot be yet: the next one is above it", epoch)
             self._above = epoch
 

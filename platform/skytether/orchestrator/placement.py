@@ -6,6 +6,7 @@ milliseconds: the delay of control to be expected there, and what money and crow
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -13,7 +14,7 @@ from fnmatch import fnmatchcase
 from skytether.api.manifest import Needs, Tier
 from skytether.api.rest import Measurement, Refusal, Score
 
-from .runtimes.base import Capacity
+from .runtimes.base import Capacity, RuntimeFailure
 from .settings import Weights
 
 NOTHING = Capacity(0.0, 0)
@@ -23,6 +24,8 @@ tried, it is ``unfit``, which ends by itself."""
 DRAINING = "is being deleted, and takes no more instances"
 _TIER_ORDER: Mapping[Tier, int] = {"robot": 0, "edge": 1, "cloud": 2}
 """Nearer first, where nothing was measured."""
+_MOST = Capacity(1e6, 1 << 40, 1 << 20)
+"""Of one site, clusters among them: more is no number of its machines."""
 _FULLEST = 0.95
 """Utilisation beyond which queueing is not reckoned as longer: the formula's pole is no prediction."""
 
@@ -82,6 +85,18 @@ class Decision:
     """None fits, and none would if it were empty and reachable: waiting is no use."""
     scores: tuple[Score, ...] = ()
     """Of the sites that fit, the best first."""
+
+
+def believable(capacity: Capacity) -> Capacity:
+    """What a site says that it has, as far as that can be: all sites are reckoned with, and shown, together.
+
+    Raises:
+        RuntimeFailure: It cannot.
+    """
+    numbers = ((capacity.cpu, _MOST.cpu), (capacity.memory_mb, _MOST.memory_mb), (capacity.gpu, _MOST.gpu))
+    if not all(math.isfinite(value) and 0 <= value <= most for value, most in numbers):
+        raise RuntimeFailure("it says that it has what nothing has: processors, memory or GPUs cannot be so many")
+    return capacity
 
 
 def place(

@@ -22,7 +22,7 @@ from .db import GONE
 from .leader import ALONE, Lead, LeadLostError, fence, fenced
 from .metrics import Metrics
 from .moves import Moves, told
-from .placement import UNSTARTED, Decision, Prospect, lacks, place
+from .placement import UNSTARTED, Decision, Prospect, believable, lacks, place
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
 from .promises import NOTHING, Promises, Sums
 from .records import Change, Record
@@ -448,6 +448,9 @@ class Reconciler:
         led = self._lead.epoch if self._leads() else 0
         # Before the look: nothing can be observed that is not in it.
         live = self._store.live_at(site.name, changing=not whole)
+        if whole:
+            before = self._store.robots_at(site.name) if site.hosted is None else site.hosted
+            site.hosted = before | {record.robot for record in live}
         try:
             if led and site.led != led:
                 site.runtime.lead(led)
@@ -455,7 +458,7 @@ class Reconciler:
                 site.fitness.forget()
             due = whole and time.monotonic() - site.tidied_at >= _TIDY
             if site.capacity is None or due:
-                site.capacity = site.runtime.capacity()  # nodes come and go
+                site.capacity = believable(site.runtime.capacity())  # nodes come and go
             ids = {record.id for record in live}
             looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
             if due:

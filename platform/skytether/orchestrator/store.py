@@ -284,6 +284,12 @@ class Store(GroupStore):
         """Those of a service that run and are nobody's, oldest first."""
         return self._look(_SPARES, service=service)
 
+    def robots_at(self, site: str) -> frozenset[str]:
+        """Robots of all instances at a site of which the store has a row, ended or not."""
+        asked = select(instances.c.robot).where(instances.c.site == site).distinct()
+        with self._reader.connect() as connection:
+            return frozenset(connection.scalars(asked))
+
     def known(self, ids: Iterable[str]) -> set[str]:
         """Those that the store has a row of, ended or not."""
         with self._reader.connect() as connection:

@@ -20,8 +20,13 @@ from ..whole_answer import hurried, original
 
 _MOST = 32 << 20
 """Bytes of an answer: a container's whole log has 4 MiB, a list of a thousand containers some."""
-_MOST_MESSAGE = 1 << 20
-"""Bytes of one message of a stream."""
+_MOST_VALUES = 500_000
+"""Of a document: each takes 30 times the memory of its bytes. A list of a thousand containers has a tenth."""
+_MOST_MESSAGE = 1 << 18
+"""Bytes of one message of a stream. Those of use come by a stream for each container, a thousand at a time."""
+_MOST_MESSAGE_VALUES = 20_000
+_MOST_REFUSAL = 1 << 20
+"""Bytes of an answer that says no: whoever cannot tell its characters guesses them, which takes long."""
 _PIECE = 1 << 16
 _FRAME = struct.Struct(">4xL")
 """Before each piece of a log: which stream it is of, and how long."""
@@ -44,7 +49,10 @@ class Client(APIClient):
         # The SDK waits for events without end: one that says nothing for so long may be gone.
         patience = options.get("timeout") or self.timeout
         answer = super().send(request, **{**options, "timeout": patience, "stream": True})
-        if answer.status_code >= HTTPStatus.BAD_REQUEST or not options.get("stream"):
+        if answer.status_code >= HTTPStatus.BAD_REQUEST:
+            _read(answer, _MOST_REFUSAL)
+            answer._content = _whole_characters(answer.content)  # noqa: SLF001 (as in `_read`)
+        elif not options.get("stream"):
             _read(answer)
         else:
             original(answer.raw).until = inf
@@ -79,10 +87,16 @@ class Client(APIClient):
         """An engine is where the site says; whom it names may be anybody."""
         return None
 
+    def _result(self, response: requests.Response, json: bool = False, binary: bool = False) -> Any:
+        self._raise_for_status(response)  # type: ignore[attr-defined]
+        if json:
+            return document(response.content)
+        return super()._result(response, json, binary)  # type: ignore[misc]
+
     def _stream_helper(self, response: requests.Response, decode: bool = False) -> Iterator[Any]:
         if response.raw.chunked and decode:
             for line in _lines(response):
-                yield json.loads(line)
+                yield document(line, _MOST_MESSAGE_VALUES)
             return
         if not response.raw.chunked:
             original(response.raw).until = time.monotonic() + self.timeout
@@ -138,3 +152,27 @@ def _lines(answer: requests.Response) -> Iterator[bytes]:
             raise requests.ConnectionError("a message without an end")
     if rest.strip():
         yield rest
+
+
+def document(content: bytes, most: int = _MOST_VALUES) -> Any:
+    """What a document of JSON says; as text of which all can be stored and sent on.
+
+    Raises:
+        requests.RequestException: It is none, or has more than ``most`` values, and would take a multiple of its size.
+    """
+    if sum(content.count(mark) for mark in (b",", b"[", b"{")) > most:
+        raise requests.ConnectionError(f"an answer of more than {most} values")
+    try:
+        return json.loads(_whole_characters(content))
+    except (ValueError, RecursionError) as error:
+        raise requests.exceptions.InvalidJSONError(f"an answer that is no JSON ({error})") from error
+
+
+def _whole_characters(content: bytes) -> bytes:
+    """A document of JSON without halves of characters, which no database takes and no answer of ours can hold."""
+    if b"\\ud" not in content and b"\\uD" not in content:
+        return content
+    try:
+        return json.dumps(json.loads(content), ensure_ascii=False).encode(errors="replace")
+    except (ValueError, RecursionError):
+        return content

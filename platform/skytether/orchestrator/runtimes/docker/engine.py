@@ -112,16 +112,21 @@ class Engine:
 
         Raises:
             EngineGoneError: The engine does not answer.
-            RuntimeFailure: It refused; in its own words.
+            RuntimeFailure: It refused, in its own words; or what it answers is of another shape than an engine's.
         """
         try:
             yield
+        except RuntimeFailure:
+            raise
         except APIError as error:
             raise RuntimeFailure(explain(error)) from error
         except (requests.RequestException, urllib3.exceptions.HTTPError, DockerException, OSError) as error:
             raise EngineGoneError(
                 f"the Docker engine at {self._options.engine} does not answer: {root_cause(error)}"
             ) from error
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+            log.debug("an engine's answer is not understood", exc_info=True)
+            raise RuntimeFailure(f"the Docker engine's answer is not understood: {root_cause(error)}") from error
 
 
 def _probe(path: str) -> None:

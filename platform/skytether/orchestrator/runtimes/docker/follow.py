@@ -26,7 +26,7 @@ from ..base import RuntimeFailure
 from ..containers import last_line
 from .engine import Engine, EngineGoneError, root_cause
 from .meter import Meter
-from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, parse, parse_helper
+from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, parse, parse_helper, pull_machine
 
 log = logging.getLogger(__name__)
 
@@ -233,7 +233,7 @@ class Follower:
     def _follow(self) -> None:
         with self._engine.asked():
             api = self._engine.api()
-            self._info = api.info()
+            self._info = pull_machine(api.info())
             # By the engine's clock: events from before the list are looked at again, and none is missed.
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
             quiet = self._engine.api(self._quiet_s)

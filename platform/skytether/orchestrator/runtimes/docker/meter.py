@@ -14,6 +14,10 @@ _SILENCE_S = 30.0
 """A stream over which nothing came for so long is given up; the next look at the container opens another."""
 
 
+_MOST = 1 << 60
+"""Bytes, or nanoseconds, of one run: 36 years of a processor, and more than any network carries."""
+
+
 @dataclass(frozen=True, slots=True)
 class Usage:
     """Of one run, so far or now."""
@@ -34,11 +38,22 @@ def usage_of(message: Mapping[str, Any]) -> Usage | None:
     idle = details.get("inactive_file", details.get("total_inactive_file", 0))
     networks = (message.get("networks") or {}).values()
     return Usage(
-        cpu_s=message["cpu_stats"]["cpu_usage"]["total_usage"] / 1e9,
-        memory_bytes=max(0, memory["usage"] - idle),
-        received_bytes=sum(network["rx_bytes"] for network in networks),
-        sent_bytes=sum(network["tx_bytes"] for network in networks),
+        cpu_s=_counted(message["cpu_stats"]["cpu_usage"]["total_usage"]) / 1e9,
+        memory_bytes=_counted(max(0, memory["usage"] - idle)),
+        received_bytes=_counted(sum(network["rx_bytes"] for network in networks)),
+        sent_bytes=_counted(sum(network["tx_bytes"] for network in networks)),
     )
+
+
+def _counted(told: Any) -> int:
+    """A count that a database holds; sums of it over all runs of a service, too.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if isinstance(told, int) and 0 <= told < _MOST:
+        return told
+    raise ValueError(f"no container counts {str(told)[:30]}")
 
 
 class Meter:
@@ -84,6 +99,7 @@ class Meter:
                     self._streams[container] = stream
                 for message in stream:
                     usage = usage_of(message)
+                    del message  # not kept until the next one comes
                     with self._lock:
                         if container not in self._wanted:
                             return

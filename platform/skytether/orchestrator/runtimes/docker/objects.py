@@ -57,6 +57,8 @@ _HELPS = {"ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode"
 """Of whom no service is asked."""
 _MOST_VOLUMES = 32
 """That an image may declare: an engine makes, mounts and removes each of them, and answers nobody meanwhile."""
+_LONGEST = 200
+"""Characters of a word that an engine says of itself, and words of a list."""
 _LEAST_BETWEEN_CHECKS = {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}
 """Nanoseconds between two checks of an image's health: each costs the engine more than the container, whose limits do
 not hold for that."""
@@ -371,6 +373,29 @@ def _owned(path: str, mode: int, kind: bytes) -> tarfile.TarInfo:
     return entry
 
 
+def pull_machine(info: Any) -> Mapping[str, Any]:
+    """What an engine says of itself, of the kinds that are reckoned with here, and short.
+
+    Raises:
+        ValueError: Some of it is of another kind.
+    """
+    if not isinstance(info, Mapping):
+        raise ValueError("it says nothing of itself")
+    kinds = {"NCPU": (int, float), "MemTotal": (int,), "Architecture": (str,), "SystemTime": (str,)}
+    for key, kind in kinds.items():
+        value = info.get(key, "")
+        if not isinstance(value, kind) or len(str(value)) > _LONGEST:
+            raise ValueError(f"its {key} is not what it should be")
+    security = info.get("SecurityOptions") or ()
+    if not isinstance(security, list | tuple) or len(security) > _LONGEST or not all(_is_word(row) for row in security):
+        raise ValueError("its SecurityOptions are not what they should be")
+    return info
+
+
+def _is_word(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST
+
+
 def parse(inspected: Mapping[str, Any]) -> Seen | None:
     """A container out of the engine's description; None: it is not one of ours."""
     labels = inspected["Config"].get("Labels") or {}
@@ -388,7 +413,7 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
         exit_code=state["ExitCode"],
         out_of_memory=state["OOMKilled"],
         limits=pull_limits(inspected["HostConfig"]),
-        host_port=port or (int(labels[_PORT]) if labels.get(_PORT, "").isdecimal() else None),
+        host_port=port or (_port(labels[_PORT]) if labels.get(_PORT, "").isdecimal() else None),
         ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
         gpus=frozenset(int(number) for number in labels.get(_GPUS, "").split(",") if number.isdecimal()),
         volume=volumes.pop(f"{_ROOT}/{_DATA}", ""),
@@ -400,7 +425,13 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
 def published_port(inspected: Mapping[str, Any]) -> int | None:
     """Where a container is reached on its engine's machine; None: nowhere, or its network is another's."""
     published = (inspected["NetworkSettings"].get("Ports") or {}).get(_INNER) or []
-    return int(published[0]["HostPort"]) if published else None
+    return _port(published[0]["HostPort"]) if published else None
+
+
+def _port(told: Any) -> int | None:
+    """A robot is sent there, so it is one, or none."""
+    port = int(told)
+    return port if 0 < port < 1 << 16 else None
 
 
 def parse_helper(inspected: Mapping[str, Any]) -> Helper | None:

@@ -120,7 +120,7 @@ def _is_readable(stat: str) -> bool:
 def unpacked(archive: bytes) -> Any:
     """The document in the one file of an archive; None: there is no such."""
     try:
-        with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        with tarfile.open(fileobj=io.BytesIO(archive), mode="r:") as tar:  # not packed: it may unpack to anything
             entry = tar.next()
             file = tar.extractfile(entry) if entry is not None and entry.isreg() and entry.size <= MOST_BYTES else None
             return json.loads(file.read()) if file is not None else None

@@ -12,6 +12,7 @@ from docker.errors import create_api_error_from_http_exception
 
 from ..base import RuntimeFailure
 from ..now_and_then import NowAndThen
+from .client import document
 from .engine import Engine
 from .fence import remove_volume
 from .objects import INSTANCE, OWNER, stored_by_robot
@@ -22,6 +23,8 @@ _EVERY_S = 30.0
 _OWN_MB = 64
 """MiB in each other volume: of the grant, where a service writes its ready file, and those that an image declares. As
 much as in the own folder of a process."""
+_MOST = 1 << 50
+"""Bytes of a volume that are believed: beyond any disk, and sums of them are numbers still."""
 _PATIENCE_S = 120.0
 """The engine looks at every file of its volumes."""
 _UNKNOWN = 2
@@ -36,8 +39,8 @@ def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
     # The second is where engines from version 1.52 of their interface on say it.
     for volume in answer.get("Volumes") or (answer.get("VolumeUsage") or {}).get("Items") or ():
         size = (volume.get("UsageData") or {}).get("Size")
-        if size is not None:
-            found[str(volume["Name"])] = int(size)
+        if isinstance(size, int):
+            found[str(volume["Name"])] = min(size, _MOST)
     return found
 
 
@@ -117,8 +120,7 @@ class Scales:
                 said.raise_for_status()
             except requests.HTTPError as error:
                 create_api_error_from_http_exception(error)
-            answer = said.json()
-        told = sizes(answer)
+            told = sizes(document(said.content))
         self._unknown = {name: self._unknown.get(name, 0) + 1 for name, size in told.items() if size < 0}
         # What was known of these stays known.
         self.sizes = {name: size if size >= 0 else self.sizes.get(name, 0) for name, size in told.items()}
