@@ -463,7 +463,7 @@ class Session:
                 exchange = self._paths.take(message, path, micros / 1e6, address, now)
                 if exchange is not None:
                     if path is self._paths.choice.active:
-                        self._streams.round_trip.add(path.rtt)
+                        self._streams.rtt.add(path.rtt)
                     self._delivery.clock.exchange(*exchange, now)
         elif isinstance(message, Report):
             self._ledger.take(message, epoch, now)

@@ -1,7 +1,5 @@
 """The two ends of a reliable topic, and a large message on its way, each alone."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,7 +20,7 @@ from skytether.wire.codec.plaintext import PREFIX
 from skytether.wire.codec.tags import SECRET_SIZE, Tags
 from skytether.wire.fec.fragment import shape_for
 from skytether.wire.measure.counters import Outbound
-from skytether.wire.measure.retransmit import FIRST, LONGEST, RoundTrip
+from skytether.wire.measure.rtt import FIRST, LONGEST, RttEstimator
 from skytether.wire.reliable.parcel import Parcel
 from skytether.wire.reliable.reliable import WINDOW, WINDOW_BYTES, Inbox, Outbox
 from skytether.wire.topic import Direction, Topic
@@ -48,7 +46,7 @@ def test_control_messages_travel_in_a_packet(ack, missing, forward):
 
 def outbox(**options):
     topic = Topic("t", "a/b", Direction.IN, **{"lifespan": 10.0, "depth": 5000, "reliable": True, **options})
-    box = Outbox(topic, Outbound(), RoundTrip())
+    box = Outbox(topic, Outbound(), RttEstimator())
     box.start_epoch(1, topic, box.counters, 0.0, newcomer=True)
     return box
 
@@ -193,18 +191,3 @@ def test_a_parcel_nobody_tells_about_is_probed_with_one_shard():
     assert sending.remaining == 2  # of the block that was told of, and of no other
     sending.cancel()
     assert sending.remaining == 0
-
-
-def test_patience_follows_the_round_trip():
-    trip = RoundTrip()
-    trip.add(math.nan)
-    assert trip.patience == FIRST
-    for _ in range(100):
-        trip.add(0.1)
-    assert 0.1 < trip.patience < 0.13
-    for i in range(100):
-        trip.add(0.1 + 0.05 * (i % 2))
-    assert trip.patience > 0.17
-    assert trip.wait(3) <= LONGEST
-    trip.add(50.0)
-    assert trip.wait(0) > 5

@@ -70,11 +70,11 @@ class Parcel(Shards):
         self.flying = False
         self._landed(self, now)
 
-    def missing(self, until: int, rows: tuple[tuple[int, bytes], ...], now: float, patience: float) -> int:
+    def missing(self, until: int, rows: tuple[tuple[int, bytes], ...], now: float, timeout: float) -> int:
         """The peer tells what it lacks (see `control.Missing`).
 
         Returns:
-            How many shards are to be sent again: those that were sent longer ago than ``patience``.
+            How many shards are to be sent again: those that were sent longer ago than ``timeout``.
         """
         shape = self._shape
         self._reported = True
@@ -85,9 +85,9 @@ class Parcel(Shards):
                 start, k = shape.block_start(block), shape.block_k(block)
                 lacking = np.unpackbits(np.frombuffer(bits, np.uint8), bitorder="little")[:k]
                 self._missing[start : start + len(lacking)] |= lacking.astype(bool)
-        return self._again(self._lost(now - patience))
+        return self._again(self._lost(now - timeout))
 
-    def remind(self, now: float, patience: float) -> int:
+    def remind(self, now: float, timeout: float) -> int:
         """Nothing was heard for some time.
 
         Returns:
@@ -95,7 +95,7 @@ class Parcel(Shards):
             since the last time, one, so that it does.
         """
         told, self._reported = self._reported, False
-        lost = self._lost(now - patience / 2)
+        lost = self._lost(now - timeout / 2)
         if told and len(lost):
             return self._again(lost)
         last = np.flatnonzero(self._missing)[-1:]

@@ -18,7 +18,7 @@ from ..codec.control import Ack
 from ..codec.plaintext import PREFIX
 from ..fec.reassembly import Entry
 from ..measure.counters import Outbound
-from ..measure.retransmit import ACK_DELAY, RoundTrip
+from ..measure.rtt import ACK_DELAY, RttEstimator
 from ..topic import Topic
 from .parcel import Parcel
 
@@ -70,15 +70,15 @@ class Outbox:
     Args:
         topic: Its row.
         counters: Its counters.
-        round_trip: Of the session.
+        rtt: Of the session.
     """
 
     __slots__ = (
-        "_again", "_flying", "_flying_bytes", "_kept", "_next", "_round_trip", "_timers", "_waiting", "_waiting_bytes",
+        "_again", "_flying", "_flying_bytes", "_kept", "_next", "_rtt", "_timers", "_waiting", "_waiting_bytes",
         "counters", "forward_at", "index", "queued", "topic",
     )  # fmt: skip
 
-    def __init__(self, topic: Topic, counters: Outbound, round_trip: RoundTrip) -> None:
+    def __init__(self, topic: Topic, counters: Outbound, rtt: RttEstimator) -> None:
         self.topic = topic
         self.counters = counters
         self.index: int | None = None
@@ -87,7 +87,7 @@ class Outbox:
         """Whether the send queue has it."""
         self.forward_at = math.inf
         """When to tell the peer the lowest number that is not given up."""
-        self._round_trip = round_trip
+        self._rtt = rtt
         self._next = 0
         self._waiting: deque[Letter] = deque()
         """Never sent."""
@@ -217,7 +217,7 @@ class Outbox:
 
     def sent(self, letter: Letter, now: float) -> None:
         """All of it was sent; wait for what the peer says."""
-        letter.due = now + self._round_trip.wait(letter.attempts)
+        letter.due = now + self._rtt.timeout_after(letter.attempts)
         heapq.heappush(self._timers, (letter.due, letter.sequence))
 
     def landed(self, letter: Letter, parcel: Parcel, now: float) -> None:
@@ -246,7 +246,7 @@ class Outbox:
         for letter in self._flying.values():
             if letter.parcel is not None and letter.parcel.number == number:
                 letter.attempts = 0
-                count = letter.parcel.missing(until, rows, now, self._round_trip.patience)
+                count = letter.parcel.missing(until, rows, now, self._rtt.timeout)
                 if count:
                     self.counters.retransmitted += count
                     letter.due = math.inf
@@ -273,7 +273,7 @@ class Outbox:
         """Whether to tell the peer the base now; it is told again until an acknowledgement shows that it is known."""
         if now < self.forward_at:
             return False
-        self.forward_at = now + self._round_trip.wait(1)
+        self.forward_at = now + self._rtt.timeout_after(1)
         return self.index is not None
 
     def _remind(self, letter: Letter, now: float) -> None:
@@ -285,7 +285,7 @@ class Outbox:
                 letter.parcel = None
                 letter.attempts = 0
             else:
-                self.counters.retransmitted += parcel.remind(now, self._round_trip.patience)
+                self.counters.retransmitted += parcel.remind(now, self._rtt.timeout)
         self._queue(letter)
 
     def _queue(self, letter: Letter) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from ..codec.control import MISSING_ROWS, Ack, Forward, Missing, push_ack, push_forward, push_missing
 from ..codec.packet import pull_number
-from ..measure.retransmit import RoundTrip
+from ..measure.rtt import RttEstimator
 from ..reliable.reliable import Inbox, Outbox
 from ..topic import Role, Topic
 from .epoch import Epoch, ReceiveTopic
@@ -33,11 +33,9 @@ class Streams:
     ) -> None:
         self._limit = limit
         self._wake = wake
-        self.round_trip = RoundTrip()
+        self.rtt = RttEstimator()
         self._ours = {t.name for t in topics if t.reliable and t.direction.sender is role}
-        self._outboxes = {
-            t.name: Outbox(t, ledger.outbound(t.name), self.round_trip) for t in topics if t.name in self._ours
-        }
+        self._outboxes = {t.name: Outbox(t, ledger.outbound(t.name), self.rtt) for t in topics if t.name in self._ours}
         self._inboxes: dict[str, Inbox] = {}
         self._busy: set[Outbox] = set()
         """Outboxes that may have a timer."""
@@ -86,7 +84,7 @@ class Streams:
         for name in self._outboxes.keys() - self._ours - sending.keys():
             self._busy.discard(self._outboxes.pop(name))
         for name, send in sending.items():
-            send.outbox = outbox = self._outboxes.get(name) or Outbox(send.topic, send.counters, self.round_trip)
+            send.outbox = outbox = self._outboxes.get(name) or Outbox(send.topic, send.counters, self.rtt)
             self._outboxes[name] = outbox
             outbox.start_epoch(send.index, send.topic, send.counters, now, newcomer)
             self._stir(outbox)

@@ -12,8 +12,8 @@ LONGEST = 1.0
 """Seconds between attempts at most: who was away is found again by other means (`Session`)."""
 
 
-class RoundTrip:
-    """Smoothed round trip and its variation."""
+class RttEstimator:
+    """Smoothed round trip, its variation, and the timeout of retransmissions that follows from them."""
 
     __slots__ = ("_mean", "_spread")
 
@@ -32,12 +32,12 @@ class RoundTrip:
             self._mean += (seconds - self._mean) / 8
 
     @property
-    def patience(self) -> float:
+    def timeout(self) -> float:
         """Seconds after which what was sent should be known to have arrived."""
         if self._mean < 0:
             return FIRST
         return self._mean + max(4 * self._spread, LEAST_SPREAD) + ACK_DELAY
 
-    def wait(self, attempts: int) -> float:
+    def timeout_after(self, attempts: int) -> float:
         """Seconds before the next attempt when so many were in vain."""
-        return max(self.patience, min(self.patience * (1 << min(attempts, 10)), LONGEST))
+        return max(self.timeout, min(self.timeout * (1 << min(attempts, 10)), LONGEST))
