@@ -15,12 +15,12 @@ from ..config import Config
 from ..fec.loss import LossEstimate, Sums
 from ..fec.redundancy import Redundancy
 from ..measure.histogram import Histogram
-from .arrivals import NUMBERS, DelayMeter, LossMeter
 from .claims import Claims
 from .congestion import RateControl
 from .liveness import Liveness
 from .mtu import MtuSearch
 from .pacer import Pacer
+from .path_estimators import NUMBERS, DelayMeter, LossMeter
 
 SETTLE = 0.15
 """Seconds between evaluations of losses: what comes later than that after its successors counts as lost."""

@@ -10,8 +10,8 @@ from skytether.lab.link_model import LinkConditions, LinkModel
 from skytether.wire.codec.control import MOST_RUN
 from skytether.wire.codec.packet import TICK, TICKS, ticks
 from skytether.wire.config import Config
-from skytether.wire.path.arrivals import COLLECT, NUMBERS, DelayMeter, LossMeter
 from skytether.wire.path.path import Path
+from skytether.wire.path.path_estimators import COLLECT, NUMBERS, DelayMeter, LossMeter
 
 
 def feed(meter, numbers, every=200, period=0.01):
