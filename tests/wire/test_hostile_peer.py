@@ -65,7 +65,7 @@ def test_who_has_the_key_cannot_have_somebody_else_flooded_by_guessing_challenge
     path = link.sessions[SERVICE]._paths.get(0)
     link.publish(SERVICE, "cmd_vel", b"x")
     say(link, ROBOT, ping(), address="victim")
-    assert list(path.claims._open) == ["victim"]
+    assert list(path.validation._open) == ["victim"]
     asked_at = round(link.now * 1e6)
     for guess in range(asked_at - 5, asked_at + 6):
         for challenge in (0, 1, guess):

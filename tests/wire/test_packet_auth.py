@@ -27,7 +27,7 @@ def all_but_rejected(link, role):
     ]
     losses, delays = path.losses, path.delays
     return (
-        counters, path.address, len(path.claims), path.packets_received, path.bytes_received, path.newest,
+        counters, path.address, len(path.validation), path.packets_received, path.bytes_received, path.newest,
         len(losses._numbers), losses.settled, losses.lost, len(delays._times), delays.pending,
         session._receiver.messages.used, len(session._receiver.messages), session._receiver._handshakes.used,
         len(link.events[role]), session._last_heard,

@@ -159,7 +159,7 @@ class Session:
         for each in self._paths:
             if path in (None, each.id):
                 each.peer = each.address = address
-                each.claims.clear()
+                each.validation.clear()
         if self._door is None and not self._closed:
             self._seeker.look_at({p.peer for p in self._paths}, connected=self._epoch is not None)
 
@@ -266,7 +266,7 @@ class Session:
             if path.id not in full:
                 batches = self._sender.transmit(path, now)
                 sent += batches
-                if path.claims:
+                if path.validation:
                     sent += path.shared(batches)
         return sent
 
@@ -486,4 +486,4 @@ class Session:
         if address is None:
             self._sender.say(path, message, now)
         else:
-            path.claims.sent(address, self._sender.say_to(address, path, message, now))
+            path.validation.sent(address, self._sender.say_to(address, path, message, now))

@@ -214,7 +214,7 @@ class Paths:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
             return None
-        if path.claims and not ping.ask and (proven := path.claims.answered(ping.challenge)) is not None:
+        if path.validation and not ping.ask and (proven := path.validation.answered(ping.challenge)) is not None:
             self._move(path, *proven, now)
         asked_at, hold = ping.echo / 1e6, ping.hold / 1e6
         rtt = now - asked_at - hold
@@ -245,9 +245,9 @@ class Paths:
             if address != path.address:
                 if proven:
                     self._move(path, address, path.heard_at, now)
-                elif path.claims.heard(address, size, path.heard_at, now):
+                elif path.validation.packet_came(address, size, path.heard_at, now):
                     challenge = int.from_bytes(self._entropy(CHALLENGE_SIZE)) or 1
-                    path.claims.challenge(address, challenge, now)
+                    path.validation.challenge(address, challenge, now)
                     self._say(path, push_ping(_ping(path, True, 0, now, challenge)), address, now)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
@@ -257,7 +257,7 @@ class Paths:
         """The peer is there."""
         moved = path.address is not None
         path.address = address
-        path.claims.clear()
+        path.validation.clear()
         if moved:
             path.mtu.restart(now)
             self._tell(PeerMoved(address))

@@ -15,12 +15,12 @@ from ..config import Config
 from ..fec.loss import LossEstimate, Sums
 from ..fec.redundancy import Redundancy
 from ..measure.histogram import Histogram
-from .claims import Claims
 from .congestion import RateControl
 from .liveness import Liveness
 from .mtu import MtuSearch
 from .pacer import Pacer
 from .path_estimators import NUMBERS, DelayMeter, LossMeter
+from .path_validation import PathValidation
 
 SETTLE = 0.15
 """Seconds between evaluations of losses: what comes later than that after its successors counts as lost."""
@@ -57,10 +57,42 @@ class Path:
     """State of one path at one end."""
 
     __slots__ = (
-        "_arrived_at", "_assumed_loss", "_astray", "_cautious", "_fed_back_at", "_known", "_pace", "_settle_at",
-        "_singles", "address", "bytes_received", "bytes_sent", "claims", "control", "cost", "delays", "echo",
-        "heard_at", "id", "large", "liveness", "loss_in", "loss_out", "losses", "mtu", "newest", "next_number",
-        "pacer", "packets_received", "packets_sent", "peer", "ping_at", "pinged_at", "redundancy", "rtt", "rtts",
+        "_arrived_at",
+        "_assumed_loss",
+        "_astray",
+        "_cautious",
+        "_fed_back_at",
+        "_known",
+        "_pace",
+        "_settle_at",
+        "_singles",
+        "address",
+        "bytes_received",
+        "bytes_sent",
+        "control",
+        "cost",
+        "delays",
+        "echo",
+        "heard_at",
+        "id",
+        "large",
+        "liveness",
+        "loss_in",
+        "loss_out",
+        "losses",
+        "mtu",
+        "newest",
+        "next_number",
+        "pacer",
+        "packets_received",
+        "packets_sent",
+        "peer",
+        "ping_at",
+        "pinged_at",
+        "redundancy",
+        "rtt",
+        "rtts",
+        "validation",
     )  # fmt: skip
 
     def __init__(self, path_id: int, config: Config, now: float) -> None:
@@ -70,8 +102,8 @@ class Path:
         self.peer: Hashable | None = None
         """Where the robot's end was told that the service is."""
         self.address: Hashable | None = None
-        """Where to send; None while unknown. Follows the peer once it has answered there (see `claims`)."""
-        self.claims = Claims()
+        """Where to send; None while unknown. Follows the peer once it has answered there (see `path_validation`)."""
+        self.validation = PathValidation()
         self.newest = -1
         """Highest number of an authentic message of this epoch that came by this path."""
         self.heard_at = now
@@ -174,7 +206,7 @@ class Path:
         """Copies for addresses where the peer may be, as far as they may have them."""
         copies = []
         for batch in batches:
-            for address, size in self.claims.shares(len(batch.data), batch.segment):
+            for address, size in self.validation.allowances(len(batch.data), batch.segment):
                 segment = batch.segment if batch.segment is not None and size > batch.segment else None
                 copies.append(Transmit(self.id, address, batch.data[:size], segment))
                 self.bytes_sent += size
@@ -212,7 +244,7 @@ class Path:
         """Forget what belongs to a peer that was there before."""
         self.newest = -1
         self.echo = None
-        self.claims.clear()
+        self.validation.clear()
         self._measure(now)
         self.liveness = Liveness()
         self.mtu.restart(now)

@@ -7,7 +7,7 @@ import pytest
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Direction, PathUse, PeerMoved, Role, Topic
 from skytether.wire.codec import packet
-from skytether.wire.path.claims import ALLOWANCE, MAX_CLAIMS, SPACING, Claims
+from skytether.wire.path.path_validation import AMPLIFICATION_LIMIT, MAX_CANDIDATES, SPACING, PathValidation
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 SLOW = LinkConditions(delay=0.05)
@@ -19,40 +19,40 @@ TOPICS = (
 
 
 def test_an_address_is_sent_three_times_what_came_from_it_at_most():
-    claims = Claims()
-    assert list(claims.shares(100, None)) == []
-    assert claims.heard("new", 100, 0.0, 1.0)
-    assert list(claims.shares(200, None)) == [("new", 200)]
-    assert list(claims.shares(101, None)) == []
-    claims.sent("new", 90)
-    assert list(claims.shares(500, 6)) == [("new", 6)]  # whole datagrams
-    assert list(claims.shares(500, 6)) == []
-    claims.heard("new", 10, 0.0, 1.0)
-    assert list(claims.shares(34, 17)) == [("new", 34)]
-    claims.sent("new", 1000)
-    assert list(claims.shares(1, 1)) == []
+    validation = PathValidation()
+    assert list(validation.allowances(100, None)) == []
+    assert validation.packet_came("new", 100, 0.0, 1.0)
+    assert list(validation.allowances(200, None)) == [("new", 200)]
+    assert list(validation.allowances(101, None)) == []
+    validation.sent("new", 90)
+    assert list(validation.allowances(500, 6)) == [("new", 6)]  # whole datagrams
+    assert list(validation.allowances(500, 6)) == []
+    validation.packet_came("new", 10, 0.0, 1.0)
+    assert list(validation.allowances(34, 17)) == [("new", 34)]
+    validation.sent("new", 1000)
+    assert list(validation.allowances(1, 1)) == []
 
 
 def test_challenges_are_spaced_and_each_is_of_one_address():
-    claims = Claims()
+    validation = PathValidation()
     for challenge, address in ((7, "a"), (8, "b")):
-        assert claims.heard(address, 1, 0.0, 5.0)
-        claims.challenge(address, challenge, 5.0)
-        assert not claims.heard(address, 1, 0.0, 5.0 + 0.9 * SPACING)
-        assert claims.heard(address, 1, 0.0, 5.0 + SPACING)
-    assert claims.answered(0) is None
-    assert claims.answered(8) == ("b", 0.0)
-    assert len(claims) == 0
-    assert claims.answered(7) is None
+        assert validation.packet_came(address, 1, 0.0, 5.0)
+        validation.challenge(address, challenge, 5.0)
+        assert not validation.packet_came(address, 1, 0.0, 5.0 + 0.9 * SPACING)
+        assert validation.packet_came(address, 1, 0.0, 5.0 + SPACING)
+    assert validation.answered(0) is None
+    assert validation.answered(8) == ("b", 0.0)
+    assert len(validation) == 0
+    assert validation.answered(7) is None
 
 
-def test_claims_are_bounded():
-    claims = Claims()
+def test_candidates_are_bounded():
+    validation = PathValidation()
     for i in range(100):
-        claims.heard(i, 10, 0.0, 0.0)
-        claims.challenge(i, i + 1, 0.0)
-    assert len(claims) == MAX_CLAIMS
-    assert [address for address, _ in claims.shares(1, None)] == [96, 97, 98, 99]
+        validation.packet_came(i, 10, 0.0, 0.0)
+        validation.challenge(i, i + 1, 0.0)
+    assert len(validation) == MAX_CANDIDATES
+    assert [address for address, _ in validation.allowances(1, None)] == [96, 97, 98, 99]
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_who_repeats_from_elsewhere_what_he_overhears_turns_nothing(link, role):
         seen = len(link.sent[role])
     link.run(0.5)
     assert moves(link, ROBOT) == moves(link, SERVICE) == []
-    assert 0 < told <= ALLOWANCE * heard
+    assert 0 < told <= AMPLIFICATION_LIMIT * heard
     assert lost(link, ROBOT) == lost(link, SERVICE) == set()
     assert {p.handshakes for p in (s.stats(link.now) for s in sessions.values())} == {1}
 

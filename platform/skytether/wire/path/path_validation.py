@@ -1,11 +1,11 @@
 """Where a path's peer seems to be, until it has shown that it is there (RFC 9000, sections 8.2 and 9.3).
 
 An authentic message from another address may come from a peer that moved, or from somebody who repeats what he
-overheard, faster than the network carries it. So it is a claim, no more: the address in use stays in use, and a
+overheard, faster than the network carries it. So it is a candidate, no more: the address in use stays in use, and a
 challenge goes to the other one: random bits, which no peer can repeat that did not get them, not even one that has the
-key and names somebody else's address. Only an answer to it moves the session. Until then the claimed address is sent
+key and names somebody else's address. Only an answer to it moves the session. Until then the candidate is sent
 copies of what goes to the one in use, so that a peer that did move misses little; with the challenges they are at most
-`ALLOWANCE` times the bytes that came from there, so that nobody is flooded by a session he has no part in.
+`AMPLIFICATION_LIMIT` times the bytes that came from there, so that nobody is flooded by a session he has no part in.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from collections.abc import Hashable, Iterator
 
-ALLOWANCE = 3
+AMPLIFICATION_LIMIT = 3
 """Bytes that an address may be sent for each that came from it before it has answered."""
-MAX_CLAIMS = 4
-"""Addresses of one path that are tested at the same time; the oldest claim gives way."""
+MAX_CANDIDATES = 4
+"""Addresses of one path that are tested at the same time; the oldest candidate gives way."""
 SPACING = 0.05
 """Seconds between challenges to one address."""
 MAX_CHALLENGES = 64
 """Challenges to one address of which an answer counts."""
 
 
-class Claim:
+class Candidate:
     """One address that authentic messages came from."""
 
     __slots__ = ("asked_at", "challenges", "left", "since")
@@ -37,18 +37,18 @@ class Claim:
         self.challenges: deque[int] = deque(maxlen=MAX_CHALLENGES)
 
 
-class Claims:
-    """The claims on one path."""
+class PathValidation:
+    """The candidates of one path."""
 
     __slots__ = ("_open",)
 
     def __init__(self) -> None:
-        self._open: OrderedDict[Hashable, Claim] = OrderedDict()
+        self._open: OrderedDict[Hashable, Candidate] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._open)
 
-    def heard(self, address: Hashable, size: int, since: float, now: float) -> bool:
+    def packet_came(self, address: Hashable, size: int, since: float, now: float) -> bool:
         """An authentic message, newer than all before, came from an address that is not the one in use.
 
         Args:
@@ -60,44 +60,44 @@ class Claims:
         Returns:
             Whether to challenge it now.
         """
-        claim = self._open.get(address)
-        if claim is None:
-            if len(self._open) >= MAX_CLAIMS:
+        candidate = self._open.get(address)
+        if candidate is None:
+            if len(self._open) >= MAX_CANDIDATES:
                 self._open.popitem(last=False)
-            claim = self._open[address] = Claim(since)
-        claim.left += ALLOWANCE * size
-        return now >= claim.asked_at + SPACING
+            candidate = self._open[address] = Candidate(since)
+        candidate.left += AMPLIFICATION_LIMIT * size
+        return now >= candidate.asked_at + SPACING
 
     def challenge(self, address: Hashable, challenge: int, now: float) -> None:
         """These random bits are sent to an address now."""
-        claim = self._open[address]
-        claim.asked_at = now
-        claim.challenges.append(challenge)
+        candidate = self._open[address]
+        candidate.asked_at = now
+        candidate.challenges.append(challenge)
 
     def sent(self, address: Hashable, size: int) -> None:
         """So many bytes went to an address."""
-        claim = self._open.get(address)
-        if claim is not None:
-            claim.left -= size
+        candidate = self._open.get(address)
+        if candidate is not None:
+            candidate.left -= size
 
     def answered(self, challenge: int) -> tuple[Hashable, float] | None:
         """The peer answers with these bits.
 
         Returns:
-            The address that it was sent to, and ``since`` of the claim; None if it was no challenge. All claims are
+            The address that it was sent to, and ``since`` of the candidate; None if it was no challenge. All are
             settled then.
         """
-        for address, claim in self._open.items():
-            if challenge in claim.challenges:
+        for address, candidate in self._open.items():
+            if challenge in candidate.challenges:
                 self._open.clear()
-                return address, claim.since
+                return address, candidate.since
         return None
 
     def clear(self) -> None:
         """Forget them."""
         self._open.clear()
 
-    def shares(self, total: int, segment: int | None) -> Iterator[tuple[Hashable, int]]:
+    def allowances(self, total: int, segment: int | None) -> Iterator[tuple[Hashable, int]]:
         """Who is to have a copy of a batch.
 
         Args:
@@ -107,8 +107,8 @@ class Claims:
         Yields:
             Address, and how many bytes of it may go there: whole datagrams.
         """
-        for address, claim in self._open.items():
-            size = total if total <= claim.left else claim.left // segment * segment if segment else 0
+        for address, candidate in self._open.items():
+            size = total if total <= candidate.left else candidate.left // segment * segment if segment else 0
             if size > 0:
-                claim.left -= size
+                candidate.left -= size
                 yield address, size
