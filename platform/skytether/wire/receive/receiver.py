@@ -31,7 +31,7 @@ from ..codec.packet import (
     pull_packets,
 )
 from ..codec.plaintext import INNER, OVERHEAD, PREFIX
-from ..codec.replay import Seen
+from ..codec.replay_window import Seen
 from ..config import Config
 from ..connect.handshake import MAX_HANDSHAKE
 from ..fec.reassembly import Entry, Reassembly

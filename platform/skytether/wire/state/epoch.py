@@ -6,7 +6,7 @@ import math
 from collections import deque
 
 from ..codec.ciphers import Ciphers
-from ..codec.replay import PacketWindow, ReplayWindow
+from ..codec.replay_window import PacketWindow, ReplayWindow
 from ..config import MAX_REKEY_BYTES
 from ..measure.counters import Inbound, Outbound
 from ..measure.sequence import SequenceTracker

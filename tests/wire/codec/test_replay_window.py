@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.wire.codec.replay import ReplayWindow, Seen
+from skytether.wire.codec.replay_window import ReplayWindow, Seen
 
 SIZE = ReplayWindow.SIZE
 steps = st.one_of(
