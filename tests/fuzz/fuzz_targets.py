@@ -18,7 +18,7 @@ import numpy as np
 from skytether.bridge.relay_table import AMPLIFICATION, Prefix, RelayLimits, RelayTable, same_session
 from skytether.wire import Config, Direction, Role, Session, Topic
 from skytether.wire.codec import control, packet
-from skytether.wire.codec.table import MAX_TOPICS, index_topics, pull_answer, pull_offer
+from skytether.wire.codec.negotiation import MAX_TOPICS, index_topics, pull_answer, pull_offer
 from skytether.wire.connect.handshake import (
     _HELLO,
     _WELCOME,

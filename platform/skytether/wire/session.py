@@ -11,8 +11,8 @@ from .codec.ciphers import HandshakeTags
 from .codec.compression import Compressed, compress
 from .codec.control import Forward, Goodbye, Ping, Report
 from .codec.crypto import KEY_SIZE, TAG_SIZE
+from .codec.negotiation import index_topics
 from .codec.plaintext import INNER
-from .codec.table import index_topics
 from .config import Config
 from .connect.greeter import Greeter, Times
 from .connect.handshake import Doorkeeper

@@ -25,8 +25,8 @@ from dataclasses import dataclass, field
 
 from ..codec import crypto
 from ..codec.ciphers import Ciphers, HandshakeTags
+from ..codec.negotiation import TablesDifferError, negotiate, pull_answer, pull_offer, push_answer, push_offer
 from ..codec.packet import HELLO, WELCOME, push_common
-from ..codec.table import TablesDifferError, join, pull_answer, pull_offer, push_answer, push_offer
 from ..fec.fragment import Shape, Shards, shape_for
 from ..state.epoch import Epoch
 from ..topic import Topic
@@ -256,7 +256,7 @@ class Doorkeeper:
         epoch = next(e % 256 for e in range(proposed, proposed + 256) if e % 256 not in busy)
         reason, agreed = "", []
         try:
-            agreed = join(offered, self._topics)
+            agreed = negotiate(offered, self._topics)
         except TablesDifferError as error:
             reason = str(error)[:MAX_REASON]
         text = reason.encode()[:MAX_REASON] if reason else push_answer(agreed)

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.wire import Direction, Topic
-from skytether.wire.codec.table import (
+from skytether.wire.codec.negotiation import (
     TablesDifferError,
     index_topics,
-    join,
+    negotiate,
     pull_answer,
     pull_offer,
     push_answer,
@@ -51,7 +51,7 @@ def test_bytes_that_are_no_table_are_a_value_error(data):
 def test_quality_is_the_services_and_encoding_the_robots():
     robot = [Topic("a", "x/y", IN, "h", "ros1", priority=1), Topic("mine", "x/y", IN), Topic("b", "x/y", OUT)]
     service = index_topics([Topic("b", "x/y", OUT, priority=9), Topic("a", "x/y", IN, "", "cdr", priority=7, depth=3)])
-    assert join(robot, service) == [
+    assert negotiate(robot, service) == [
         (1, Topic("a", "x/y", IN, "h", "ros1", priority=7, depth=3)),
         (3, Topic("b", "x/y", OUT, priority=9)),
     ]
@@ -60,7 +60,7 @@ def test_quality_is_the_services_and_encoding_the_robots():
 def test_a_star_takes_what_the_robot_sends_and_named_rows_go_first():
     service = index_topics([Topic("*", "*", IN, depth=50), Topic("a", "x/y", IN, depth=3)])
     robot = [Topic("a", "x/y", IN), Topic("b", "any/thing", IN, "h"), Topic("c", "x/y", OUT)]
-    assert join(robot, service) == [
+    assert negotiate(robot, service) == [
         (1, Topic("a", "x/y", IN, depth=3)),
         (2, Topic("b", "any/thing", IN, "h", depth=50)),
     ]
@@ -76,12 +76,12 @@ def test_a_star_takes_what_the_robot_sends_and_named_rows_go_first():
 )
 def test_what_cannot_be_joined_is_named(robot, service, words):
     with pytest.raises(TablesDifferError) as error:
-        join([robot], index_topics([service]))
+        negotiate([robot], index_topics([service]))
     assert all(word in str(error.value) for word in words)
 
 
 def test_a_hash_that_one_end_does_not_know_is_no_difference():
-    [(_, agreed)] = join([Topic("a", "x/y", IN)], index_topics([Topic("a", "x/y", IN, "h")]))
+    [(_, agreed)] = negotiate([Topic("a", "x/y", IN)], index_topics([Topic("a", "x/y", IN, "h")]))
     assert agreed.type_hash == "h"
 
 
@@ -93,9 +93,9 @@ def test_a_topic_listed_twice_is_refused():
 def test_hashes_of_two_encodings_are_not_compared():
     """An MD5 of ROS 1 and a RIHS01 of ROS 2 say nothing of each other; what the robot has is agreed on."""
     robot, service = Topic("a", "x/y", IN, "11", "ros1"), Topic("a", "x/y", IN, "RIHS01_22", "cdr")
-    ((_, agreed),) = join([robot], {"a": service})
+    ((_, agreed),) = negotiate([robot], {"a": service})
     assert (agreed.type_hash, agreed.encoding) == ("11", "ros1")
-    ((_, agreed),) = join([replace(robot, type_hash="")], {"a": service})
+    ((_, agreed),) = negotiate([replace(robot, type_hash="")], {"a": service})
     assert agreed.type_hash == ""
 
 

@@ -40,7 +40,7 @@ def index_topics(topics: Sequence[Topic]) -> dict[str, Topic]:
     return table
 
 
-def join(robot: Sequence[Topic], service: Mapping[str, Topic]) -> list[tuple[int, Topic]]:
+def negotiate(robot: Sequence[Topic], service: Mapping[str, Topic]) -> list[tuple[int, Topic]]:
     """Agreed topics with their indices: position in the robot's table plus 1.
 
     Raises:
