@@ -25,7 +25,7 @@ from .receive.receiver import Receiver
 from .send.sender import Sender
 from .state.epoch import Epoch
 from .state.ledger import Ledger
-from .state.streams import Streams
+from .state.reliable_topics import ReliableTopics
 from .stats import SessionStats
 from .topic import ANY, Role, Topic
 
@@ -87,7 +87,7 @@ class Session:
             self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._ledger = Ledger(role)
-        self._streams = Streams(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
+        self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
         self._door = Doorkeeper(key, self._table, entropy) if service else None
         self._seeker = Seeker(session_id, key, topics, self._config, entropy)
         self._greeter = Greeter(
@@ -125,7 +125,7 @@ class Session:
         """
         epoch = self._epoch
         sender = epoch.send.get(topic) if epoch is not None else None
-        outbox = self._streams.outbox(topic) if epoch is None else sender.outbox if sender is not None else None
+        outbox = self._reliable.outbox(topic) if epoch is None else sender.outbox if sender is not None else None
         if self._closed or (outbox is None and (sender is None or not self._connected)):
             ours = self._table.get(topic)
             if ours is None or ours.direction.sender is not self.role:
@@ -141,7 +141,7 @@ class Session:
         if row is not None and row.topic.compression and not isinstance(payload, Compressed):
             payload = compress(payload)
         if outbox is not None:
-            return self._streams.put(outbox, payload, now)
+            return self._reliable.put(outbox, payload, now)
         if sender is not None:
             sender.counters.offered += 1
             self._sender.put(sender, payload, now)
@@ -288,7 +288,7 @@ class Session:
             return None
         due = min(
             self._sender.next_timer(full), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
-            self._check_at, self._rekey_at, self._streams.due,
+            self._check_at, self._rekey_at, self._reliable.due,
         )  # fmt: skip
         return due if due < math.inf else None
 
@@ -307,8 +307,8 @@ class Session:
         if now >= self._sweep_at:
             self._receiver.sweep(now)
             self._sweep_at = now + self._config.keepalive
-        if now >= self._streams.due:
-            for message in self._streams.handle_timer(now):
+        if now >= self._reliable.due:
+            for message in self._reliable.handle_timer(now):
                 self._sender.tell(message, now)
         if now >= self._report_at:
             self._report(now)
@@ -356,7 +356,7 @@ class Session:
             return
         self._sender.start_epoch(epoch)
         self._ledger.start_epoch(epoch)
-        restarted = self._streams.start_epoch(epoch, now)
+        restarted = self._reliable.start_epoch(epoch, now)
         self._delivery.start_epoch(epoch)
         self._paths.start_epoch(now)
         self._sweep_at = now + self._config.keepalive
@@ -369,7 +369,7 @@ class Session:
         self._epoch = None
         self._sender.start_epoch(None)
         self._delivery.end_epoch()
-        self._streams.start_epoch(None, now)
+        self._reliable.start_epoch(None, now)
         self._paths.end_epoch()
         self._sweep_at = self._report_at = self._rekey_at = math.inf
         if self._door is None:
@@ -390,7 +390,7 @@ class Session:
         self._connected = True
         self._check_at = now + self._config.silence
         self._events.append(Connected(topics, restarted))
-        self._streams.resume(now)
+        self._reliable.resume(now)
 
     def _disconnect(self, reason: str) -> None:
         self._connected = False
@@ -463,7 +463,7 @@ class Session:
                 exchange = self._paths.take(message, path, micros / 1e6, address, now)
                 if exchange is not None:
                     if path is self._paths.choice.active:
-                        self._streams.rtt.add(path.rtt)
+                        self._reliable.rtt.add(path.rtt)
                     self._delivery.clock.exchange(*exchange, now)
         elif isinstance(message, Report):
             self._ledger.take(message, epoch, now)
@@ -472,7 +472,7 @@ class Session:
         elif isinstance(message, Forward):
             self._delivery.forward(message, epoch, now)
         else:
-            self._streams.on_control(message, epoch, now)
+            self._reliable.on_control(message, epoch, now)
 
     # --- sending of our own accord
 

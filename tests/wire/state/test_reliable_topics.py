@@ -79,7 +79,7 @@ def test_everything_arrives_once_and_in_order_on_any_link(make_world, up, down, 
         for name in published:
             counted = row(link, role, name)
             assert (counted.lost, counted.expired, counted.replaced) == (0, 0, 0)
-        assert link.sessions[role]._streams._busy == set()
+        assert link.sessions[role]._reliable._busy == set()
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_memory_of_the_sender_is_bounded(world):
     topics = (Topic("event", "a/b", Direction.IN, lifespan=60.0, depth=10_000, reliable=True),)
     link = make(world, ends={"topics": topics, "config": config})
     link.models[SERVICE].conditions = LinkConditions(cut=True)
-    streams = link.sessions[ROBOT]._streams
+    streams = link.sessions[ROBOT]._reliable
     accepted = sum(link.publish(ROBOT, "event", bytes(10_000)) for _ in range(500))
     assert accepted == 2**20 // 10_000
     assert streams.outbox("event").used == accepted * 10_000

@@ -17,7 +17,7 @@ ACCOUNTS = 8
 """Large messages of a topic that one acknowledgement may come with; the others are remembered by the sender's timer."""
 
 
-class Streams:
+class ReliableTopics:
     """The reliable topics of one end.
 
     Args:
