@@ -24,8 +24,8 @@ from .receive.delivery import Delivery
 from .receive.receiver import Receiver
 from .send.sender import Sender
 from .state.epoch import Epoch
-from .state.ledger import Ledger
 from .state.reliable_topics import ReliableTopics
+from .state.topic_counters import TopicCounters
 from .stats import SessionStats
 from .topic import ANY, Role, Topic
 
@@ -86,12 +86,12 @@ class Session:
             self._find_epoch, self._on_message, self._on_handshake,
             self._delivery.expired, self._rejected,
         )  # fmt: skip
-        self._ledger = Ledger(role)
-        self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._ledger, self._sender.put_outbox)
+        self._counters = TopicCounters(role)
+        self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._counters, self._sender.put_outbox)
         self._door = Doorkeeper(key, self._table, entropy) if service else None
         self._seeker = Seeker(session_id, key, topics, self._config, entropy)
         self._greeter = Greeter(
-            self._door, self._seeker, self._paths, self._sender, self._ledger,
+            self._door, self._seeker, self._paths, self._sender, self._counters,
             welcome_tags if service else hello_tags, self._events, self._rejected, self._on_welcomed,
         )  # fmt: skip
 
@@ -227,9 +227,9 @@ class Session:
         rejected = Counter(self._rejected)
         if self._receiver.messages.evicted:
             rejected["evicted"] = self._receiver.messages.evicted
-        paths = self._paths.stats(*self._ledger.overhead(), now)
+        paths = self._paths.stats(*self._counters.overhead(), now)
         return SessionStats(
-            self._connected, self._ledger.stats(table), paths, dict(rejected), clock.offset,
+            self._connected, self._counters.stats(table), paths, dict(rejected), clock.offset,
             clock.error_at(now), self._handshakes, now - self._last_heard,
         )  # fmt: skip
 
@@ -355,7 +355,7 @@ class Session:
                 self._connect(epoch.topics, now)
             return
         self._sender.start_epoch(epoch)
-        self._ledger.start_epoch(epoch)
+        self._counters.start_epoch(epoch)
         restarted = self._reliable.start_epoch(epoch, now)
         self._delivery.start_epoch(epoch)
         self._paths.start_epoch(now)
@@ -466,7 +466,7 @@ class Session:
                         self._reliable.rtt.add(path.rtt)
                     self._delivery.clock.exchange(*exchange, now)
         elif isinstance(message, Report):
-            self._ledger.take(message, epoch, now)
+            self._counters.take(message, epoch, now)
         elif isinstance(message, Goodbye):
             self._end_epoch(now)
         elif isinstance(message, Forward):
@@ -479,7 +479,7 @@ class Session:
     def _report(self, now: float) -> None:
         if self._epoch is None:
             return
-        for message in control.push_reports(*self._ledger.rows(self._epoch, now)):
+        for message in control.push_reports(*self._counters.rows(self._epoch, now)):
             self._sender.tell(message, now)
 
     def _say(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:

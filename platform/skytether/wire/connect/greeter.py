@@ -17,7 +17,7 @@ from ..events import Event, Refused
 from ..path.path import Path, Transmit
 from ..send.sender import Sender
 from ..state.epoch import Epoch
-from ..state.ledger import Ledger
+from ..state.topic_counters import TopicCounters
 from .handshake import MAX_REASON, NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
 from .paths import Paths
 from .seeker import Seeker
@@ -39,7 +39,7 @@ class Greeter:
         seeker: Of the robot's end; the service's never speaks first.
         paths: Where to send.
         sender: Seals what is said under keys.
-        ledger: For the topics of a new epoch.
+        counters: For the topics of a new epoch.
         tags: Of handshake packets that this end sends.
         events: Where refusals go.
         rejected: Counters of what is refused.
@@ -53,7 +53,7 @@ class Greeter:
         seeker: Seeker,
         paths: Paths,
         sender: Sender,
-        ledger: Ledger,
+        counters: TopicCounters,
         tags: HandshakeTags,
         events: deque[Event],
         rejected: Counter[str],
@@ -63,7 +63,7 @@ class Greeter:
         self._seeker = seeker
         self._paths = paths
         self._sender = sender
-        self._ledger = ledger
+        self._counters = counters
         self._tags = tags
         self._events = events
         self._rejected = rejected
@@ -180,7 +180,7 @@ class Greeter:
             self._events.append(Refused(reason))
 
     def _make_epoch(self, outcome: Outcome) -> Epoch:
-        send, receive = self._ledger.topics(outcome.topics)
+        send, receive = self._counters.topics(outcome.topics)
         return Epoch(outcome.epoch, outcome.ciphers, tuple(t for _, t in outcome.topics), send, receive, outcome.life)
 
     def _send(self, common: bytes, message: bytes, path: Path, address: Hashable, most: float = math.inf) -> None:

@@ -11,7 +11,7 @@ from ..measure.rtt import RttEstimator
 from ..reliable.reliable import Inbox, Outbox
 from ..topic import Role, Topic
 from .epoch import Epoch, ReceiveTopic
-from .ledger import Ledger
+from .topic_counters import TopicCounters
 
 ACCOUNTS = 8
 """Large messages of a topic that one acknowledgement may come with; the others are remembered by the sender's timer."""
@@ -24,18 +24,20 @@ class ReliableTopics:
         role: Which end.
         topics: Its table: messages of its reliable topics are kept even before a peer was ever there.
         limit: Most payload bytes kept until they are acknowledged.
-        ledger: For the counters.
+        counters: For the counters.
         wake: Called with an outbox that has something to send and is not queued.
     """
 
     def __init__(
-        self, role: Role, topics: Iterable[Topic], limit: int, ledger: Ledger, wake: Callable[[Outbox], None]
+        self, role: Role, topics: Iterable[Topic], limit: int, counters: TopicCounters, wake: Callable[[Outbox], None]
     ) -> None:
         self._limit = limit
         self._wake = wake
         self.rtt = RttEstimator()
         self._ours = {t.name for t in topics if t.reliable and t.direction.sender is role}
-        self._outboxes = {t.name: Outbox(t, ledger.outbound(t.name), self.rtt) for t in topics if t.name in self._ours}
+        self._outboxes = {
+            t.name: Outbox(t, counters.outbound(t.name), self.rtt) for t in topics if t.name in self._ours
+        }
         self._inboxes: dict[str, Inbox] = {}
         self._busy: set[Outbox] = set()
         """Outboxes that may have a timer."""

@@ -22,7 +22,7 @@ _RECEIVED = ("delivered", "lost", "late", "expired", "superseded", "duplicate", 
 """Counters of the peer's rows; the rest of them are indices and times."""
 
 
-class Ledger:
+class TopicCounters:
     """Outlives epochs and peers: no counter goes down when a peer restarts. Bounded by the tables of both ends."""
 
     def __init__(self, role: Role) -> None:
