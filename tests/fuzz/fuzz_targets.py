@@ -26,7 +26,7 @@ from skytether.wire.connect.handshake import (
     MIN_HELLO,
     NO_KEYS,
     ROW_HELLO,
-    Doorkeeper,
+    HandshakeResponder,
     Hello,
     Pending,
     _key,
@@ -103,14 +103,14 @@ def tables(data: bytes) -> None:
 def hellos(data: bytes) -> None:
     """The service's answer to what a robot says that holds the key."""
     entropy = Random(1).randbytes
-    door = Doorkeeper(KEY, index_topics(TOPICS), entropy)
+    responder = HandshakeResponder(KEY, index_topics(TOPICS), entropy)
     offer = zlib.compress(data[HELLO_HEAD:])
     text = data[:HELLO_HEAD].ljust(HELLO_HEAD, b"\0") + len(offer).to_bytes(4, "big") + offer
     salt = entropy(32)
     for plaintext in (data, text.ljust(MIN_HELLO, b"\0")):
         common, message = _pack(packet.HELLO, SESSION_ID, salt, _key(KEY, salt, b"hello"), plaintext)
-        answer = door.answer(common, message, NO_KEYS, set(), 1.0)
-        again = door.answer(common, message, NO_KEYS, set(), 2.0)
+        answer = responder.answer(common, message, NO_KEYS, set(), 1.0)
+        again = responder.answer(common, message, NO_KEYS, set(), 2.0)
         assert type(again) is type(answer)
         if isinstance(answer, Pending):
             rows = text.count(b"[")

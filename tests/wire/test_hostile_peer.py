@@ -80,7 +80,7 @@ def test_a_question_from_two_addresses_proves_neither_whatever_paths_it_names(wo
     link.run(0.04)
     hello = bytearray(link.sent[ROBOT][0][1])
     hello[packet.PATH_AT] = 7
-    HandshakeTags(link.sessions[ROBOT]._seeker._key, b"hello").put(np.frombuffer(hello, np.uint8).reshape(1, -1))
+    HandshakeTags(link.sessions[ROBOT]._reconnector._key, b"hello").put(np.frombuffer(hello, np.uint8).reshape(1, -1))
     link.inject(SERVICE, bytes(hello), "victim")
     link.run(0.066)
     say(link, ROBOT, ping(7), path=7, address="victim")

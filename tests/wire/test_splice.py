@@ -70,7 +70,7 @@ def rekeyed(make_world):
         for road in link.roads.values():
             road.set(LinkConditions())
         if turn == 0:
-            link.sessions[ROBOT]._seeker.rekey(link.now)
+            link.sessions[ROBOT]._reconnector.rekey(link.now)
         link.run(0.3)
     for role in Role:
         first, second = link.lost[role]
@@ -183,7 +183,7 @@ def test_questions_after_keys_of_then_make_no_keys_later(world, monkeypatch):
     link.run(1.0)
     seen = [p for at, p in link.sent[ROBOT] if p[0] == packet.HELLO and at >= start]
     assert len(set(seen)) >= 2
-    link.sessions[ROBOT]._seeker.rekey(link.now)
+    link.sessions[ROBOT]._reconnector.rekey(link.now)
     link.run(0.5)
     assert link.sessions[SERVICE].stats(link.now).handshakes == 2
     exchanged = []
@@ -243,7 +243,7 @@ def test_an_old_welcome_answers_no_new_hello(world):
     link.run(2.0)
     old = [p for _, p in link.sent[SERVICE] if p[0] == packet.WELCOME]
     link.run(link.sessions[ROBOT]._rekey_at - link.now + 0.005)
-    assert link.sessions[ROBOT]._seeker.hello is not None
+    assert link.sessions[ROBOT]._reconnector.hello is not None
     handshakes, counts = link.sessions[ROBOT].stats(link.now).handshakes, refused(link, ROBOT)
     for one in old:
         link.inject(ROBOT, one)

@@ -14,10 +14,10 @@ from .codec.crypto import KEY_SIZE, TAG_SIZE
 from .codec.negotiation import index_topics
 from .codec.plaintext import INNER
 from .config import Config
-from .connect.greeter import Greeter, Times
-from .connect.handshake import Doorkeeper
+from .connect.handshake import HandshakeResponder
+from .connect.handshake_driver import HandshakeDriver, Times
 from .connect.paths import Choice, Paths
-from .connect.seeker import Seeker
+from .connect.reconnect import Reconnector
 from .events import Connected, Disconnected, Event, MessageReceived
 from .path.path import Path, Transmit
 from .receive.delivery import Delivery
@@ -88,10 +88,10 @@ class Session:
         )  # fmt: skip
         self._counters = TopicCounters(role)
         self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._counters, self._sender.put_outbox)
-        self._door = Doorkeeper(key, self._table, entropy) if service else None
-        self._seeker = Seeker(session_id, key, topics, self._config, entropy)
-        self._greeter = Greeter(
-            self._door, self._seeker, self._paths, self._sender, self._counters,
+        self._responder = HandshakeResponder(key, self._table, entropy) if service else None
+        self._reconnector = Reconnector(session_id, key, topics, self._config, entropy)
+        self._driver = HandshakeDriver(
+            self._responder, self._reconnector, self._paths, self._sender, self._counters,
             welcome_tags if service else hello_tags, self._events, self._rejected, self._on_welcomed,
         )  # fmt: skip
 
@@ -160,8 +160,8 @@ class Session:
             if path in (None, each.id):
                 each.peer = each.address = address
                 each.validation.clear()
-        if self._door is None and not self._closed:
-            self._seeker.look_at({p.peer for p in self._paths}, connected=self._epoch is not None)
+        if self._responder is None and not self._closed:
+            self._reconnector.set_peers({p.peer for p in self._paths}, connected=self._epoch is not None)
 
     def open_path(self, path: int, now: float, *, cost: int = 0, peer: Hashable | None = None) -> None:
         """Add a path from the robot's end, or change its cost; path 0 is there from the beginning.
@@ -183,7 +183,7 @@ class Session:
         opened = self._paths.open(path, cost, now)
         if not known:
             opened.peer = opened.address = self._peer if peer is None else peer
-            self._seeker.peers.add(opened.peer)
+            self._reconnector.peers.add(opened.peer)
         for each in self._paths:
             self._paths.ping(each, now)
         self._paths.choose(now)
@@ -259,7 +259,7 @@ class Session:
     def transmit(self, now: float, full: Container[int] = ()) -> list[Transmit]:
         """What may be sent now, at most a burst by each path that is not ``full``; call again until it is nothing."""
         sent: list[Transmit] = []
-        for waiting in (self._greeter.waiting, self._sender.astray):
+        for waiting in (self._driver.waiting, self._sender.astray):
             sent += waiting
             waiting.clear()
         for path in self._paths:
@@ -287,8 +287,8 @@ class Session:
         if self._closed:
             return None
         due = min(
-            self._sender.next_timer(full), self._seeker.due, self._paths.next_timer(), self._sweep_at, self._report_at,
-            self._check_at, self._rekey_at, self._reliable.due,
+            self._sender.next_timer(full), self._reconnector.due, self._paths.next_timer(), self._reliable.due,
+            self._sweep_at, self._report_at, self._check_at, self._rekey_at,
         )  # fmt: skip
         return due if due < math.inf else None
 
@@ -300,9 +300,9 @@ class Session:
             self._check(now)
         if now >= self._rekey_at:
             self._rekey_at = math.inf
-            self._seeker.rekey(now)
-        if now >= self._seeker.due:
-            self._greeter.seek(self._epoch, self._last_heard, now)
+            self._reconnector.rekey(now)
+        if now >= self._reconnector.due:
+            self._driver.send_hello(self._epoch, self._last_heard, now)
         self._paths.handle_timer(now, now - self._last_heard, self._connected)
         if now >= self._sweep_at:
             self._receiver.sweep(now)
@@ -313,13 +313,13 @@ class Session:
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
-            if self._door is None and self._epoch is not None and self._epoch.volume >= self._config.rekey_bytes:
-                self._seeker.rekey(now)
+            if self._responder is None and self._epoch is not None and self._epoch.volume >= self._config.rekey_bytes:
+                self._reconnector.rekey(now)
 
     # --- keys
 
     def _on_handshake(self, kind: int, common: bytes, message: bytes, path: int, address: Hashable, now: float) -> None:
-        self._greeter.take(kind, common, message, path, address, self._epoch, self._previous, now)
+        self._driver.handle_handshake(kind, common, message, path, address, self._epoch, self._previous, now)
 
     def _on_welcomed(self, epoch: Epoch, times: Times | None, now: float) -> None:
         self._start_epoch(epoch, now)
@@ -332,7 +332,7 @@ class Session:
             return epoch
         if self._previous is not None and self._previous.ciphers.packet_id == packet_id:
             return self._previous
-        return self._door.pending(packet_id) if self._door is not None else None
+        return self._responder.pending(packet_id) if self._responder is not None else None
 
     def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
@@ -343,10 +343,10 @@ class Session:
             self._previous, self._previous_until = before, now + self._config.old_keys
         self._epoch = epoch
         self._handshakes += 1
-        self._greeter.done()
+        self._driver.done()
         self._last_heard = now
-        self._rekey_at = now + self._config.rekey_after if self._door is None else math.inf
-        self._seeker.found(now, epoch.id)
+        self._rekey_at = now + self._config.rekey_after if self._responder is None else math.inf
+        self._reconnector.found(now, epoch.id)
         if goes_on:
             self._sender.change_keys(epoch)
             self._delivery.change_keys(epoch)
@@ -372,8 +372,8 @@ class Session:
         self._reliable.start_epoch(None, now)
         self._paths.end_epoch()
         self._sweep_at = self._report_at = self._rekey_at = math.inf
-        if self._door is None:
-            self._seeker.rest(now + self._config.hello_retry)
+        if self._responder is None:
+            self._reconnector.pause(now + self._config.hello_retry)
         if self._connected:
             self._disconnect("goodbye")
 
@@ -420,22 +420,22 @@ class Session:
         """One authentic message, the first time that it is complete."""
         asked_from: Hashable | None = None
         if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
-            if self._door is not None:
-                asked_from = self._door.confirm(epoch)
+            if self._responder is not None:
+                asked_from = self._responder.confirm(epoch)
             self._start_epoch(epoch, now)
         came_by = self._paths.get(path)
-        if came_by is None and self._door is not None:
+        if came_by is None and self._responder is not None:
             said = control.pull_control(plaintext[INNER.size :]) if index == 0 else None
             came_by = self._paths.admit(path, said, now)
-        if epoch is self._epoch and self._seeker.counts(address):
+        if epoch is self._epoch and self._reconnector.counts(address):
             self._last_heard = now
             if came_by is not None:
                 size = len(plaintext) + TAG_SIZE
                 self._paths.heard(came_by, number, address, size, now, proven=address == asked_from)
             if not self._connected:
                 self._connect(epoch.topics, now)
-            if self._seeker.hello is not None and not self._seeker.rekeying:
-                self._seeker.found(now, epoch.id)
+            if self._reconnector.hello is not None and not self._reconnector.rekeying:
+                self._reconnector.found(now, epoch.id)
         sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
             self._on_control(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
@@ -458,7 +458,7 @@ class Session:
             return
         elif isinstance(message, Ping):
             if path is not None and path.id == message.path:
-                if self._door is not None:
+                if self._responder is not None:
                     path.cost = message.cost
                 exchange = self._paths.take(message, path, micros / 1e6, address, now)
                 if exchange is not None:

@@ -7,7 +7,7 @@ import pytest
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Disconnected, Refused, Role, Session, Topic
 from skytether.wire.codec import packet
-from skytether.wire.connect.handshake import Doorkeeper
+from skytether.wire.connect.handshake import HandshakeResponder
 from skytether.wire.fec.loss import LossModel
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
@@ -325,22 +325,22 @@ def test_an_answer_is_at_most_three_times_as_long_however_much_is_lost(world, lo
 
 def test_why_a_peer_refuses_is_one_short_line(world):
     link = world.link(connect=False)
-    link.sessions[ROBOT]._greeter._refuse("\x1b[2Jgone\n" + "x" * 100_000)
+    link.sessions[ROBOT]._driver._refuse("\x1b[2Jgone\n" + "x" * 100_000)
     (refused,) = [e for e in iter(link.sessions[ROBOT].next_event, None) if isinstance(e, Refused)]
     assert refused.reason == "?[2Jgone?" + "x" * 291
 
 
 @pytest.mark.slow
 def test_used_hellos_and_pending_handshakes_are_bounded(world, topics):
-    door = Doorkeeper(bytes(32), {t.name: t for t in topics}, world.random.randbytes)
+    responder = HandshakeResponder(bytes(32), {t.name: t for t in topics}, world.random.randbytes)
     from skytether.wire.connect.handshake import NO_KEYS, Hello
 
-    for i in range(Doorkeeper.MAX_USED + 100):
+    for i in range(HandshakeResponder.MAX_USED + 100):
         hello = Hello(1, bytes(32), topics[:1], i % 256, NO_KEYS, bytes(8), world.random.randbytes, i)
-        answer = door.answer(hello.common, hello.message, NO_KEYS, {5}, 0.0)
+        answer = responder.answer(hello.common, hello.message, NO_KEYS, {5}, 0.0)
         assert answer.outcome.epoch != 5
-    assert len(door._pending) == door.MAX_PENDING
-    assert len(door._used) == door.MAX_USED
+    assert len(responder._pending) == responder.MAX_PENDING
+    assert len(responder._used) == responder.MAX_USED
 
 
 @pytest.mark.parametrize(

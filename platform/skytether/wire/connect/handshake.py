@@ -188,7 +188,7 @@ class Resume:
     """HELLO of a robot that still holds the service's keys."""
 
 
-class Doorkeeper:
+class HandshakeResponder:
     """The service's end of all handshakes of a session."""
 
     MAX_PENDING = 4

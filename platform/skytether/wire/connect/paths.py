@@ -21,7 +21,7 @@ from ..path.liveness import HURRY, Health
 from ..path.mtu import SMALL
 from ..path.path import Path
 from ..stats import PathStats
-from .seeker import patience
+from .reconnect import patience
 
 MAX_PATHS = 8
 """Paths that an end keeps."""

@@ -24,7 +24,7 @@ class ReliableTopics:
         role: Which end.
         topics: Its table: messages of its reliable topics are kept even before a peer was ever there.
         limit: Most payload bytes kept until they are acknowledged.
-        counters: For the counters.
+        counters: Of all topics.
         wake: Called with an outbox that has something to send and is not queued.
     """
 

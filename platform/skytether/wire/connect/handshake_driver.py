@@ -1,6 +1,6 @@
 """The conversation around a handshake: what is said and answered, by which path, to which address (rule 1).
 
-The messages themselves are made and read in `handshake`, when to speak first is decided in `seeker`, and what new
+The messages themselves are made and read in `handshake`, when to speak first is decided in `reconnect`, and what new
 keys begin is the session's business.
 """
 
@@ -18,9 +18,9 @@ from ..path.path import Path, Transmit
 from ..send.sender import Sender
 from ..state.epoch import Epoch
 from ..state.topic_counters import TopicCounters
-from .handshake import MAX_REASON, NO_KEYS, Doorkeeper, Hello, Outcome, Resume, cut
+from .handshake import MAX_REASON, NO_KEYS, HandshakeResponder, Hello, Outcome, Resume, cut
 from .paths import Paths
-from .seeker import Seeker
+from .reconnect import Reconnector
 
 AMPLIFICATION = 3
 """Bytes of an answer for each that was asked with, for nobody knows yet who asks."""
@@ -31,15 +31,15 @@ Times = tuple[float, float, float]
 """t1, t2, t3 in seconds, the first by the robot's clock."""
 
 
-class Greeter:
+class HandshakeDriver:
     """Handshakes of one end, on its paths.
 
     Args:
-        door: Of the service's end; None at the robot's.
-        seeker: Of the robot's end; the service's never speaks first.
+        responder: Of the service's end; None at the robot's.
+        reconnector: Of the robot's end; the service's never speaks first.
         paths: Where to send.
         sender: Seals what is said under keys.
-        counters: For the topics of a new epoch.
+        counters: Of all topics, for those of a new epoch.
         tags: Of handshake packets that this end sends.
         events: Where refusals go.
         rejected: Counters of what is refused.
@@ -49,8 +49,8 @@ class Greeter:
 
     def __init__(
         self,
-        door: Doorkeeper | None,
-        seeker: Seeker,
+        responder: HandshakeResponder | None,
+        reconnector: Reconnector,
         paths: Paths,
         sender: Sender,
         counters: TopicCounters,
@@ -59,8 +59,8 @@ class Greeter:
         rejected: Counter[str],
         welcomed: Callable[[Epoch, Times | None, float], None],
     ) -> None:
-        self._door = door
-        self._seeker = seeker
+        self._responder = responder
+        self._reconnector = reconnector
         self._paths = paths
         self._sender = sender
         self._counters = counters
@@ -73,10 +73,10 @@ class Greeter:
         self.waiting: deque[Transmit] = deque()
         """Packets on their way before everything else."""
 
-    def seek(self, epoch: Epoch | None, last_heard: float, now: float) -> None:
+    def send_hello(self, epoch: Epoch | None, last_heard: float, now: float) -> None:
         """The robot's end: ask for the service, or whether it still knows the keys in use."""
         held = None if epoch is None else epoch.ciphers
-        hello = self._seeker.seek(held, last_heard, now)
+        hello = self._reconnector.next_hello(held, last_heard, now)
         if hello is not None:
             for path in self._paths:
                 if path.peer is not None:
@@ -84,7 +84,7 @@ class Greeter:
                 if held is not None:
                     self._paths.ping(path, now)
 
-    def take(
+    def handle_handshake(
         self,
         kind: int,
         common: bytes,
@@ -107,10 +107,10 @@ class Greeter:
             previous: Those before, if still kept.
             now: Time.
         """
-        if kind == HELLO and self._door is not None:
-            self._on_hello(self._door, common, message, path, address, epoch, previous, now)
-        elif kind == WELCOME and self._seeker.hello is not None:
-            self._on_welcome(self._seeker.hello, common, message, path, now)
+        if kind == HELLO and self._responder is not None:
+            self._on_hello(self._responder, common, message, path, address, epoch, previous, now)
+        elif kind == WELCOME and self._reconnector.hello is not None:
+            self._on_welcome(self._reconnector.hello, common, message, path, now)
         else:
             self._rejected["unasked"] += 1
 
@@ -120,7 +120,7 @@ class Greeter:
 
     def _on_hello(
         self,
-        door: Doorkeeper,
+        responder: HandshakeResponder,
         common: bytes,
         message: bytes,
         path: int,
@@ -131,7 +131,7 @@ class Greeter:
     ) -> None:
         held = NO_KEYS if epoch is None or epoch.spent else epoch.ciphers.resume
         taken = {e.id for e in (epoch, previous) if e is not None}
-        answer = door.answer(common, message, held, taken, now)
+        answer = responder.answer(common, message, held, taken, now)
         if isinstance(answer, str):
             self._rejected[answer] += 1
         elif isinstance(answer, Resume):
@@ -154,7 +154,7 @@ class Greeter:
             return
         if welcome.outcome is None:
             self._refuse(welcome.reason)
-            self._seeker.refused(now)
+            self._reconnector.refused(now)
             return
         sole = hello.sent == 1  # else nobody knows which one was answered, and the first ping will tell more
         self._welcomed(self._make_epoch(welcome.outcome), welcome.times if sole else None, now)

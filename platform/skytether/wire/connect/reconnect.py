@@ -24,7 +24,7 @@ def patience(config: Config, silence: float) -> float:
     return min(max(config.probe_interval, PROBE_SHARE * silence), config.hello_retry_max)
 
 
-class Seeker:
+class Reconnector:
     """Makes HELLO when it is time. The service's end has one that never does."""
 
     def __init__(self, session_id: int, key: bytes, topics: Sequence[Topic], config: Config, entropy: Entropy) -> None:
@@ -42,13 +42,13 @@ class Seeker:
         self.hello: Hello | None = None
         """The one that is to be answered."""
         self.due = math.inf
-        """When to call `seek`."""
+        """When to call `next_hello`."""
         self._elsewhere = False
         """Told to look in another place, from which no answer came yet."""
         self.rekeying = False
         """New keys are wanted although those in use work."""
 
-    def look_at(self, peers: set[Hashable], connected: bool) -> None:
+    def set_peers(self, peers: set[Hashable], connected: bool) -> None:
         """Look there at once, even if somebody is heard from another place."""
         self.peers = peers
         self.hello = None
@@ -76,16 +76,16 @@ class Seeker:
             self.hello = None
             self.due = now
 
-    def rest(self, until: float) -> None:
+    def pause(self, until: float) -> None:
         """Ask again, anew, at that time."""
         self.hello = None
         self.due = until
 
     def refused(self, now: float) -> None:
         """The service has other topics: ask again, rarely."""
-        self.rest(now + self._config.hello_retry_max)
+        self.pause(now + self._config.hello_retry_max)
 
-    def seek(self, held: Ciphers | None, last_heard: float, now: float) -> Hello | None:
+    def next_hello(self, held: Ciphers | None, last_heard: float, now: float) -> Hello | None:
         """What to send now.
 
         Args:
