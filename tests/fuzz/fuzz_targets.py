@@ -17,7 +17,7 @@ import numpy as np
 
 from skytether.bridge.relay_table import AMPLIFICATION, Prefix, RelayLimits, RelayTable, same_session
 from skytether.wire import Config, Direction, Role, Session, Topic
-from skytether.wire.codec import control, packet
+from skytether.wire.codec import frames, packet
 from skytether.wire.codec.negotiation import MAX_TOPICS, index_topics, pull_answer, pull_offer
 from skytether.wire.connect.handshake import (
     _HELLO,
@@ -85,10 +85,10 @@ def headers(data: bytes) -> None:
 
 
 def controls(data: bytes) -> None:
-    """Codec of control messages."""
-    message = control.pull_control(data)
-    if isinstance(message, control.Ping):
-        again = control.pull_control(control.push_ping(message))
+    """Codec of frames."""
+    message = frames.pull_frame(data)
+    if isinstance(message, frames.Ping):
+        again = frames.pull_frame(frames.push_ping(message))
         assert again == message
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from skytether.lab.link_model import LinkConditions
 from skytether.wire import Role
-from skytether.wire.codec import control, packet
+from skytether.wire.codec import frames, packet
 from skytether.wire.codec.ciphers import HandshakeTags
 from skytether.wire.codec.plaintext import INNER
 from skytether.wire.connect.paths import MAX_PATHS
@@ -17,7 +17,7 @@ ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 
 
 def say(link, role, message, *, stamp=None, path=0, address=None):
-    """Let an end hear a control message that its peer sealed, by any path and with any time stamp."""
+    """Let an end hear a frame that its peer sealed, by any path and with any time stamp."""
     receiver = SERVICE if role is ROBOT else ROBOT
     epoch = link.sessions[role]._epoch
     epoch.next_number += 1
@@ -29,12 +29,12 @@ def say(link, role, message, *, stamp=None, path=0, address=None):
     link.inject(receiver, own.packet(path, packet_number, 0), address or link.addresses[role])
 
 
-NOTHING = control.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
+NOTHING = frames.Feedback(math.inf, 0.0, 0.0, 0, 0, 0, 0.0, 0.0)
 
 
 def ping(path=0, **fields):
-    return control.push_ping(
-        control.Ping(
+    return frames.push_ping(
+        frames.Ping(
             **{
                 "path": path,
                 "cost": 0,
@@ -122,4 +122,4 @@ def test_a_path_that_was_left_wakes_nobody(world):
     choice = session._paths.choice
     (idle,) = {0, 1, 2} - {choice.active.id, choice.other.id}
     session._paths.close(idle, link.now)
-    assert set(session._sender._lanes) == {p.path for p in session.stats(link.now).paths}
+    assert set(session._sender._path_queues) == {p.path for p in session.stats(link.now).paths}

@@ -6,11 +6,11 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Container, Hashable, Sequence
 
-from .codec import control
+from .codec import frames
 from .codec.ciphers import HandshakeTags
 from .codec.compression import Compressed, compress
-from .codec.control import Forward, Goodbye, Ping, Report
 from .codec.crypto import KEY_SIZE, TAG_SIZE
+from .codec.frames import Forward, Goodbye, Ping, Report
 from .codec.negotiation import index_topics
 from .codec.plaintext import INNER
 from .config import Config
@@ -210,7 +210,7 @@ class Session:
         if self._epoch is not None:
             self._report(now)
             for _ in range(GOODBYES):
-                self._sender.tell(control.push_goodbye(), now)
+                self._sender.tell(frames.push_goodbye(), now)
         self._closed = True
         if self._connected:
             self._disconnect("closed")
@@ -425,7 +425,7 @@ class Session:
             self._start_epoch(epoch, now)
         came_by = self._paths.get(path)
         if came_by is None and self._responder is not None:
-            said = control.pull_control(plaintext[INNER.size :]) if index == 0 else None
+            said = frames.pull_frame(plaintext[INNER.size :]) if index == 0 else None
             came_by = self._paths.admit(path, said, now)
         if epoch is self._epoch and self._reconnector.counts(address):
             self._last_heard = now
@@ -438,7 +438,7 @@ class Session:
                 self._reconnector.found(now, epoch.id)
         sequence, stamp = INNER.unpack_from(plaintext)
         if index == 0:
-            self._on_control(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
+            self._on_frame(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
             return
         self._delivery.take(epoch, epoch.receive[index], plaintext, sequence, stamp, now)
 
@@ -448,10 +448,10 @@ class Session:
     def _on_moved(self, path: Path, since: float, now: float) -> None:
         self._sender.repeat(path, since, now)
 
-    def _on_control(
+    def _on_frame(
         self, epoch: Epoch, data: bytes, micros: int, path: Path | None, address: Hashable, now: float
     ) -> None:
-        message = control.pull_control(data)
+        message = frames.pull_frame(data)
         if message is None:
             self._rejected["control"] += 1
         elif not epoch.belongs_with(self._epoch):
@@ -472,14 +472,14 @@ class Session:
         elif isinstance(message, Forward):
             self._delivery.forward(message, epoch, now)
         else:
-            self._reliable.on_control(message, epoch, now)
+            self._reliable.on_frame(message, epoch, now)
 
     # --- sending of our own accord
 
     def _report(self, now: float) -> None:
         if self._epoch is None:
             return
-        for message in control.push_reports(*self._counters.rows(self._epoch, now)):
+        for message in frames.push_reports(*self._counters.rows(self._epoch, now)):
             self._sender.tell(message, now)
 
     def _say(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:

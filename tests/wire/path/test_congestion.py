@@ -7,7 +7,7 @@ import pytest
 
 from skytether.lab.link_model import LinkConditions, LinkModel
 from skytether.wire import Direction, Role, Topic
-from skytether.wire.codec.control import Feedback
+from skytether.wire.codec.frames import Feedback
 from skytether.wire.path.congestion import LOWEST, MARGIN, PATIENCE, TARGET, RateControl
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE

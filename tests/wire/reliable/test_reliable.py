@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.wire.codec.control import (
+from skytether.wire.codec.frames import (
     MISSING_ROWS,
     Ack,
     Forward,
     Missing,
-    pull_control,
+    pull_frame,
     push_ack,
     push_forward,
     push_missing,
@@ -37,10 +37,10 @@ indices = st.integers(0, 2**16 - 1)
     ),
     st.builds(Forward, indices, numbers),
 )  # fmt: skip
-def test_control_messages_travel_in_a_packet(ack, missing, forward):
-    assert pull_control(push_ack(ack)) == ack
-    assert pull_control(push_missing(missing)) == missing
-    assert pull_control(push_forward(forward)) == forward
+def test_frames_travel_in_a_packet(ack, missing, forward):
+    assert pull_frame(push_ack(ack)) == ack
+    assert pull_frame(push_missing(missing)) == missing
+    assert pull_frame(push_forward(forward)) == forward
     assert len(push_missing(missing)) < 1024
 
 

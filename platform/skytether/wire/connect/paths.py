@@ -11,8 +11,8 @@ import math
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import NamedTuple
 
-from ..codec.control import PING_SIZE, Control, Ping, push_ping
 from ..codec.crypto import TAG_SIZE
+from ..codec.frames import PING_SIZE, Frame, Ping, push_ping
 from ..codec.packet import HEADER_SIZE
 from ..codec.plaintext import INNER
 from ..config import Config
@@ -124,12 +124,12 @@ class Paths:
         path.cost = cost
         return path
 
-    def admit(self, path_id: int, message: Control | None, now: float) -> Path | None:
+    def admit(self, path_id: int, message: Frame | None, now: float) -> Path | None:
         """The robot speaks by a path that is not known yet: its ping says so, or there is none other.
 
         Args:
             path_id: The path.
-            message: What it says, if that is a control message.
+            message: What it says, if that is a frame.
             now: Time.
         """
         if any(p.address is not None for p in self) and not (isinstance(message, Ping) and message.path == path_id):

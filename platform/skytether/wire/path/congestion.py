@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from ..codec.control import Feedback
+from ..codec.frames import Feedback
 
 TARGET = 0.002
 """Seconds of standing queue that are tolerated; on a slow path the time of one and a half packets."""

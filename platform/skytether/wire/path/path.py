@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from ..codec.control import MOST_ASTRAY, MOST_RUN, Feedback
+from ..codec.frames import MOST_ASTRAY, MOST_RUN, Feedback
 from ..config import Config
 from ..fec.loss import LossEstimate, Sums
 from ..fec.redundancy import Redundancy

@@ -10,7 +10,7 @@ from collections import Counter, deque
 from dataclasses import replace
 
 from ..codec.compression import FLAG, Packed, decompress, unpacked_size
-from ..codec.control import Forward
+from ..codec.frames import Forward
 from ..codec.plaintext import INNER
 from ..events import Event, MessageReceived
 from ..measure.clock import ClockOffset

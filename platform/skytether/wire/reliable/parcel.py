@@ -71,7 +71,7 @@ class Parcel(Shards):
         self._landed(self, now)
 
     def missing(self, until: int, rows: tuple[tuple[int, bytes], ...], now: float, timeout: float) -> int:
-        """The peer tells what it lacks (see `control.Missing`).
+        """The peer tells what it lacks (see `frames.Missing`).
 
         Returns:
             How many shards are to be sent again: those that were sent longer ago than ``timeout``.

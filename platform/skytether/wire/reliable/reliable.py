@@ -14,7 +14,7 @@ import math
 from collections import deque
 
 from ..codec.compression import original_size
-from ..codec.control import Ack
+from ..codec.frames import Ack
 from ..codec.plaintext import PREFIX
 from ..fec.reassembly import Entry
 from ..measure.counters import Outbound

@@ -24,8 +24,8 @@ from ..path.path import Path, Transmit
 from ..reliable.parcel import Parcel
 from ..reliable.reliable import NUMBER_SPAN, Outbox
 from ..state.epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
-from .lane import MAX_SEGMENTS, Batches, Copy, Flight, Lane
 from .message import LoneShard, Message
+from .path_queue import MAX_SEGMENTS, Batches, Copy, InFlight, PathQueue
 from .queue import SendQueue
 
 NO_WAVES = Copies(0, 0.0)
@@ -47,9 +47,9 @@ class Sender:
         self._config = config
         self.epoch: Epoch | None = None
         self._control = _control()
-        self._lanes = {path.id: Lane(path, config.queue_limit)}
-        self._active = self._lanes[path.id]
-        self._other: Lane | None = None
+        self._path_queues = {path.id: PathQueue(path, config.queue_limit)}
+        self._active = self._path_queues[path.id]
+        self._other: PathQueue | None = None
         self._doubled = False
         self.astray: deque[Transmit] = deque()
         """Packets to other addresses than those of their paths."""
@@ -70,13 +70,13 @@ class Sender:
             now: Time.
         """
         before, already = self._active, self._doubled
-        self._lanes = {p.id: self._lane(p) for p in paths}
-        self._active = self._lanes[active.id]
-        self._other = self._lanes[other.id] if other is not None else None
+        self._path_queues = {p.id: self._path_queue(p) for p in paths}
+        self._active = self._path_queues[active.id]
+        self._other = self._path_queues[other.id] if other is not None else None
         self._doubled = doubled
         if self._active is not before:
             before.queue, self._active.queue = self._active.queue, before.queue
-            before.land_parcels(now)
+            before.land_reliable(now)
             if not already:
                 before.repeat(self._active, before.path.liveness.confirmed_at, now)
         elif self._other is not None and doubled and not already:
@@ -84,8 +84,8 @@ class Sender:
 
     def start_epoch(self, epoch: Epoch | None) -> None:
         """Use other keys from now on; what was queued or under way for the old ones is dropped."""
-        for lane in self._lanes.values():
-            lane.clear()
+        for path_queue in self._path_queues.values():
+            path_queue.clear()
         self.astray.clear()
         self.epoch = epoch
         self._control = _control()
@@ -104,14 +104,14 @@ class Sender:
         self._active.queue.put_other(outbox.topic.priority, outbox)
 
     def tell(self, message: bytes, now: float) -> None:
-        """Queue a control message, once: the next one of its kind makes up for its loss."""
+        """Queue a frame, once: the next one of its kind makes up for its loss."""
         self.put(self._control, message, now, extra=0)
 
     def say(self, path: Path, message: bytes, now: float) -> None:
-        """Send a control message of one packet by that path, once and at once, however large the packet."""
+        """Send a frame of one packet by that path, once and at once, however large the packet."""
         packet = self._packet(message, path, path.number, now)
         if packet is not None:
-            self._lane(path).say(packet)
+            self._path_queue(path).add_urgent(packet)
 
     def say_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
         """The same to some address, which need not be the path's; returns its bytes, 0 if it cannot be sent."""
@@ -125,11 +125,11 @@ class Sender:
 
     def repeat(self, path: Path, since: float, now: float) -> None:
         """The peer moved: send again what went where it was not any more, of topics that ask for every effort."""
-        lane = self._lane(path)
-        lane.repeat(lane, since, now)
+        path_queue = self._path_queue(path)
+        path_queue.repeat(path_queue, since, now)
 
     def _packet(self, message: bytes, path: Path, number: Callable[[], int], now: float) -> bytes | None:
-        """Seal a control message of one packet, which gets that number; None if there are no keys."""
+        """Seal a frame of one packet, which gets that number; None if there are no keys."""
         epoch, topic = self.epoch, self._control
         if epoch is None or epoch.spent:
             return None
@@ -137,21 +137,21 @@ class Sender:
         topic.counters.bytes_sent += len(packet)
         return packet
 
-    def _lane(self, path: Path) -> Lane:
-        lane = self._lanes.get(path.id)
-        if lane is None or lane.path is not path:
-            lane = self._lanes[path.id] = Lane(path, self._config.queue_limit)
-        return lane
+    def _path_queue(self, path: Path) -> PathQueue:
+        path_queue = self._path_queues.get(path.id)
+        if path_queue is None or path_queue.path is not path:
+            path_queue = self._path_queues[path.id] = PathQueue(path, self._config.queue_limit)
+        return path_queue
 
     def next_timer(self, full: Container[int] = ()) -> float:
         """When `transmit` will have something to send by paths not ``full``; 0 for at once, inf for never."""
         due = math.inf
         if self.epoch is not None and self.epoch.spent:
             return due
-        for lane in self._lanes.values():
-            path = lane.path
+        for path_queue in self._path_queues.values():
+            path = path_queue.path
             if path.address is not None and path.id not in full:
-                due = min(due, lane.next_timer())
+                due = min(due, path_queue.next_timer())
         return due
 
     def transmit(self, path: Path, now: float) -> list[Transmit]:
@@ -159,10 +159,10 @@ class Sender:
         epoch, address = self.epoch, path.address
         if epoch is None or address is None or epoch.spent:
             return []
-        lane = self._lane(path)
-        queue, flights, copies = lane.queue, lane.flights, lane.copies
-        lane.wake = math.inf
-        if not (queue or flights or lane.urgent or (copies and copies[0].due <= now)):
+        path_queue = self._path_queue(path)
+        queue, in_flight, copies = path_queue.queue, path_queue.in_flight, path_queue.copies
+        path_queue.wake = math.inf
+        if not (queue or in_flight or path_queue.urgent or (copies and copies[0].due <= now)):
             return []
         while copies and copies[0].due <= now:
             copy = heapq.heappop(copies)
@@ -170,53 +170,53 @@ class Sender:
         pacer = path.pacer
         left = min(pacer.budget(now), self._config.burst)
         batches = Batches(path.id, address)
-        for packet in lane.urgent:
+        for packet in path_queue.urgent:
             batches.add(packet)
             left -= len(packet)
             path.bytes_sent += len(packet)
             epoch.bytes_sent += len(packet)
             pacer.spend(len(packet))
-        lane.urgent.clear()
-        while (priority := queue.priority) >= 0 or flights:
-            if flights and flights[-1].topic.priority >= priority:
-                flight = flights[-1]
-                shards = flight.shards
-                if flight.deadline < now:
-                    flights.pop()
-                    flight.topic.counters.expired += 1
+        path_queue.urgent.clear()
+        while (priority := queue.priority) >= 0 or in_flight:
+            if in_flight and in_flight[-1].topic.priority >= priority:
+                top = in_flight[-1]
+                shards = top.shards
+                if top.deadline < now:
+                    in_flight.pop()
+                    top.topic.counters.expired += 1
                     continue
                 if not shards.remaining:  # delivered or given up meanwhile
-                    flights.pop()
+                    in_flight.pop()
                     shards.land(now)
                     continue
                 size = shards.packet_size
                 need = min(shards.remaining * size, max(size, pacer.quantum // size * size))
                 if left < need:
-                    lane.wake = pacer.ready_at(need)
+                    path_queue.wake = pacer.ready_at(need)
                     break
                 path.large = True
-                flight.sent_at = now
+                top.sent_at = now
                 count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
-                counters = flight.topic.counters
+                counters = top.topic.counters
                 counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
                 batches.add_run(shards.take(count, path.id, path.number(count), ticks(now)), size)
                 shards.sent(count, now)
                 sent = count * size
                 counters.bytes_sent += sent
                 if not shards.remaining:
-                    flights.pop()
+                    in_flight.pop()
                     shards.land(now)
             elif left <= 0 and priority < CONTROL_PRIORITY:
-                lane.wake = pacer.ready_at(1)
+                path_queue.wake = pacer.ready_at(1)
                 break
             else:
                 item = queue.pop(now)
                 if isinstance(item, Copy):
-                    sent = self._send_copy(item, lane, batches, now)
+                    sent = self._send_copy(item, path_queue, batches, now)
                 elif isinstance(item, Outbox):
-                    sent = self._send_letter(epoch, item, lane, batches, now)
+                    sent = self._send_letter(epoch, item, path_queue, batches, now)
                 elif item is not None:
-                    sent = self._send_first(epoch, *item, lane, batches, now)
+                    sent = self._send_first(epoch, *item, path_queue, batches, now)
                 else:
                     continue
             left -= sent
@@ -233,33 +233,33 @@ class Sender:
         payload: bytes,
         published_at: float,
         extra: int | None,
-        lane: Lane,
+        path_queue: PathQueue,
         batches: Batches,
         now: float,
     ) -> int:
-        """Seal a message; send it if it is one shard, else put it on top of the flights. Returns bytes sent."""
+        """Seal a message; send it if it is one shard, else put it on top of those in flight. Returns bytes sent."""
         message = self._next(epoch, topic, payload, published_at)
-        if message.size <= lane.room:
-            return self._send_small(topic, message, published_at + topic.lifespan, extra, lane, batches, now)
-        common, sealed, shape = message.seal(lane.shard_room)
+        if message.size <= path_queue.room:
+            return self._send_small(topic, message, published_at + topic.lifespan, extra, path_queue, batches, now)
+        common, sealed, shape = message.seal(path_queue.shard_room)
         tagger = message.ciphers.tagger
-        redundancy, k, deadline = lane.path.redundancy, shape.block_k(0), now + topic.lifespan
+        redundancy, k, deadline = path_queue.path.redundancy, shape.block_k(0), now + topic.lifespan
         waves = redundancy.waves(k, topic.delivery, topic.lifespan) if shape.blocks == 1 else NO_WAVES
         parity = 0 if waves.more else redundancy.parity(k, shape.blocks, topic.delivery)
         rows = range(k, k + k * waves.more)
         for row, shard in zip(rows, encode_sealed(sealed, shape, rows), strict=True):
             due = now + (row // k) * waves.spacing
             lone = LoneShard(common, row, shard, tagger)
-            heapq.heappush(lane.copies, Copy(topic, lone, 1, waves.spacing, due, deadline))
-        flight = Flight(topic, Shards(common, sealed, shape, parity, tagger), deadline)
-        lane.flights.append(flight)
+            heapq.heappush(path_queue.copies, Copy(topic, lone, 1, waves.spacing, due, deadline))
+        sending = InFlight(topic, Shards(common, sealed, shape, parity, tagger), deadline)
+        path_queue.in_flight.append(sending)
         if self._other is not None or topic.redundant:
-            lane.remember(flight, now)
+            path_queue.remember(sending, now)
         if self._other is not None and (self._doubled or topic.redundant):
-            self._other.take(flight, now)
+            self._other.enqueue(sending, now)
         return 0
 
-    def _send_letter(self, epoch: Epoch, outbox: Outbox, lane: Lane, batches: Batches, now: float) -> int:
+    def _send_letter(self, epoch: Epoch, outbox: Outbox, path_queue: PathQueue, batches: Batches, now: float) -> int:
         """The next of a reliable topic: seal it, or go on with the shards of a large one. Returns bytes sent."""
         outbox.queued = False
         letter, topic = outbox.next(now), epoch.send.get(outbox.topic.name)
@@ -270,7 +270,7 @@ class Sender:
         parcel = letter.parcel
         if parcel is not None and (
             parcel.number + NUMBER_SPAN < epoch.next_number
-            or parcel.packet_size > lane.shard_room + SHARD_AT
+            or parcel.packet_size > path_queue.shard_room + SHARD_AT
             or (parcel.tagger is not epoch.ciphers.tagger and not parcel.flying)
         ):
             parcel.cancel()
@@ -279,15 +279,15 @@ class Sender:
             plaintext = push_inner(letter.sequence, letter.published_at, letter.payload)
             plaintext += outbox.prefix(letter) + letter.payload
             message = self._number(epoch, topic, plaintext)
-            if message.size <= lane.room:
+            if message.size <= path_queue.room:
                 outbox.sent(letter, now)
-                return self._send_small(topic, message, letter.deadline, None, lane, batches, now)
+                return self._send_small(topic, message, letter.deadline, None, path_queue, batches, now)
             landed = partial(outbox.landed, letter)
-            sealed = message.seal(lane.shard_room)
+            sealed = message.seal(path_queue.shard_room)
             parcel = letter.parcel = Parcel(message.number, *sealed, message.ciphers.tagger, landed)
         if not parcel.flying:
             parcel.flying = True
-            lane.flights.append(Flight(topic, parcel, math.inf))
+            path_queue.in_flight.append(InFlight(topic, parcel, math.inf))
         return 0
 
     def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> Message:
@@ -312,34 +312,34 @@ class Sender:
         message: Message,
         deadline: float,
         extra: int | None,
-        lane: Lane,
+        path_queue: PathQueue,
         batches: Batches,
         now: float,
     ) -> int:
         """Send a message of one packet, and plan its copies. Returns bytes sent."""
         other = self._other
-        planned, spacing = lane.path.redundancy.copies(topic.delivery, topic.lifespan)
+        planned, spacing = path_queue.path.redundancy.copies(topic.delivery, topic.lifespan)
         extra = planned if extra is None else extra
         if other is not None or topic.redundant:
             sent = Copy(topic, message, 0, spacing, 0.0, deadline)
-            lane.remember(sent, now)
+            path_queue.remember(sent, now)
             # every second copy goes by the other path, one at once
             if other is not None and (self._doubled or topic.redundant or (extra and message.size <= other.room)):
                 there = max(1, (extra + 1) // 2)
-                other.take(sent, now, there)
+                other.enqueue(sent, now, there)
                 extra = max(0, extra - there)
         if extra:
-            heapq.heappush(lane.copies, Copy(topic, message, extra, spacing, now + spacing, deadline))
-        return self._send_packet(topic, message, lane.path, batches, now)
+            heapq.heappush(path_queue.copies, Copy(topic, message, extra, spacing, now + spacing, deadline))
+        return self._send_packet(topic, message, path_queue.path, batches, now)
 
-    def _send_copy(self, copy: Copy, lane: Lane, batches: Batches, now: float) -> int:
+    def _send_copy(self, copy: Copy, path_queue: PathQueue, batches: Batches, now: float) -> int:
         if copy.deadline < now:
             return 0
         copy.left -= 1
         if copy.left:
             copy.due = now + copy.spacing
-            heapq.heappush(lane.copies, copy)
-        size = self._send_packet(copy.topic, copy.content, lane.path, batches, now)
+            heapq.heappush(path_queue.copies, copy)
+        size = self._send_packet(copy.topic, copy.content, path_queue.path, batches, now)
         copy.topic.counters.bytes_redundant += size
         return size
 
@@ -352,5 +352,5 @@ class Sender:
 
 
 def _control() -> SendTopic:
-    """What an epoch's control messages are sent as; nobody reads their counters."""
+    """What an epoch's frames are sent as; nobody reads their counters."""
     return SendTopic(0, CONTROL, Outbound(), CONTROL_PRIORITY)

@@ -1,11 +1,11 @@
-"""All reliable topics of a session: what outlives handshakes, what is said about them in control messages, and when."""
+"""All reliable topics of a session: what outlives handshakes, what is said about them in frames, and when."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
 
-from ..codec.control import MISSING_ROWS, Ack, Forward, Missing, push_ack, push_forward, push_missing
+from ..codec.frames import MISSING_ROWS, Ack, Forward, Missing, push_ack, push_forward, push_missing
 from ..codec.packet import pull_number
 from ..measure.rtt import RttEstimator
 from ..reliable.reliable import Inbox, Outbox
@@ -106,7 +106,7 @@ class ReliableTopics:
             outbox.resume(now)
             self._stir(outbox)
 
-    def on_control(self, message: Ack | Missing, epoch: Epoch, now: float) -> None:
+    def on_frame(self, message: Ack | Missing, epoch: Epoch, now: float) -> None:
         """The peer tells what it has of what we send."""
         outbox = next((t.outbox for t in epoch.send.values() if t.index == message.topic), None)
         if outbox is None:
@@ -118,7 +118,7 @@ class ReliableTopics:
         self._stir(outbox)
 
     def handle_timer(self, now: float) -> Iterator[bytes]:
-        """Do what is due; yields control messages to send."""
+        """Do what is due; yields frames to send."""
         for outbox in list(self._busy):
             if outbox.due <= now:
                 outbox.handle_timer(now)

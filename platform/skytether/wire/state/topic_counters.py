@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from ..codec.control import ReceiverRow, Report, SenderRow
+from ..codec.frames import ReceiverRow, Report, SenderRow
 from ..measure.counters import Inbound, Outbound
 from ..stats import TopicStats
 from ..topic import Role, Topic

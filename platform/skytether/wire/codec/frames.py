@@ -1,4 +1,4 @@
-"""Codec of control messages: what the two ends tell each other beside the topics. Only ever read after opening."""
+"""Codec of frames: what the two ends tell each other beside the topics, each in a sealed message of topic 0."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class Forward(NamedTuple):
     base: int
 
 
-Control = Ping | Report | Goodbye | Ack | Missing | Forward
+Frame = Ping | Report | Goodbye | Ack | Missing | Forward
 
 
 PING_SIZE = _PING.size
@@ -210,7 +210,7 @@ def _pull_astray(data: bytes) -> tuple[tuple[int, int], ...]:
     return tuple(_ASTRAY.unpack_from(data, start + i * _ASTRAY.size) for i in range(count))
 
 
-def pull_control(data: bytes) -> Control | None:
+def pull_frame(data: bytes) -> Frame | None:
     """Decode any of them; None if it is none. Longer messages of later versions are cut to what is known."""
     try:
         kind = data[0]

@@ -22,7 +22,7 @@ MAX_URGENT = 16
 """Pings that may wait for the socket: they tell nothing when they are late."""
 MAX_TAKEN = 4096
 """Small messages of another path that may wait; a path that is too slow for them misses the rest."""
-MAX_FLIGHTS = 64
+MAX_IN_FLIGHT = 64
 """Large ones; the lowest priorities give way."""
 RECENT_TIME = 1.0
 """Seconds for which sent messages are kept in case that their path turns out to be broken."""
@@ -60,7 +60,7 @@ class Copy:
         return self.content.size
 
 
-class Flight:
+class InFlight:
     """A large message of which some packets are still to be sent."""
 
     __slots__ = ("deadline", "sent_at", "shards", "topic")
@@ -116,23 +116,23 @@ class Batches:
             self._run = []
 
 
-class Lane:
+class PathQueue:
     """State of sending on one path."""
 
-    __slots__ = ("_recent", "_recent_bytes", "copies", "flights", "path", "queue", "urgent", "wake")
+    __slots__ = ("_recent", "_recent_bytes", "copies", "in_flight", "path", "queue", "urgent", "wake")
 
     def __init__(self, path: Path, queue_limit: int) -> None:
         self.path = path
         self.queue: SendQueue[Copy | Outbox] = SendQueue(queue_limit)
         """Copies that are due, and of the active path the messages that are not sealed yet."""
-        self.flights: list[Flight] = []
+        self.in_flight: list[InFlight] = []
         """Rising priority: the last is sent first."""
         self.copies: list[Copy] = []
         """Heap by due time."""
         self.urgent: list[bytes] = []
         """Packets that wait for nothing."""
         self.wake = math.inf
-        self._recent: deque[tuple[float, Copy | Flight]] = deque()
+        self._recent: deque[tuple[float, Copy | InFlight]] = deque()
         self._recent_bytes = 0
 
     @property
@@ -148,7 +148,7 @@ class Lane:
     def clear(self) -> None:
         """Drop everything."""
         self.queue.clear()
-        for waiting in (self.flights, self.copies, self.urgent, self._recent):
+        for waiting in (self.in_flight, self.copies, self.urgent, self._recent):
             waiting.clear()
         self._recent_bytes = 0
         self.wake = math.inf
@@ -159,15 +159,15 @@ class Lane:
             return 0.0
         return min(self.copies[0].due, self.wake) if self.copies else self.wake
 
-    def say(self, packet: bytes) -> None:
+    def add_urgent(self, packet: bytes) -> None:
         """Send a packet before everything else."""
         if len(self.urgent) < MAX_URGENT:
             self.urgent.append(packet)
 
-    def take(self, message: Copy | Flight, now: float, times: int = 1) -> None:
+    def enqueue(self, message: Copy | InFlight, now: float, times: int = 1) -> None:
         """Send a message that another path has as well; a small one that many times."""
         topic, deadline = message.topic, message.deadline
-        if isinstance(message, Flight):
+        if isinstance(message, InFlight):
             shards = message.shards.again(self.shard_room)
         elif message.size > self.room and isinstance(message.content, Message):
             shards = message.content.shards(self.shard_room)
@@ -176,18 +176,18 @@ class Lane:
                 copy = Copy(topic, message.content, times, message.spacing, now, deadline)
                 self.queue.put_other(topic.priority, copy)
             return
-        insort_left(self.flights, Flight(topic, shards, deadline), key=_priority)
-        del self.flights[:-MAX_FLIGHTS]
+        insort_left(self.in_flight, InFlight(topic, shards, deadline), key=_priority)
+        del self.in_flight[:-MAX_IN_FLIGHT]
         self.wake = now
 
-    def land_parcels(self, now: float) -> None:
+    def land_reliable(self, now: float) -> None:
         """This path is not the active one any more: what is reliable goes on by another, as its timers say."""
-        parcels = [f.shards for f in self.flights if isinstance(f.shards, Parcel)]
-        self.flights = [f for f in self.flights if not isinstance(f.shards, Parcel)]
+        parcels = [f.shards for f in self.in_flight if isinstance(f.shards, Parcel)]
+        self.in_flight = [f for f in self.in_flight if not isinstance(f.shards, Parcel)]
         for parcel in parcels:
             parcel.land(now)
 
-    def remember(self, message: Copy | Flight, now: float) -> None:
+    def remember(self, message: Copy | InFlight, now: float) -> None:
         """Keep a message that was sent just now."""
         recent = self._recent
         recent.append((now, message))
@@ -195,7 +195,7 @@ class Lane:
         while recent[0][0] < now - RECENT_TIME or (self._recent_bytes > RECENT_BYTES and len(recent) > 1):
             self._recent_bytes -= recent.popleft()[1].size
 
-    def repeat(self, other: Lane, since: float, now: float) -> None:
+    def repeat(self, other: PathQueue, since: float, now: float) -> None:
         """Have another path (or this one, which leads elsewhere now) send what may not have arrived by this one.
 
         Args:
@@ -204,13 +204,13 @@ class Lane:
             now: Time.
         """
         for sent_at, message in self._recent:
-            if isinstance(message, Flight):
+            if isinstance(message, InFlight):
                 sent_at = now if message.shards.remaining else message.sent_at
             if sent_at >= since and message.deadline >= now:
-                other.take(message, now)
+                other.enqueue(message, now)
         self._recent.clear()
         self._recent_bytes = 0
 
 
-def _priority(flight: Flight) -> int:
-    return flight.topic.priority
+def _priority(message: InFlight) -> int:
+    return message.topic.priority
