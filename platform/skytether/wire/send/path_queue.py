@@ -11,7 +11,7 @@ from ..codec.packet import HEADER_SIZE, SHARD_AT
 from ..fec.fragment import Shards
 from ..path.path import Path, Transmit
 from ..reliable.parcel import Parcel
-from ..reliable.reliable import Outbox
+from ..reliable.reliable_sender import Outbox
 from ..state.epoch import SendTopic
 from .message import LoneShard, Message
 from .queue import SendQueue

@@ -22,7 +22,7 @@ from ..fec.redundancy import Copies
 from ..measure.counters import Outbound
 from ..path.path import Path, Transmit
 from ..reliable.parcel import Parcel
-from ..reliable.reliable import NUMBER_SPAN, Outbox
+from ..reliable.reliable_sender import NUMBER_SPAN, Outbox
 from ..state.epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
 from .message import LoneShard, Message
 from .path_queue import MAX_SEGMENTS, Batches, Copy, InFlight, PathQueue

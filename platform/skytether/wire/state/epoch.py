@@ -10,7 +10,7 @@ from ..codec.replay_window import PacketWindow, ReplayWindow
 from ..config import MAX_REKEY_BYTES
 from ..measure.counters import Inbound, Outbound
 from ..measure.sequence import SequenceTracker
-from ..reliable.reliable import Inbox, Outbox
+from ..reliable.reliable_sender import Inbox, Outbox
 from ..topic import Direction, PathUse, Topic
 
 CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from ..codec.frames import MISSING_ROWS, Ack, Forward, Missing, push_ack, push_forward, push_missing
 from ..codec.packet import pull_number
 from ..measure.rtt import RttEstimator
-from ..reliable.reliable import Inbox, Outbox
+from ..reliable.reliable_sender import Inbox, Outbox
 from ..topic import Role, Topic
 from .epoch import Epoch, ReceiveTopic
 from .topic_counters import TopicCounters

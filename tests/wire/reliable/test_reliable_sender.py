@@ -22,7 +22,7 @@ from skytether.wire.fec.fragment import shape_for
 from skytether.wire.measure.counters import Outbound
 from skytether.wire.measure.rtt import FIRST, LONGEST, RttEstimator
 from skytether.wire.reliable.parcel import Parcel
-from skytether.wire.reliable.reliable import WINDOW, WINDOW_BYTES, Inbox, Outbox
+from skytether.wire.reliable.reliable_sender import WINDOW, WINDOW_BYTES, Inbox, Outbox
 from skytether.wire.topic import Direction, Topic
 
 numbers = st.integers(0, 2**64 - 1)
