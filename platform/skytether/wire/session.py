@@ -87,7 +87,9 @@ class Session:
             self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._counters = TopicCounters(role)
-        self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._counters, self._sender.put_outbox)
+        self._reliable = ReliableTopics(
+            role, topics, self._config.queue_limit, self._counters, self._sender.put_reliable
+        )
         self._responder = HandshakeResponder(key, self._table, entropy) if service else None
         self._reconnector = Reconnector(session_id, key, topics, self._config, entropy)
         self._driver = HandshakeDriver(
@@ -125,8 +127,10 @@ class Session:
         """
         epoch = self._epoch
         sender = epoch.send.get(topic) if epoch is not None else None
-        outbox = self._reliable.outbox(topic) if epoch is None else sender.outbox if sender is not None else None
-        if self._closed or (outbox is None and (sender is None or not self._connected)):
+        reliable = (
+            self._reliable.sender(topic) if epoch is None else sender.reliable_sender if sender is not None else None
+        )
+        if self._closed or (reliable is None and (sender is None or not self._connected)):
             ours = self._table.get(topic)
             if ours is None or ours.direction.sender is not self.role:
                 raise KeyError(f"topic '{topic}' is not one that this end ({self.role}) sends")
@@ -137,11 +141,11 @@ class Session:
             raise ValueError(
                 f"topic '{topic}': {len(payload)} bytes are more than a message may have, {self._config.max_message}"
             )
-        row = sender or outbox
+        row = sender or reliable
         if row is not None and row.topic.compression and not isinstance(payload, Compressed):
             payload = compress(payload)
-        if outbox is not None:
-            return self._reliable.put(outbox, payload, now)
+        if reliable is not None:
+            return self._reliable.put(reliable, payload, now)
         if sender is not None:
             sender.counters.offered += 1
             self._sender.put(sender, payload, now)

@@ -6,17 +6,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.wire.codec.frames import (
+    MISSING_ROWS,
     MOST_ASTRAY,
     MOST_RUN,
     PING_SIZE,
+    Ack,
     Feedback,
+    Forward,
     Goodbye,
+    Missing,
     Ping,
     ReceiverRow,
     Report,
     SenderRow,
     pull_frame,
+    push_ack,
+    push_forward,
     push_goodbye,
+    push_missing,
     push_ping,
     push_reports,
 )
@@ -90,3 +97,22 @@ def test_any_bytes_are_read_or_refused(data):
     assert pull_frame(data) is None or data[0] in range(1, 7)
     for kind in range(1, 7):
         pull_frame(bytes([kind]) + data)
+
+
+numbers = st.integers(0, 2**64 - 1)
+indices = st.integers(0, 2**16 - 1)
+
+
+@given(
+    st.builds(Ack, indices, numbers, st.binary(max_size=128)),
+    st.builds(
+        Missing, indices, numbers, indices,
+        st.lists(st.tuples(indices, st.binary(min_size=13, max_size=13)), max_size=MISSING_ROWS).map(tuple),
+    ),
+    st.builds(Forward, indices, numbers),
+)  # fmt: skip
+def test_frames_travel_in_a_packet(ack, missing, forward):
+    assert pull_frame(push_ack(ack)) == ack
+    assert pull_frame(push_missing(missing)) == missing
+    assert pull_frame(push_forward(forward)) == forward
+    assert len(push_missing(missing)) < 1024

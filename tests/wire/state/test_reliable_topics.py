@@ -156,14 +156,14 @@ def test_memory_of_the_sender_is_bounded(world):
     topics = (Topic("event", "a/b", Direction.IN, lifespan=60.0, depth=10_000, reliable=True),)
     link = make(world, ends={"topics": topics, "config": config})
     link.models[SERVICE].conditions = LinkConditions(cut=True)
-    streams = link.sessions[ROBOT]._reliable
+    reliable = link.sessions[ROBOT]._reliable
     accepted = sum(link.publish(ROBOT, "event", bytes(10_000)) for _ in range(500))
     assert accepted == 2**20 // 10_000
-    assert streams.outbox("event").used == accepted * 10_000
+    assert reliable.sender("event").used == accepted * 10_000
     link.models[SERVICE].conditions = LinkConditions()
     link.run(10)
     assert received(link, SERVICE, "event") == [bytes(10_000)] * accepted
-    assert streams.outbox("event").used == 0
+    assert reliable.sender("event").used == 0
 
 
 @pytest.mark.slow

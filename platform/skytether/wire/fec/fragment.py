@@ -94,19 +94,9 @@ class Shards:
     """One sealed message on its way out. Packets are made as they are sent, parity when it is needed."""
 
     __slots__ = (
-        "_common",
-        "_data",
-        "_parity",
-        "_sent",
-        "_shape",
-        "_summed",
-        "_sums",
-        "_tails",
-        "length",
-        "packet_size",
-        "remaining",
-        "tagger",
-    )
+        "_common", "_data", "_parity", "_sent", "_shape", "_summed", "_sums", "_tails", "length", "packet_size",
+        "remaining", "tagger",
+    )  # fmt: skip
 
     def __init__(self, common: bytes, sealed: memoryview, shape: Shape, parity: int, tagger: Tagger) -> None:
         """Take a sealed message.

@@ -34,18 +34,9 @@ class LossMeter:
     """Runs of numbers that were not sent here, kept until they are evaluated."""
 
     __slots__ = (
-        "_astray",
-        "_in_run",
-        "_numbers",
-        "_settled",
-        "_span",
-        "_times",
-        "lost",
-        "runs",
-        "settled",
-        "time",
+        "_astray", "_in_run", "_numbers", "_settled", "_span", "_times", "lost", "runs", "settled", "time",
         "time_squared",
-    )
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self._numbers = array("I")

@@ -65,18 +65,18 @@ class Delivery:
             size = len(plaintext) - INNER.size
             payload = plaintext[INNER.size :] if size <= COPY_BELOW else memoryview(plaintext)[INNER.size :]
             self._deliver(epoch, topic, sequence, stamp, payload, now)
-        elif topic.inbox is None:
+        elif topic.reliable_receiver is None:
             self._rejected["epoch"] += 1
         else:
-            for delivery in topic.inbox.take(plaintext[INNER.size :], stamp, now):
+            for delivery in topic.reliable_receiver.receive_message(plaintext[INNER.size :], stamp, now):
                 self._deliver(epoch, topic, *delivery, now)
 
     def forward(self, message: Forward, epoch: Epoch, now: float) -> None:
         """The sender gave up messages of a reliable topic: those after them need not wait any more."""
         topic = epoch.receive.get(message.topic)
-        if topic is not None and topic.inbox is not None:
-            topic.inbox.touch(now)
-            for delivery in topic.inbox.forward(message.base):
+        if topic is not None and topic.reliable_receiver is not None:
+            topic.reliable_receiver.touch(now)
+            for delivery in topic.reliable_receiver.forward(message.base):
                 self._deliver(epoch, topic, *delivery, now)
 
     def expired(self, index: int) -> None:

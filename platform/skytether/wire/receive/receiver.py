@@ -263,8 +263,8 @@ class Receiver:
         entry = self.messages.entry(common, size, length, topic, block, lifespan, now)
         if entry is None:
             self.rejected["shape"] += packets
-        elif topic and (inbox := epoch.receive[topic].inbox) is not None:
-            inbox.touch(now, entry)
+        elif topic and (reliable := epoch.receive[topic].reliable_receiver) is not None:
+            reliable.touch(now, entry)
         return entry
 
     def _refused(self, epoch: Epoch, number: int, topic: int, packets: int, now: float) -> bool:
@@ -280,8 +280,8 @@ class Receiver:
             self.rejected["old"] += packets
         elif receiver is not None:
             receiver.counters.duplicate += packets
-            if receiver.inbox is not None:  # the sender does not know that it arrived
-                receiver.inbox.touch(now)
+            if receiver.reliable_receiver is not None:  # the sender does not know that it arrived
+                receiver.reliable_receiver.touch(now)
         return True
 
     def _open(self, epoch: Epoch, number: int, topic: int, plaintext: bytes | None, by: int, origin: Origin) -> None:

@@ -10,8 +10,8 @@ from collections.abc import Hashable
 from ..codec.packet import HEADER_SIZE, SHARD_AT
 from ..fec.fragment import Shards
 from ..path.path import Path, Transmit
-from ..reliable.parcel import Parcel
-from ..reliable.reliable_sender import Outbox
+from ..reliable.reliable_sender import ReliableSender
+from ..reliable.selective_repeat import SelectiveRepeat
 from ..state.epoch import SendTopic
 from .message import LoneShard, Message
 from .queue import SendQueue
@@ -123,7 +123,7 @@ class PathQueue:
 
     def __init__(self, path: Path, queue_limit: int) -> None:
         self.path = path
-        self.queue: SendQueue[Copy | Outbox] = SendQueue(queue_limit)
+        self.queue: SendQueue[Copy | ReliableSender] = SendQueue(queue_limit)
         """Copies that are due, and of the active path the messages that are not sealed yet."""
         self.in_flight: list[InFlight] = []
         """Rising priority: the last is sent first."""
@@ -182,10 +182,10 @@ class PathQueue:
 
     def land_reliable(self, now: float) -> None:
         """This path is not the active one any more: what is reliable goes on by another, as its timers say."""
-        parcels = [f.shards for f in self.in_flight if isinstance(f.shards, Parcel)]
-        self.in_flight = [f for f in self.in_flight if not isinstance(f.shards, Parcel)]
-        for parcel in parcels:
-            parcel.land(now)
+        reliable = [f.shards for f in self.in_flight if isinstance(f.shards, SelectiveRepeat)]
+        self.in_flight = [f for f in self.in_flight if not isinstance(f.shards, SelectiveRepeat)]
+        for shards in reliable:
+            shards.land(now)
 
     def remember(self, message: Copy | InFlight, now: float) -> None:
         """Keep a message that was sent just now."""

@@ -21,8 +21,8 @@ from ..fec.fragment import Shards, encode_sealed
 from ..fec.redundancy import Copies
 from ..measure.counters import Outbound
 from ..path.path import Path, Transmit
-from ..reliable.parcel import Parcel
-from ..reliable.reliable_sender import NUMBER_SPAN, Outbox
+from ..reliable.reliable_sender import NUMBER_SPAN, ReliableSender
+from ..reliable.selective_repeat import SelectiveRepeat
 from ..state.epoch import CONTROL, CONTROL_PRIORITY, Epoch, SendTopic
 from .message import LoneShard, Message
 from .path_queue import MAX_SEGMENTS, Batches, Copy, InFlight, PathQueue
@@ -55,7 +55,7 @@ class Sender:
         """Packets to other addresses than those of their paths."""
 
     @property
-    def queue(self) -> SendQueue[Copy | Outbox]:
+    def queue(self) -> SendQueue[Copy | ReliableSender]:
         """Messages that are not sealed yet."""
         return self._active.queue
 
@@ -98,10 +98,10 @@ class Sender:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
         self._active.queue.put(topic, payload, published_at, extra)
 
-    def put_outbox(self, outbox: Outbox) -> None:
+    def put_reliable(self, reliable: ReliableSender) -> None:
         """Queue a reliable topic that has something to send."""
-        outbox.queued = True
-        self._active.queue.put_other(outbox.topic.priority, outbox)
+        reliable.queued = True
+        self._active.queue.put_other(reliable.topic.priority, reliable)
 
     def tell(self, message: bytes, now: float) -> None:
         """Queue a frame, once: the next one of its kind makes up for its loss."""
@@ -213,8 +213,8 @@ class Sender:
                 item = queue.pop(now)
                 if isinstance(item, Copy):
                     sent = self._send_copy(item, path_queue, batches, now)
-                elif isinstance(item, Outbox):
-                    sent = self._send_letter(epoch, item, path_queue, batches, now)
+                elif isinstance(item, ReliableSender):
+                    sent = self._send_reliable(epoch, item, path_queue, batches, now)
                 elif item is not None:
                     sent = self._send_first(epoch, *item, path_queue, batches, now)
                 else:
@@ -259,35 +259,37 @@ class Sender:
             self._other.enqueue(sending, now)
         return 0
 
-    def _send_letter(self, epoch: Epoch, outbox: Outbox, path_queue: PathQueue, batches: Batches, now: float) -> int:
+    def _send_reliable(
+        self, epoch: Epoch, reliable: ReliableSender, path_queue: PathQueue, batches: Batches, now: float
+    ) -> int:
         """The next of a reliable topic: seal it, or go on with the shards of a large one. Returns bytes sent."""
-        outbox.queued = False
-        letter, topic = outbox.next(now), epoch.send.get(outbox.topic.name)
-        if outbox.ready:
-            self.put_outbox(outbox)
-        if letter is None or topic is None:
+        reliable.queued = False
+        pending, topic = reliable.next(now), epoch.send.get(reliable.topic.name)
+        if reliable.ready:
+            self.put_reliable(reliable)
+        if pending is None or topic is None:
             return 0
-        parcel = letter.parcel
-        if parcel is not None and (
-            parcel.number + NUMBER_SPAN < epoch.next_number
-            or parcel.packet_size > path_queue.shard_room + SHARD_AT
-            or (parcel.tagger is not epoch.ciphers.tagger and not parcel.flying)
+        shards = pending.shards
+        if shards is not None and (
+            shards.number + NUMBER_SPAN < epoch.next_number
+            or shards.packet_size > path_queue.shard_room + SHARD_AT
+            or (shards.tagger is not epoch.ciphers.tagger and not shards.sending)
         ):
-            parcel.cancel()
-            parcel = letter.parcel = None
-        if parcel is None:
-            plaintext = push_inner(letter.sequence, letter.published_at, letter.payload)
-            plaintext += outbox.prefix(letter) + letter.payload
+            shards.cancel()
+            shards = pending.shards = None
+        if shards is None:
+            plaintext = push_inner(pending.sequence, pending.published_at, pending.payload)
+            plaintext += reliable.prefix(pending) + pending.payload
             message = self._number(epoch, topic, plaintext)
             if message.size <= path_queue.room:
-                outbox.sent(letter, now)
-                return self._send_small(topic, message, letter.deadline, None, path_queue, batches, now)
-            landed = partial(outbox.landed, letter)
+                reliable.sent(pending, now)
+                return self._send_small(topic, message, pending.deadline, None, path_queue, batches, now)
+            landed = partial(reliable.landed, pending)
             sealed = message.seal(path_queue.shard_room)
-            parcel = letter.parcel = Parcel(message.number, *sealed, message.ciphers.tagger, landed)
-        if not parcel.flying:
-            parcel.flying = True
-            path_queue.in_flight.append(InFlight(topic, parcel, math.inf))
+            shards = pending.shards = SelectiveRepeat(message.number, *sealed, message.ciphers.tagger, landed)
+        if not shards.sending:
+            shards.sending = True
+            path_queue.in_flight.append(InFlight(topic, shards, math.inf))
         return 0
 
     def _next(self, epoch: Epoch, topic: SendTopic, payload: bytes, published_at: float) -> Message:

@@ -10,7 +10,8 @@ from ..codec.replay_window import PacketWindow, ReplayWindow
 from ..config import MAX_REKEY_BYTES
 from ..measure.counters import Inbound, Outbound
 from ..measure.sequence import SequenceTracker
-from ..reliable.reliable_sender import Inbox, Outbox
+from ..reliable.reliable_receiver import ReliableReceiver
+from ..reliable.reliable_sender import ReliableSender
 from ..topic import Direction, PathUse, Topic
 
 CONTROL = Topic("control", "control", Direction.IN, lifespan=1.0, depth=64, delivery=0.9, paths=PathUse.REDUNDANT)
@@ -29,9 +30,8 @@ class SendTopic:
     """A topic that this end sends, during one epoch."""
 
     __slots__ = (
-        "counters", "delivery", "depth", "index", "lifespan", "name", "outbox", "priority", "ready", "redundant",
-        "sequence",
-        "topic", "waiting",
+        "counters", "delivery", "depth", "index", "lifespan", "name", "priority", "ready", "redundant",
+        "reliable_sender", "sequence", "topic", "waiting",
     )  # fmt: skip
 
     def __init__(self, index: int, topic: Topic, counters: Outbound, priority: int | None = None) -> None:
@@ -45,7 +45,7 @@ class SendTopic:
         self.redundant = topic.paths is PathUse.REDUNDANT
         self.counters = counters
         self.waiting: deque[Waiting] = deque()
-        self.outbox: Outbox | None = None
+        self.reliable_sender: ReliableSender | None = None
         """Of a reliable topic, as long as its epoch is in use."""
         self.ready = False
         """Whether the send queue has it in its heap."""
@@ -57,7 +57,8 @@ class ReceiveTopic:
     """A topic that the peer sends, during one epoch."""
 
     __slots__ = (
-        "counters", "inbox", "index", "lifespan", "name", "newest", "newest_only", "settled", "topic", "tracker",
+        "counters", "index", "lifespan", "name", "newest", "newest_only", "reliable_receiver", "settled", "topic",
+        "tracker",
     )  # fmt: skip
 
     def __init__(self, index: int, topic: Topic, counters: Inbound) -> None:
@@ -66,7 +67,7 @@ class ReceiveTopic:
         self.name = topic.name
         self.lifespan = topic.lifespan
         self.newest_only = topic.depth == 1
-        self.inbox: Inbox | None = None
+        self.reliable_receiver: ReliableReceiver | None = None
         """Of a reliable topic, as long as its peer is the one in use."""
         self.newest = -1
         """Highest sequence that arrived."""
@@ -112,9 +113,9 @@ class ReceiveTopic:
 
     def settle(self, now: float) -> None:
         """Bring the counters' losses up to date."""
-        if self.inbox is not None:
-            self.counters.lost += self.inbox.skipped
-            self.inbox.skipped = 0
+        if self.reliable_receiver is not None:
+            self.counters.lost += self.reliable_receiver.skipped
+            self.reliable_receiver.skipped = 0
         self.counters.settle()
         self.tracker.settle(now)
         self._count_lost()
@@ -128,19 +129,9 @@ class Epoch:
     """The state that a handshake begins and the next one ends."""
 
     __slots__ = (
-        "_packets",
-        "bytes_received",
-        "bytes_sent",
-        "ciphers",
-        "heard_at",
-        "id",
-        "life",
-        "next_number",
-        "receive",
-        "replay",
-        "send",
-        "topics",
-    )
+        "_packets", "bytes_received", "bytes_sent", "ciphers", "heard_at", "id", "life", "next_number", "receive",
+        "replay", "send", "topics",
+    )  # fmt: skip
 
     def __init__(
         self,

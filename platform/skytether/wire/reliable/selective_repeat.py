@@ -15,12 +15,10 @@ from ..codec.tags import Tagger
 from ..fec.fragment import Positions, Shape, Shards
 
 
-class Parcel(Shards):
+class SelectiveRepeat(Shards):
     """One sealed message."""
 
-    __slots__ = (
-        "_known", "_landed", "_missing", "_reported", "_sent_at", "_taken", "_todo", "flying", "number",
-    )  # fmt: skip
+    __slots__ = ("_known", "_landed", "_missing", "_reported", "_sent_at", "_taken", "_todo", "number", "sending")
 
     def __init__(
         self,
@@ -29,7 +27,7 @@ class Parcel(Shards):
         sealed: memoryview,
         shape: Shape,
         tagger: Tagger,
-        landed: Callable[[Parcel, float], None],
+        landed: Callable[[SelectiveRepeat, float], None],
     ) -> None:
         """Take a sealed message; all of it is to be sent.
 
@@ -52,7 +50,7 @@ class Parcel(Shards):
         """inf while a shard is to be sent."""
         self._todo: Positions = np.arange(shape.shards)
         self._taken = 0
-        self.flying = False
+        self.sending = False
         """Whether somebody is taking packets."""
         self._reported = False
         """Whether the peer told what is missing since the last `remind`."""
@@ -67,7 +65,7 @@ class Parcel(Shards):
         self._sent_at[self._todo[self._taken - count : self._taken]] = now
 
     def land(self, now: float) -> None:
-        self.flying = False
+        self.sending = False
         self._landed(self, now)
 
     def missing(self, until: int, rows: tuple[tuple[int, bytes], ...], now: float, timeout: float) -> int:
