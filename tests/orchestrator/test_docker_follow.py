@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from skytether.orchestrator.runtimes.base import RuntimeFailure
 from skytether.orchestrator.runtimes.docker import follow
 from skytether.orchestrator.runtimes.docker.follow import Follower
 from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER
@@ -58,7 +59,8 @@ class StagedEngine:
         """No connection is held."""
 
     def info(self) -> dict[str, Any]:
-        return {"SystemTime": "2026-07-24T12:00:00.000000000Z"}
+        machine = {"NCPU": 4, "MemTotal": 8 << 30, "Architecture": "x86_64"}
+        return {**machine, "SystemTime": "2026-07-24T12:00:00.000000000Z"}
 
     def containers(self, **_: Any) -> list[dict[str, Any]]:
         return [{"Id": "c1", "Labels": {INSTANCE: "i1"}}]
@@ -207,3 +209,46 @@ def test_all_are_listed_now_and_then_though_events_never_cease(
         for stream in engine.streams[-1:]:
             stream.tell("exec_start", "c1")
         time.sleep(0.02)
+
+
+def made_up(engine: StagedEngine, monkeypatch: pytest.MonkeyPatch, containers: int) -> None:
+    """Have an engine list so many, none of which is ever ready."""
+    inspect = engine.inspect_container
+    rows = [{"Id": f"c{number}", "Labels": {INSTANCE: "i1"}} for number in range(containers)]
+    monkeypatch.setattr(engine, "containers", lambda **_: rows)
+    monkeypatch.setattr(engine, "inspect_container", lambda container: {**inspect(container), "Id": container})
+    quiet = threading.Event()
+    monkeypatch.setattr(engine, "stats", lambda *_, **__: iter(lambda: quiet.wait(0.05) and None, None))
+
+
+def watchers() -> Counter[str]:
+    return Counter(thread.name for thread in threading.enumerate() if thread.name in ("docker-ready", "docker-stats"))
+
+
+def test_containers_that_an_engine_makes_up_cost_no_thread_each(
+    engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It lists thousands: each had two threads, two connections and a megabyte."""
+    monkeypatch.setattr(follow, "_BESIDE", 3)
+    follower.expect(0)
+    made_up(engine, monkeypatch, 40)
+    follower.start()
+    assert len(follower.seen(PATIENCE)) == 40
+    engine.looks.get(timeout=PATIENCE)
+    assert max(watchers().values()) <= follow._BESIDE
+    follower.expect(10)  # these are to be there, and whoever waited is watched now
+    end = time.monotonic() + PATIENCE
+    while watchers()["docker-ready"] < 2 * 10 + 3:
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    assert watchers()["docker-ready"] == 2 * 10 + 3
+
+
+def test_an_engine_that_lists_more_than_there_can_be_is_not_believed(
+    engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(follow, "_MOST_LISTED", 39)
+    made_up(engine, monkeypatch, 40)
+    follower.start()
+    with pytest.raises(RuntimeFailure, match="lists 40 containers of this site: that cannot be"):
+        follower.seen(PATIENCE)

@@ -244,7 +244,12 @@ class Busy:
         """No connection is held."""
 
     def info(self) -> dict[str, Any]:
-        return {"SystemTime": "2026-07-24T12:00:00.000000000Z"}
+        return {
+            "NCPU": 4,
+            "MemTotal": 8 << 30,
+            "Architecture": "x86_64",
+            "SystemTime": "2026-07-24T12:00:00.000000000Z",
+        }
 
     def containers(self, **_: Any) -> list[dict[str, Any]]:
         return [{"Id": name, "Labels": {INSTANCE: name}, "State": state} for name, state in self.there.items()]

@@ -460,6 +460,8 @@ class Reconciler:
             if site.capacity is None or due:
                 site.capacity = believable(site.runtime.capacity())  # nodes come and go
             ids = {record.id for record in live}
+            if whole:
+                site.runtime.expect(len(ids))
             looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
             if due:
                 site.load = site.runtime.load()

@@ -250,6 +250,12 @@ class Runtime(ABC):
             RuntimeFailure: The site does not answer.
         """
 
+    def expect(self, instances: int) -> None:  # noqa: B027 (whoever is not told by others what is there need not)
+        """Before a look at all: so many instances are to be there. What a site tells of beyond is not believed to be.
+
+        For runtimes that spend something on each, and are told what is there by a machine of somebody else's.
+        """
+
     def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
         """What ``observe`` tells, of these only: asked again and again while they start or stop, so it should be cheap.
 

@@ -36,8 +36,13 @@ _AGAIN_S = 1.0
 """Between two attempts to reach an engine that does not answer."""
 _SHORT_S = 0.1
 """A stream that was shorter is not opened anew at once."""
-_READY_S = 0.02
-"""Between two looks for the ready file of a container that starts; each costs the engine some 3 ms."""
+_READY_S, _READY_MOST_S, _READY_SHARE = 0.02, 0.5, 0.02
+"""Between two looks for the ready file of a container that starts; each costs the engine some 3 ms. One that takes long
+is looked at less often: a share of the time for which it has been waited for."""
+_BESIDE = 64
+"""Containers that are followed each by a thread of its own, beside two for each instance that is to be there."""
+_MOST_LISTED = 20_000
+"""Containers of a site, ended ones and those without a service included."""
 _REMEMBERED = 256
 """Containers that are gone of which it is known: a look that was begun before need not find them again."""
 _TAIL = 20
@@ -65,6 +70,7 @@ class Follower:
         self._lock = threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._helpers: dict[str, Helper] = {}
+        self._most = _BESIDE
         self._awaited: set[str] = set()
         self._at_will: dict[str, bool] = {}
         """Containers that were looked at a moment ago because of `_AT_WILL`, and whether there was more of it since."""
@@ -115,6 +121,21 @@ class Follower:
         failure = self._failure
         if failure is not None:
             raise type(failure)(str(failure))
+
+    def expect(self, instances: int) -> None:
+        """So many instances are to be there; of containers that an engine makes up beyond, none costs a thread."""
+        before, self._most = self._most, 2 * instances + _BESIDE
+        if self._most > before:
+            with self._lock:
+                run = [seen for seen in self._seen.values() if seen.runs]
+            for seen in run:
+                self._follow_closely(seen)
+
+    def _follow_closely(self, seen: Seen) -> None:
+        if not self._closing.is_set():
+            self.meter.follow(seen.id, self._most)
+        if not seen.ready:
+            self._await_ready(seen.id)
 
     def doubt(self, error: EngineGoneError) -> None:
         """A call got no answer: believe that the engine is away until it has been looked at anew, at once."""
@@ -195,10 +216,7 @@ class Follower:
         if seen is None or not seen.runs:
             self.meter.forget(container)
             return seen
-        if not self._closing.is_set():
-            self.meter.follow(container)
-        if not seen.ready:
-            self._await_ready(container)
+        self._follow_closely(seen)
         return seen
 
     def _last_line(self, container: str) -> str:
@@ -258,7 +276,10 @@ class Follower:
         """Those that were seen before, and those that there are now."""
         with self._lock:
             before = self._seen.keys() | self._helpers.keys()
-        return before, api.containers(all=True, filters=self._mine)
+        rows = api.containers(all=True, filters=self._mine)
+        if len(rows) > _MOST_LISTED:
+            raise RuntimeFailure(f"the engine lists {len(rows)} containers of this site: that cannot be")
+        return before, rows
 
     def _take(self, before: set[str], rows: Sequence[Mapping[str, Any]], *, anew: bool) -> None:
         """Look at what has changed by a list, or at all of it ``anew``."""
@@ -280,7 +301,7 @@ class Follower:
             seen = {one.id: (one.status, bool(one.ill)) for one in known}
             run = [one.id for one in self._seen.values() if one.runs]
         for container in run:
-            self.meter.follow(container)
+            self.meter.follow(container, self._most)
         return [container for container in there if listed[container] != seen.get(container)]
 
     def _read_events(self) -> None:
@@ -333,12 +354,13 @@ class Follower:
 
     def _await_ready(self, container: str) -> None:
         with self._lock:
-            if container in self._awaited or not self._connected:
+            if container in self._awaited or not self._connected or len(self._awaited) >= self._most:
                 return
             self._awaited.add(container)
         threading.Thread(target=self._watch_ready, args=(container,), name="docker-ready", daemon=True).start()
 
     def _watch_ready(self, container: str) -> None:
+        began = time.monotonic()
         while True:
             with self._lock:
                 seen = self._seen.get(container)
@@ -347,7 +369,8 @@ class Follower:
                     return
             with suppress(RuntimeFailure):
                 self._look_ready(container)
-            self._closing.wait(_READY_S)
+            waited = time.monotonic() - began
+            self._closing.wait(min(_READY_MOST_S, max(_READY_S, _READY_SHARE * waited)))
 
     def _look_ready(self, container: str) -> None:
         with self._engine.asked():

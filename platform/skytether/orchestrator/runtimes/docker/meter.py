@@ -70,9 +70,11 @@ class Meter:
         """The newest; None: nothing came yet."""
         return self._usage.get(container)
 
-    def follow(self, container: str) -> None:
-        """Begin, unless it is followed already."""
+    def follow(self, container: str, most: int) -> None:
+        """Begin, unless it is followed already, or so many others are."""
         with self._lock:
+            if container not in self._streams and len(self._streams) >= most:
+                return
             self._wanted.add(container)
             if container in self._streams:
                 return

@@ -259,6 +259,10 @@ class DockerRuntime(Runtime):
             after = self._follower.look(seen.id)
         return after is not None and after.limits == wanted
 
+    @override
+    def expect(self, instances: int) -> None:
+        self._follower.expect(instances)
+
     def observe(self) -> Mapping[str, Observation]:
         with self._lock:
             jobs = dict(self._jobs)
