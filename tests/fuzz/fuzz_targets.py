@@ -271,7 +271,7 @@ def peers(data: bytes) -> None:
             message = Message(peer.ciphers, peer.id, number, topic, plaintext)
             if op & 128:
                 shards = message.shards(script.number(2) % 1200 + 240)
-                whole = bytes(shards.take(1 + script.number() % shards.remaining, path, number, 0))
+                whole = bytes(shards.make_packets(1 + script.number() % shards.remaining, path, number, 0))
                 end.receive(whole, "elsewhere", ends.now, segment=shards.packet_size)
                 continue
             whole = message.packet(path, number, 0)

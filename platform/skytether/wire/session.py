@@ -74,7 +74,9 @@ class Session:
         self._table = index_topics(topics)
         self._config = config or Config()
         self._events: deque[Event] = deque()
-        self._paths = Paths(self._config, self._say, self._on_choice, self._on_moved, self._events.append, entropy, now)
+        self._paths = Paths(
+            self._config, self._send_ping, self._on_choice, self._on_moved, self._events.append, entropy, now
+        )
         self._peer: Hashable | None = None
         self._sender = Sender(self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
@@ -88,7 +90,7 @@ class Session:
         )  # fmt: skip
         self._counters = TopicCounters(role)
         self._reliable = ReliableTopics(
-            role, topics, self._config.queue_limit, self._counters, self._sender.put_reliable
+            role, topics, self._config.queue_limit, self._counters, self._sender.queue_reliable
         )
         self._responder = HandshakeResponder(key, self._table, entropy) if service else None
         self._reconnector = Reconnector(session_id, key, topics, self._config, entropy)
@@ -148,7 +150,7 @@ class Session:
             return self._reliable.put(reliable, payload, now)
         if sender is not None:
             sender.counters.offered += 1
-            self._sender.put(sender, payload, now)
+            self._sender.queue_message(sender, payload, now)
         return True
 
     def set_peer(self, address: Hashable, path: int | None = None) -> None:
@@ -214,7 +216,7 @@ class Session:
         if self._epoch is not None:
             self._report(now)
             for _ in range(GOODBYES):
-                self._sender.tell(frames.push_goodbye(), now)
+                self._sender.queue_frame(frames.push_goodbye(), now)
         self._closed = True
         if self._connected:
             self._disconnect("closed")
@@ -258,7 +260,7 @@ class Session:
         if not self._closed:
             self._receiver.receive(memoryview(data), address, path, now, segment, waited)
             if self._connected:
-                self._paths.tell(now)
+                self._paths.report_arrivals(now)
 
     def transmit(self, now: float, full: Container[int] = ()) -> list[Transmit]:
         """What may be sent now, at most a burst by each path that is not ``full``; call again until it is nothing."""
@@ -313,7 +315,7 @@ class Session:
             self._sweep_at = now + self._config.keepalive
         if now >= self._reliable.due:
             for message in self._reliable.handle_timer(now):
-                self._sender.tell(message, now)
+                self._sender.queue_frame(message, now)
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
@@ -444,7 +446,7 @@ class Session:
         if index == 0:
             self._on_frame(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
             return
-        self._delivery.take(epoch, epoch.receive[index], plaintext, sequence, stamp, now)
+        self._delivery.deliver_message(epoch, epoch.receive[index], plaintext, sequence, stamp, now)
 
     def _on_choice(self, choice: Choice, now: float) -> None:
         self._sender.use(self._paths, *choice, now)
@@ -464,13 +466,13 @@ class Session:
             if path is not None and path.id == message.path:
                 if self._responder is not None:
                     path.cost = message.cost
-                exchange = self._paths.take(message, path, micros / 1e6, address, now)
+                exchange = self._paths.handle_ping(message, path, micros / 1e6, address, now)
                 if exchange is not None:
                     if path is self._paths.choice.active:
                         self._reliable.rtt.add(path.rtt)
                     self._delivery.clock.exchange(*exchange, now)
         elif isinstance(message, Report):
-            self._counters.take(message, epoch, now)
+            self._counters.apply_report(message, epoch, now)
         elif isinstance(message, Goodbye):
             self._end_epoch(now)
         elif isinstance(message, Forward):
@@ -484,10 +486,10 @@ class Session:
         if self._epoch is None:
             return
         for message in frames.push_reports(*self._counters.rows(self._epoch, now)):
-            self._sender.tell(message, now)
+            self._sender.queue_frame(message, now)
 
-    def _say(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:
+    def _send_ping(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:
         if address is None:
-            self._sender.say(path, message, now)
+            self._sender.send_frame(path, message, now)
         else:
-            path.validation.sent(address, self._sender.say_to(address, path, message, now))
+            path.validation.sent(address, self._sender.send_frame_to(address, path, message, now))

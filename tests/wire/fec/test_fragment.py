@@ -55,7 +55,7 @@ def test_any_loss_up_to_the_parity_is_made_good_in_any_order(length, parity, see
     assert total == shape.shards + parity * shape.blocks
     while shards.remaining:
         count = random.randint(1, min(64, shards.remaining))
-        data = shards.take(count, 0, number, 54_321)
+        data = shards.make_packets(count, 0, number, 54_321)
         assert len(data) == count * shards.packet_size
         packets += [data[i : i + shards.packet_size] for i in range(0, len(data), shards.packet_size)]
         number += count
@@ -85,7 +85,7 @@ def test_any_loss_up_to_the_parity_is_made_good_in_any_order(length, parity, see
 
 def test_parity_goes_last_and_in_turn_over_the_blocks():
     shape, shards = cut(bytes(250 * ROOM), ROOM, 3)
-    data = shards.take(shards.remaining, 0, 0, 0)
+    data = shards.make_packets(shards.remaining, 0, 0, 0)
     headers = [packet.pull_header(data[i : i + shards.packet_size]) for i in range(0, len(data), shards.packet_size)]
     order = [(h[6], h[7]) for h in headers]
     assert shape.blocks == 3

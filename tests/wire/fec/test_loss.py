@@ -37,7 +37,7 @@ class Path:
                     self.total[4] += duration**2
                     run = 0
             self.now += 0.1
-            self.estimate.take(Sums(*self.total), self.now)
+            self.estimate.update(Sums(*self.total), self.now)
         return self.estimate.model
 
 
@@ -80,16 +80,16 @@ def test_up_in_a_second_and_down_slowly():
 
 def test_sums_wrap_and_old_ones_change_nothing():
     estimate = LossEstimate(0.05)
-    estimate.take(Sums(2**32 - 100, 2**32 - 3, 2**32 - 3), 0.0)
+    estimate.update(Sums(2**32 - 100, 2**32 - 3, 2**32 - 3), 0.0)
     estimate = LossEstimate(0.05)
-    estimate.take(Sums(100, 0, 0), 0.0)
-    assert estimate.take(Sums(200, 5, 5), 1.0) == Sums(100, 5, 5)
-    assert estimate.take(Sums(150, 3, 3), 1.1) == Sums()
-    assert estimate.take(Sums(300, 5, 5), 1.2) == Sums(100, 0, 0)
+    estimate.update(Sums(100, 0, 0), 0.0)
+    assert estimate.update(Sums(200, 5, 5), 1.0) == Sums(100, 5, 5)
+    assert estimate.update(Sums(150, 3, 3), 1.1) == Sums()
+    assert estimate.update(Sums(300, 5, 5), 1.2) == Sums(100, 0, 0)
     wrapping = LossEstimate(0.05)
-    wrapping.take(Sums(2**31 - 1), 0.0)
-    wrapping.take(Sums(2**32 - 10), 0.1)
-    assert wrapping.take(Sums(5, 3, 1), 0.2) == Sums(15, 3, 1)
+    wrapping.update(Sums(2**31 - 1), 0.0)
+    wrapping.update(Sums(2**32 - 10), 0.1)
+    assert wrapping.update(Sums(5, 3, 1), 0.2) == Sums(15, 3, 1)
 
 
 def test_rounding_is_up_and_keeps_what_is_exact():

@@ -21,7 +21,7 @@ def packets_of(message, number=3, topic=4, parity=0):
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
     common = packet.push_common(packet.SHARD, 1, 2, number, topic, len(message))
     shards = Shards(common, padded, shape, parity, Tags(bytes(SECRET_SIZE)))
-    data = shards.take(shards.remaining, 0, 0, 0)
+    data = shards.make_packets(shards.remaining, 0, 0, 0)
     return shape, np.frombuffer(data, np.uint8).reshape(-1, shards.packet_size)
 
 

@@ -27,7 +27,7 @@ class Told:
             self.now += 0.1
             rate = self.control.rate if used is None else used
             feedback = CLEAR._replace(**{"rate": rate, **fields})
-            self.control.take(feedback, settled, lost, rate, waited, 0.05, self.now)
+            self.control.update(feedback, settled, lost, rate, waited, 0.05, self.now)
         return self.control.rate
 
 

@@ -17,7 +17,7 @@ def take_all(sending, now):
     out = []
     while sending.remaining:
         count = min(sending.remaining, 7)
-        packets = sending.take(count, 0, 0, 0)
+        packets = sending.make_packets(count, 0, 0, 0)
         sending.sent(count, now)
         size = sending.packet_size
         out += [bytes(packets[i * size : (i + 1) * size]) for i in range(count)]

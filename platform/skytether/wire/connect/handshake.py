@@ -70,7 +70,7 @@ def cut(
     padded = memoryview(message.ljust(shape.shards * shape.size, b"\0"))
     more = 0 if whole else parity(shape.block_k(0), shape.blocks, 0.9)
     shards = Shards(common, padded, shape, more, tags)
-    return shards.take(shards.remaining, 0, 0, 0), shards.packet_size
+    return shards.make_packets(shards.remaining, 0, 0, 0), shards.packet_size
 
 
 @dataclass(frozen=True, slots=True)

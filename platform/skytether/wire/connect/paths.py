@@ -61,11 +61,11 @@ class Paths:
 
     Args:
         config: Settings.
-        say: Sends a ping by a path, at once, to some address or (None) to the path's.
+        send_ping: Sends a ping by a path, at once, to some address or (None) to the path's.
         changed: Called with the choice whenever it is another one, and when paths came or went.
         moved: Called when the peer of a path has another address, with the time since when what was sent to the one
             before may not have arrived.
-        tell: Takes events: the peer moved, another path became the active one.
+        emit: Takes events: the peer moved, another path became the active one.
         entropy: Source of random bytes.
         now: Time.
     """
@@ -73,18 +73,18 @@ class Paths:
     def __init__(
         self,
         config: Config,
-        say: Callable[[Path, bytes, Hashable | None, float], None],
+        send_ping: Callable[[Path, bytes, Hashable | None, float], None],
         changed: Callable[[Choice, float], None],
         moved: Callable[[Path, float, float], None],
-        tell: Callable[[Event], None],
+        emit: Callable[[Event], None],
         entropy: Callable[[int], bytes],
         now: float,
     ) -> None:
         self._config = config
-        self._say = say
+        self._send_ping = send_ping
         self._changed = changed
         self._moved = moved
-        self._tell = tell
+        self._emit = emit
         self._entropy = entropy
         self._paths: dict[int, Path] = {0: Path(0, config, now)}
         self._numbers: dict[int, int] = {}
@@ -178,24 +178,24 @@ class Paths:
         said = _ping(path, ask, size, now)
         if not size:  # a probe has the size that it has
             said = said._replace(astray=path.astray(now))
-        self._say(path, push_ping(said, max(0, size - PADDING)), None, now)
+        self._send_ping(path, push_ping(said, max(0, size - PADDING)), None, now)
 
     def ping_to(self, address: Hashable, path: Path, now: float) -> None:
         """Tell somebody who seems to be the peer that we are here."""
-        self._say(path, push_ping(_ping(path, False, 0, now)), address, now)
+        self._send_ping(path, push_ping(_ping(path, False, 0, now)), address, now)
 
     def ping_soon(self, path: Path, now: float) -> None:
         """Ping, unless one was sent just now."""
         if now >= path.pinged_at + PING_SPACING:
             self.ping(path, now)
 
-    def tell(self, now: float) -> None:
+    def report_arrivals(self, now: float) -> None:
         """Tell the peer what arrived, by the paths on which that is much."""
         for path in self._paths.values():
             if path.much_arrived:
                 self.ping_soon(path, now)
 
-    def take(self, ping: Ping, path: Path, sent_at: float, address: Hashable, now: float) -> Exchange | None:
+    def handle_ping(self, ping: Ping, path: Path, sent_at: float, address: Hashable, now: float) -> Exchange | None:
         """Take the peer's ping that came by a path, and answer it where it came from.
 
         Returns:
@@ -209,7 +209,7 @@ class Paths:
         if ping.ask:
             echo = round(sent_at * 1e6)
             answer = Ping(path.id, path.cost, False, ping.size, echo, ping.challenge, 0, path.feedback(now))
-            self._say(path, push_ping(answer), None if address == path.address else address, now)
+            self._send_ping(path, push_ping(answer), None if address == path.address else address, now)
         elif first:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
@@ -248,7 +248,7 @@ class Paths:
                 elif path.validation.packet_came(address, size, path.heard_at, now):
                     challenge = int.from_bytes(self._entropy(CHALLENGE_SIZE)) or 1
                     path.validation.challenge(address, challenge, now)
-                    self._say(path, push_ping(_ping(path, True, 0, now, challenge)), address, now)
+                    self._send_ping(path, push_ping(_ping(path, True, 0, now, challenge)), address, now)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
             self.ping_soon(path, now)
@@ -260,7 +260,7 @@ class Paths:
         path.validation.clear()
         if moved:
             path.mtu.restart(now)
-            self._tell(PeerMoved(address))
+            self._emit(PeerMoved(address))
             self._moved(path, since - (path.rtt if path.rtt == path.rtt else 0.0), now)
         self.choose(now)
 
@@ -408,7 +408,7 @@ class Paths:
             self.choice = choice
             self._changed(choice, now)
             if reason and self._up:
-                self._tell(PathSwitched(choice.active.id, reason))
+                self._emit(PathSwitched(choice.active.id, reason))
 
 
 def _ping(path: Path, ask: bool, size: int, now: float, challenge: int = 0) -> Ping:

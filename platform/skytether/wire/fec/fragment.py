@@ -129,7 +129,7 @@ class Shards:
         """Data shards not yet taken."""
         return max(self._shape.shards - self._sent, 0)
 
-    def take(self, count: int, path: int, first_number: int, time: int) -> memoryview:
+    def make_packets(self, count: int, path: int, first_number: int, time: int) -> memoryview:
         """The next ``count`` packets, one after the other, each of ``packet_size`` bytes; ``time`` in ticks."""
         start, end, shards = self._sent, self._sent + count, self._shape.shards
         rows = self._headers(self._tails[start:end], path, first_number, time)

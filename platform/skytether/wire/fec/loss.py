@@ -65,7 +65,7 @@ class LossEstimate:
         """Packets, ever."""
         self._updated = 0.0
 
-    def take(self, total: Sums, now: float) -> Sums:
+    def update(self, total: Sums, now: float) -> Sums:
         """Take sums since the beginning; the first three may wrap at 2**32.
 
         Returns:

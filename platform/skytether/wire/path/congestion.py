@@ -103,7 +103,7 @@ class RateControl:
         self._usual = 0.0, 0.0
         """Packets and losses without a queue, those of late counting more."""
 
-    def take(
+    def update(
         self, feedback: Feedback, settled: float, lost: float, used: float, waited: bool, rtt: float, now: float
     ) -> None:
         """Take the peer's feedback.

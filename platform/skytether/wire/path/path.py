@@ -143,12 +143,12 @@ class Path:
             self._settle_at = now + SETTLE
         delays.evaluate(now)
         sums = Sums(losses.settled, losses.lost, losses.runs, losses.time, losses.time_squared)
-        self.loss_in.take(sums, now)
+        self.loss_in.update(sums, now)
         return Feedback(delays.capacity, delays.queue, delays.rate, losses.settled, losses.lost, losses.runs, *sums[3:])
 
     def take_feedback(self, feedback: Feedback, now: float) -> None:
         """Follow what the peer knows."""
-        new = self.loss_out.take(Sums(*feedback[3:]), now)
+        new = self.loss_out.update(Sums(*feedback[3:]), now)
         self.redundancy.model = self.loss_out.model.rounded()
         elapsed = now - self._fed_back_at
         if elapsed <= 0:
@@ -160,7 +160,7 @@ class Path:
         if now >= self.pacer.burst_at + self.rtts.minimum + BURST_TIME:
             self._known = True
         waited = waited and self._known
-        self.control.take(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
+        self.control.update(feedback, new.settled, new.lost, used * 8 / elapsed, waited, self.rtt, now)
         self.pacer.set_rate(self.control.rate if self._known else min(self.control.rate, self._cautious))
 
     def _follow_pace(self, pace: float, elapsed: float) -> None:

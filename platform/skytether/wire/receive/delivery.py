@@ -50,7 +50,9 @@ class Delivery:
         """No keys are in use."""
         self._epoch = None
 
-    def take(self, epoch: Epoch, topic: ReceiveTopic, plaintext: bytes, sequence: int, stamp: int, now: float) -> None:
+    def deliver_message(
+        self, epoch: Epoch, topic: ReceiveTopic, plaintext: bytes, sequence: int, stamp: int, now: float
+    ) -> None:
         """Take one authentic message, the first time that it is complete.
 
         Args:

@@ -55,7 +55,7 @@ class SelectiveRepeat(Shards):
         self._reported = False
         """Whether the peer told what is missing since the last `remind`."""
 
-    def take(self, count: int, path: int, first_number: int, time: int) -> memoryview:
+    def make_packets(self, count: int, path: int, first_number: int, time: int) -> memoryview:
         chosen = self._todo[self._taken : self._taken + count]
         self._taken += count
         self.remaining -= count

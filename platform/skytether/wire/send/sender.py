@@ -94,26 +94,26 @@ class Sender:
         """Seal with other keys from now on; what was sealed before is sent as it is."""
         self.epoch = epoch
 
-    def put(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
+    def queue_message(self, topic: SendTopic, payload: bytes, published_at: float, extra: int | None = None) -> None:
         """Queue a message; ``extra`` packets, or as many as the redundancy policy says."""
         self._active.queue.put(topic, payload, published_at, extra)
 
-    def put_reliable(self, reliable: ReliableSender) -> None:
+    def queue_reliable(self, reliable: ReliableSender) -> None:
         """Queue a reliable topic that has something to send."""
         reliable.queued = True
         self._active.queue.put_other(reliable.topic.priority, reliable)
 
-    def tell(self, message: bytes, now: float) -> None:
+    def queue_frame(self, message: bytes, now: float) -> None:
         """Queue a frame, once: the next one of its kind makes up for its loss."""
-        self.put(self._control, message, now, extra=0)
+        self.queue_message(self._control, message, now, extra=0)
 
-    def say(self, path: Path, message: bytes, now: float) -> None:
+    def send_frame(self, path: Path, message: bytes, now: float) -> None:
         """Send a frame of one packet by that path, once and at once, however large the packet."""
         packet = self._packet(message, path, path.number, now)
         if packet is not None:
             self._path_queue(path).add_urgent(packet)
 
-    def say_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
+    def send_frame_to(self, address: Hashable, path: Path, message: bytes, now: float) -> int:
         """The same to some address, which need not be the path's; returns its bytes, 0 if it cannot be sent."""
         number = partial(path.number_astray, now)
         packet = self._packet(message, path, number, now) if len(self.astray) < MAX_ASTRAY else None
@@ -199,7 +199,7 @@ class Sender:
                 count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
                 counters = top.topic.counters
                 counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
-                batches.add_run(shards.take(count, path.id, path.number(count), ticks(now)), size)
+                batches.add_run(shards.make_packets(count, path.id, path.number(count), ticks(now)), size)
                 shards.sent(count, now)
                 sent = count * size
                 counters.bytes_sent += sent
@@ -266,7 +266,7 @@ class Sender:
         reliable.queued = False
         pending, topic = reliable.next(now), epoch.send.get(reliable.topic.name)
         if reliable.ready:
-            self.put_reliable(reliable)
+            self.queue_reliable(reliable)
         if pending is None or topic is None:
             return 0
         shards = pending.shards

@@ -137,7 +137,7 @@ class ReliableTopics:
             self._stir(sender)
         for receiver in [i for i in self._owing if i.due <= now]:
             self._owing.discard(receiver)
-            yield from _tell(receiver)
+            yield from _acknowledge(receiver)
 
     def _stir(self, sender: ReliableSender) -> None:
         """Keep watch of a sender as long as it has something to do."""
@@ -149,7 +149,7 @@ class ReliableTopics:
             self._busy.add(sender)
 
 
-def _tell(receiver: ReliableReceiver) -> Iterator[bytes]:
+def _acknowledge(receiver: ReliableReceiver) -> Iterator[bytes]:
     """An acknowledgement and what is missing of large messages."""
     receiver.due = math.inf
     ack = receiver.acknowledgement()

@@ -87,7 +87,7 @@ class TopicCounters:
             [self._receiver_row(t, now) for t in _in_turn(receivers, self._turn)],
         )
 
-    def take(self, report: Report, epoch: Epoch, now: float) -> None:
+    def apply_report(self, report: Report, epoch: Epoch, now: float) -> None:
         """Take what the peer reports; of reports that overtook each other, the newest stays."""
         current = epoch.life == self._life
         for row in report.senders:
