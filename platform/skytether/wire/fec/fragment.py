@@ -160,7 +160,7 @@ class Shards:
         )
 
     def pick(self, positions: Positions, path: int, first_number: int, time: int) -> memoryview:
-        """Packets of any data shards, by their positions in the message, as `take` returns them."""
+        """Packets of any data shards, by their positions in the message, as `make_packets` returns them."""
         rows = self._headers(self._tails[positions], path, first_number, time)
         rows[:, SHARD_AT:] = self._data[positions]
         sums = self._sums_of(0, int(positions.max()) + 1)
