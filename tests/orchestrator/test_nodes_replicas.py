@@ -62,8 +62,10 @@ def test_when_the_leader_is_killed_the_next_one_has_the_nodes_engine_at_once(
                 until(lambda: set(linked) >= set(urls))
                 for client in (first, second):
                     until(lambda client=client: client.get_site("ward").state in ANSWERS)  # type: ignore[misc]
+                links = other.log.count("is linked from")
                 one.end(signal.SIGKILL)
-                assert second.get_site("ward").state in ANSWERS
                 until(lambda: 'skytether_site_up{site="ward"} 1.0' in second.metrics())
+                until(lambda: second.get_site("ward").state in ANSWERS)
+                assert other.log.count("is linked from") == links, "by the link that it had"
         finally:
             engine.stop()
