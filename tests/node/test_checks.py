@@ -112,7 +112,19 @@ def test_a_unit_wants_root_and_a_folder_that_may_be_written(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    "url", ["http://cloud:8603", "cloud", "https://", "https://u:p@cloud", "https://cloud/x", "https://cloud:99999"]
+    "url",
+    [
+        "http://cloud:8603",
+        "cloud",
+        "https://",
+        "https://u:p@cloud",
+        "https://cloud/x",
+        "https://cloud:99999",
+        "https://a..b",  # a resolver raises on this, and on the next one
+        f"https://{64 * 'a'}.b",
+        "https://ward one",
+        "https://ward\x00",
+    ],
 )
 def test_what_is_no_address_for_nodes_is_refused(url: str) -> None:
     with pytest.raises(NodeError, match="write https://HOST or https://HOST:PORT"):

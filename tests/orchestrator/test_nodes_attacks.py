@@ -18,7 +18,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
-from node_scene import NodeScene, connection, context_of, first_line, until
+from node_scene import NodeScene, connection, context_of, first_line, linked_by, until
 
 from skytether.api.node import (
     ALPN,
@@ -44,6 +44,7 @@ from skytether.api.node import (
 )
 from skytether.node import calls, join
 from skytether.node.calls import RefusedError, first_call, trusting
+from skytether.node.machine import machine_id
 from skytether.node.store import NodeError, new_key, request_for
 from skytether.orchestrator.nodes import door, ways
 from skytether.orchestrator.nodes.authority import Authority
@@ -232,17 +233,17 @@ def test_a_node_has_ways_to_no_engine_but_its_own_and_only_when_it_is_asked(node
         with pytest.raises(ValueError, match="no request"):
             read_request(b'{"do": "way", "name": "edge"}')
         # Linked, it gets no way that it was not asked for.
-        with nodes.running("other") as second:
-            until(lambda: second and nodes.state("other") == "ready")
-            with contextlib.ExitStack() as stack:
-                links = []
-                for _ in range(ways._SPARE + 3):  # some may be wanted just now
-                    link = stack.enter_context(connection(nodes, context_of(nodes.store("other"))))
-                    link.sendall(line_of(Way()))
-                    link.settimeout(0.05)
-                    links.append(link)
-                until(lambda: any(b"nobody asked for this way" in first_line(link) for link in links))
-            assert nodes.state("edge") == "ready"
+        hostile = context_of(nodes.store("other"))
+        with connection(nodes, hostile) as link, contextlib.ExitStack() as stack:
+            secret, opened = linked_by(link), []
+            link.sendall(line_of(Said(engine="")))
+            for _ in range(ways._SPARE + 3):  # some may be wanted just now
+                way = stack.enter_context(connection(nodes, hostile))
+                way.sendall(line_of(Way(link=secret)))
+                way.settimeout(0.05)
+                opened.append(way)
+            until(lambda: any(b"nobody asked for this way" in first_line(way) for way in opened))
+        assert nodes.state("edge") == "ready"
 
 
 @pytest.mark.slow
@@ -287,6 +288,8 @@ def test_a_copy_of_a_machine_does_not_take_its_place(nodes: NodeScene) -> None:
         until(lambda: linked and nodes.state() == "ready")
         with pytest.raises(RefusedError, match="another machine is linked as 'edge'"):
             calls.call(nodes.url, trust, Link(machine=Machine(id="another")), Linked)
+        with pytest.raises(RefusedError, match="this machine, or one that says so, is linked as 'edge'"):
+            calls.call(nodes.url, trust, Link(machine=Machine(id=machine_id())), Linked)
         assert nodes.state() == "ready"
     assert len(linked) == 1
 

@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from node_scene import MadeUpEngine, NodeScene, connection, context_of, first_line, until
+from node_scene import MadeUpEngine, NodeScene, connection, context_of, first_line, linked_by, until
 
 from skytether.api.client import Client
-from skytether.api.node import GO, Issued, Join, Link, Linked, Said, Standing, Stands, Way, Welcome, line_of
+from skytether.api.node import GO, Issued, Join, Link, Said, Standing, Stands, Way, Welcome, line_of
 from skytether.api.rest import InstanceCreate, SiteCreate
 from skytether.node import calls, join
 from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.store import NodeError, new_key, request_for
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.nodes import ways
+from skytether.orchestrator.nodes import door, ways
 from skytether.orchestrator.nodes.authority import Authority
 from skytether.orchestrator.settings import Settings, Timing
 
@@ -74,13 +74,26 @@ def test_a_node_cannot_have_more_ways_wanted_than_it_was_asked_for(nodes: NodeSc
     nodes.join()
     trust = context_of(nodes.store())
     with connection(nodes, trust) as link, contextlib.ExitStack() as stack:
-        link.sendall(line_of(Link()))
-        Linked.model_validate_json(first_line(link).splitlines()[0])
+        secret = linked_by(link)
         link.sendall(b'{"failed": -10000}\n')
         for _ in range(3):
             way = stack.enter_context(connection(nodes, trust))
-            way.sendall(line_of(Way()))
+            way.sendall(line_of(Way(link=secret)))
             assert first_line(way)  # a refusal
+
+
+def test_a_copy_of_a_nodes_key_gets_none_of_its_ways(nodes: NodeScene) -> None:
+    """Beside the node he waits for the orchestrator to want one: calls to the engine have keys of sessions in them."""
+    nodes.join()
+    trust = context_of(nodes.store())
+    with nodes.running() as linked, contextlib.ExitStack() as stack:
+        until(lambda: linked and nodes.state() == "ready")
+        for number in range(ways._SPARE + 2):
+            way = stack.enter_context(connection(nodes, trust))
+            way.sendall(line_of(Way()) if number % 2 else line_of(Way(link=32 * "0")))
+            assert b"this way is of no link that stands" in first_line(way)
+        nodes.core.sites.get("edge").runtime.engine.drop()  # type: ignore[attr-defined]
+        until(lambda: nodes.state() == "ready")
 
 
 @pytest.mark.parametrize(
@@ -131,13 +144,14 @@ def test_what_an_engine_says_beyond_measure_waits(nodes: NodeScene, monkeypatch:
     nodes.join()
     path = nodes.core.settings.state_dir / "sites/edge/engine.sock"
     with connection(nodes, context_of(nodes.store())) as link, contextlib.ExitStack() as stack:
-        link.sendall(line_of(Link()) + line_of(Said(engine="")))
+        secret = linked_by(link)
+        link.sendall(line_of(Said(engine="")))
         until(path.exists)
 
         def asked() -> Any:
             """A way by which somebody asks, and does not only look whether there is one."""
             way = stack.enter_context(connection(nodes, context_of(nodes.store())))
-            way.sendall(line_of(Way()))
+            way.sendall(line_of(Way(link=secret)))
             return way if way.recv(1) == GO and way.recv(4096).startswith(b"GET") else None
 
         way = until(asked)
@@ -195,3 +209,29 @@ def test_of_a_machine_that_joined_it_is_known_which_robots_were_there(nodes: Nod
         until(lambda: not nodes.operator.get_site("edge").instances)
         nodes.core.sites.get("edge").hosted = None  # opened anew
         until(lambda: nodes.core.sites.hosted("edge") == {"walker"})
+
+
+def test_a_node_whose_name_takes_for_ever_to_resolve_keeps_nobody_waiting(
+    nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says under which name its echo is, and has that resolved by a server of its own."""
+    nodes.join("edge")
+    ended = threading.Event()
+    monkeypatch.setattr(door, "echo_answers", lambda *_: ended.wait(30))
+    monkeypatch.setattr(door, "_ECHO_PATIENCE_S", 0.05)
+    try:
+        nodes.join("other", echo=free_port())
+        hostile = context_of(nodes.store("other"))
+        for _ in range(door._ECHOES + 4):  # more than there are threads
+            assert calls.call(nodes.url, hostile, Standing(), Stands).echo is None
+        assert calls.call(nodes.url, context_of(nodes.store("edge")), Standing(), Stands).state == "unreachable"
+        nodes.shut()  # nor whoever ends the orchestrator
+    finally:
+        ended.set()
+    assert sum(thread.name == "node-echo" for thread in threading.enumerate()) <= door._ECHOES
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])

@@ -21,7 +21,7 @@ from typing import Any
 from typing_extensions import override
 
 from skytether.api.manifest import Strict
-from skytether.api.node import SERVER_NAME
+from skytether.api.node import SERVER_NAME, Link, Linked, line_of
 from skytether.node.calls import trusting
 from skytether.node.join import Joined, JoinOptions, join
 from skytether.node.run import NodeProgram
@@ -268,3 +268,9 @@ def first_line(link: ssl.SSLSocket) -> bytes:
         while not line.endswith(b"\n") and (piece := link.recv(4096)):
             line += piece
     return line
+
+
+def linked_by(link: ssl.SSLSocket) -> str:
+    """Begin a node's link by a connection; what its ways have to show."""
+    link.sendall(line_of(Link()))
+    return Linked.model_validate_json(first_line(link).splitlines()[0]).link

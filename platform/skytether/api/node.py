@@ -7,6 +7,7 @@ the connection depends on that: an answer and its end, the node's link, which st
 from __future__ import annotations
 
 import contextlib
+import re
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
@@ -32,6 +33,7 @@ MOST_WAYS = 1024
 _PEM = Annotated[str, Field(max_length=16_384)]
 Address = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[A-Za-z0-9._:-]+$")]
 """An address or a name, without a port."""
+_ODD = re.compile(r"[\s\x00-\x1f\x7f]")
 Port = Annotated[int, Field(ge=1, le=65_535)]
 
 
@@ -106,6 +108,8 @@ class Way(Strict):
     """This connection is for somebody who asks the engine: after `GO` come the bytes of both."""
 
     do: Literal["way"] = "way"
+    link: Annotated[str, Field(max_length=64, repr=False)] = ""
+    """Of which link it is: its `Linked.link`."""
 
 
 class Standing(Strict):
@@ -171,6 +175,8 @@ class Linked(Strict):
     begins: float
     ends: float
     """Validity of the certificate that the orchestrator knows of this node."""
+    link: Annotated[str, Field(max_length=64, repr=False)] = ""
+    """Known at the two ends of this link alone: a copy of the node's key elsewhere opens none of its ways."""
     urls: tuple[str, ...] = ()
 
 
@@ -219,7 +225,8 @@ def read_url(text: str) -> tuple[str, int]:
     with contextlib.suppress(ValueError):
         parts = urlsplit(text.strip())
         plain = not (parts.path.strip("/") or parts.query or parts.fragment or parts.username)
-        if parts.scheme == "https" and parts.hostname and plain:
+        if parts.scheme == "https" and parts.hostname and plain and not _ODD.search(parts.hostname):
+            parts.hostname.encode("idna")  # what has no such form is looked up nowhere, and raises wherever it is tried
             return parts.hostname, parts.port or PORT
     raise ValueError(f"'{text}' is not where nodes connect: write https://HOST or https://HOST:PORT")
 

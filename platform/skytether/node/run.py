@@ -165,7 +165,7 @@ class NodeProgram:
             log.info("linked with %s", url)
             self._on_linked(url)
             self._learn(linked.urls)
-            await self._both(self._hear(url, reader, writer), self._look(url, writer, linked))
+            await self._both(self._hear(url, reader, writer, linked.link), self._look(url, writer, linked))
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValidationError) as error:
             raise NodeError(f"the link to {url} ended: {str(error) or type(error).__name__}") from error
         finally:
@@ -190,7 +190,7 @@ class NodeProgram:
             engine = None
         return describe(engine, self._config.echo)
 
-    async def _hear(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _hear(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, link: str) -> None:
         """Do what the orchestrator says until it says nothing more."""
         ways: set[asyncio.Task[None]] = set()
         try:
@@ -201,7 +201,7 @@ class NodeProgram:
                 if told.ping is not None:
                     writer.write(line_of(Said(pong=told.ping)))
                 for _ in range(min(told.open or 0, MOST_WAYS - len(ways))):
-                    way = asyncio.create_task(self._way(url, writer))
+                    way = asyncio.create_task(self._way(url, writer, link))
                     ways.add(way)
                     way.add_done_callback(ways.discard)
         except asyncio.IncompleteReadError:
@@ -269,12 +269,12 @@ class NodeProgram:
 
     # Ways
 
-    async def _way(self, url: str, link: asyncio.StreamWriter) -> None:
+    async def _way(self, url: str, told: asyncio.StreamWriter, link: str) -> None:
         """One connection for somebody who asks the engine from there."""
         try:
-            reader, writer = await self._open(url, Way())
+            reader, writer = await self._open(url, Way(link=link))
         except NodeError:
-            link.write(line_of(Said(failed=1)))
+            told.write(line_of(Said(failed=1)))
             return
         try:
             if await reader.readexactly(1) != GO:

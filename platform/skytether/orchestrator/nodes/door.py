@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import secrets
 import socket
 import ssl
 import threading
@@ -78,6 +79,8 @@ the same process."""
 _AT_ONCE = 4
 """Requests of one node under way, its links and ways not counted."""
 _ECHO_S, _ECHO_TRIES = 0.5, 3
+_ECHOES, _ECHO_PATIENCE_S = 8, 3.0
+"""Looks for echoes at once, of all nodes, and how long a node waits for one."""
 
 
 class _Guest(Guest):
@@ -95,6 +98,7 @@ class NodeDoor:
         enrolment: Enrolment,
         ways: Ways,
         standing: Callable[[str], Stands],
+        echo: Callable[[str], tuple[str, int] | None],
         leave: Callable[[str, bool], Stands],
         clock: Callable[[], float],
     ) -> None:
@@ -106,6 +110,7 @@ class NodeDoor:
             enrolment: Knows nodes and tokens.
             ways: To their engines.
             standing: How a site is now.
+            echo: Where its machine says that its echo is.
             leave: Ends a site, at once or when nothing runs there; says how far that is.
             clock: Seconds since the epoch.
         """
@@ -114,6 +119,9 @@ class NodeDoor:
         self._enrolment = enrolment
         self._ways = ways
         self._standing = standing
+        self._echo = echo
+        self._echoes = 0
+        """Looks for echoes that are under way."""
         self._leave = leave
         self._clock = clock
         self._book = Book(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
@@ -325,7 +333,7 @@ class NodeDoor:
         certificate = x509.load_der_x509_certificate(shown)
         name = name_in(certificate)
         if isinstance(request, Way):
-            await self._bring(name, certificate, guest, (reader, writer))
+            await self._bring(request, name, certificate, guest, (reader, writer))
             return None
         wait = self._requests.wait(name)
         if isinstance(request, Link | Renew):
@@ -351,7 +359,8 @@ class NodeDoor:
                 return Refused(error=text, final=False, over=True)
             if isinstance(request, Standing):
                 stands = await asyncio.to_thread(self._standing, name)
-                return stands.model_copy(update={"seen_as": guest.host})
+                echo = None if stands.state == "gone" else await self._echo_answers(name)
+                return stands.model_copy(update={"seen_as": guest.host, "echo": echo})
             if isinstance(request, Leave):
                 stands = await asyncio.to_thread(self._leave, name, request.force)
                 self._note(request, guest, "", name)
@@ -364,6 +373,33 @@ class NodeDoor:
             why = await self._ways.serve(node, reader)
         finally:
             self._ways.end(node, why)
+        return None
+
+    async def _echo_answers(self, name: str) -> bool | None:
+        """Whether the echo of a node answers; None: it has none, or that could not be found out soon.
+
+        In a thread that nobody waits for: a node says the name under which it is, and whoever resolves that may hang.
+        """
+        where = await asyncio.to_thread(self._echo, name)
+        if where is None or self._echoes >= _ECHOES:
+            return None
+        answered: asyncio.Future[bool] = self._loop.create_future()
+
+        def tell(answers: bool) -> None:
+            self._echoes -= 1
+            if not answered.done():
+                answered.set_result(answers)
+
+        def look() -> None:
+            answers = echo_answers(*where)
+            with contextlib.suppress(RuntimeError):  # all of it has ended meanwhile
+                self._loop.call_soon_threadsafe(tell, answers)
+
+        self._echoes += 1
+        threading.Thread(target=look, name="node-echo", daemon=True).start()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_ECHO_PATIENCE_S):
+                return await answered
         return None
 
     @contextlib.contextmanager
@@ -398,12 +434,13 @@ class NodeDoor:
     async def _link(
         self, request: Link, known: Known, guest: _Guest, writer: asyncio.StreamWriter
     ) -> LinkedNode | Refused:
-        """Begin a node's link, unless another machine has it."""
+        """Begin a node's link, unless one is alive: another machine's, or of a program with a copy of its key."""
         name, machine = known.name, request.machine
         there = self._ways.get(name)
-        if there is not None and there.machine != machine.id and await self._ways.is_alive(name):
+        if there is not None and await self._ways.is_alive(name):
+            who = "another machine is" if there.machine != machine.id else "this machine, or one that says so, is"
             return Refused(
-                error=f"another machine is linked as '{name}', from {there.seen_as}: this one is a copy of it; run "
+                error=f"{who} linked as '{name}', from {there.seen_as}: this one is a copy of it; run "
                 "`skytether site leave --force` on the one that is to be no site, and invite it under another name",
                 final=False,
             )
@@ -412,7 +449,13 @@ class NodeDoor:
         node = LinkedNode(name, known.node.serial, machine.id, guest.host, writer, heard_at=now)
         writer.write(
             line_of(
-                Linked(time=self._clock(), begins=known.begins_at, ends=known.node.ends_at, urls=self._enrolment.urls)
+                Linked(
+                    time=self._clock(),
+                    begins=known.begins_at,
+                    ends=known.node.ends_at,
+                    link=node.secret,
+                    urls=self._enrolment.urls,
+                )
             )
         )
         self._ways.begin(node)
@@ -420,6 +463,7 @@ class NodeDoor:
 
     async def _bring(
         self,
+        request: Way,
         name: str,
         certificate: x509.Certificate,
         guest: _Guest,
@@ -429,6 +473,8 @@ class NodeDoor:
         node = self._ways.get(name)
         if node is None:
             raise ForbiddenError("a node has ways while its link stands, and this one's does not")
+        if not secrets.compare_digest(request.link.encode(), node.secret.encode()):
+            raise ForbiddenError("this way is of no link that stands: whoever opens it is not at the other end")
         if serial_of(certificate) != node.serial:
             with self._one_of(name):
                 await asyncio.to_thread(self._enrolment.admit, certificate)
@@ -461,5 +507,5 @@ def echo_answers(host: str, port: int) -> bool:
     try:
         with EchoClient(host, port) as client:
             return any(client.ask(_ECHO_S) is not None for _ in range(_ECHO_TRIES))
-    except OSError:
+    except (OSError, UnicodeError):  # UnicodeError: it is no name that could be looked up
         return False

@@ -11,7 +11,7 @@ from skytether.api.node import Stands
 from ..core import Orchestrator
 from ..errors import ConflictError, NotFoundError
 from .authority import LiveContext
-from .door import NodeDoor, echo_answers
+from .door import NodeDoor
 from .ways import Ways
 
 ADDRESS = "nodes.address"
@@ -30,6 +30,7 @@ def serving_nodes(core: Orchestrator, listener: socket.socket | None) -> Iterato
         core.nodes,
         Ways(core.settings.state_dir / "sites"),
         lambda name: standing(core, name),
+        lambda name: echo_of(core, name),
         lambda name, force: leave(core, name, force=force),
         core.clock,
     )
@@ -45,23 +46,29 @@ def serving_nodes(core: Orchestrator, listener: socket.socket | None) -> Iterato
             address.unlink(missing_ok=True)
 
 
-def standing(core: Orchestrator, name: str, *, look: bool = True) -> Stands:
-    """How a node's site is now; ``look``: also whether its echo answers."""
+def standing(core: Orchestrator, name: str) -> Stands:
+    """How a node's site is now."""
     site = core.sites.find_anew(name)
     node = core.nodes.get(name) if core.nodes is not None else None
     if site is None or node is None:
         return Stands(state="gone")
     unreachable, blocked, total = site.unreachable, site.runtime.blocked(), site.capacity
-    host, echo = site.asked.options.get("advertise_host"), node.machine.echo
     return Stands(
         state="unreachable" if unreachable else "blocked" if blocked else "ready",
         reason=(unreachable or blocked)[:2000],
         instances=len(core.store.live_at(name)),
         draining=site.draining or site.evacuating,
-        echo=echo_answers(str(host), echo) if look and host and echo else None,
         cpu=total.cpu if total else None,
         memory_mb=total.memory_mb if total else None,
     )
+
+
+def echo_of(core: Orchestrator, name: str) -> tuple[str, int] | None:
+    """Where a node says that its echo answers; None: it says nothing."""
+    site = core.sites.find(name)
+    node = core.nodes.get(name) if core.nodes is not None and site is not None else None
+    host = site.asked.options.get("advertise_host") if site is not None else None
+    return (str(host), node.machine.echo) if host and node is not None and node.machine.echo else None
 
 
 def leave(core: Orchestrator, name: str, *, force: bool) -> Stands:
@@ -78,4 +85,4 @@ def leave(core: Orchestrator, name: str, *, force: bool) -> Stands:
     if gone:
         core.metrics.forget_site(name)
         return Stands(state="gone")
-    return standing(core, name, look=False)
+    return standing(core, name)

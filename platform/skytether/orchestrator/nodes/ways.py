@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import secrets
 import socket
 import time
 from collections import deque
@@ -54,6 +55,8 @@ class LinkedNode:
     writer: asyncio.StreamWriter
     heard_at: float
     """When it said something last, by the loop's clock."""
+    secret: str = field(default_factory=lambda: secrets.token_hex(16), repr=False)
+    """Known to whoever is at the other end of the link: whose ways these are."""
     engine_away: str | None = None
     """Why its engine cannot be reached; empty: it can; None: it has not said yet."""
     spare: deque[tuple[Stream, asyncio.Future[None]]] = field(default_factory=deque)
