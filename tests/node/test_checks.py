@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from skytether.node.calls import address_of
 from skytether.node.checks import Finding, judge_address, judge_clock, judge_disk, judge_engine, judge_memory
 from skytether.node.join import engine_path
 from skytether.node.machine import EngineInfo, address_towards, ask_engine, describe
-from skytether.node.store import NodeError
+from skytether.node.store import NodeError, NodeStore
 from skytether.node.unit import unit
 
 ROOT = Path(__file__).parents[2]
@@ -158,3 +159,31 @@ def test_a_unit_hides_no_home_that_it_needs() -> None:
     assert "ProtectHome=yes" in unit("/opt/skytether/bin/skytether")
     assert "ProtectHome=read-only" in unit("/home/me/.venv/bin/skytether")
     assert "ProtectHome=no" in unit("/opt/skytether/bin/skytether", engine="/run/user/1000/docker.sock")
+
+
+def test_a_folder_into_which_others_may_put_another_authority_is_refused(tmp_path: Path) -> None:
+    """Whoever does that is the node's orchestrator, and has its engine."""
+    tmp_path.chmod(0o755)
+    open_to_all = tmp_path / "open"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    found = checks.look_at_rights(open_to_all / "node", unit=False)
+    assert not found.good
+    assert f"others may write to {open_to_all}" in found.says
+    (open_to_all / "node").mkdir(mode=0o700)
+    with pytest.raises(NodeError, match="is not trusted: others may replace"):
+        NodeStore(open_to_all / "node").config()
+    open_to_all.chmod(0o755)
+    assert checks.look_at_rights(open_to_all / "other", unit=False).good
+    with pytest.raises(NodeError, match="this machine has not joined"):
+        NodeStore(open_to_all / "node").config()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="makes a folder another user's")
+def test_a_folder_that_somebody_made_where_all_may_is_not_the_nodes() -> None:
+    with tempfile.TemporaryDirectory() as place:
+        os.chmod(place, 0o1777)
+        theirs = Path(place) / "node"
+        theirs.mkdir()
+        os.chown(theirs, 65_534, 65_534)
+        assert "belongs to the user 65534" in checks.look_at_rights(theirs, unit=False).says

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from skytether.guard.folder import objection
+
 from .machine import EngineInfo, architecture, ask_engine, free_mb, own_addresses
 
 OLDEST_API = (1, 41)
@@ -157,6 +159,9 @@ def look_at_rights(folder: Path, *, unit: bool) -> Finding:
         above = above.parent
     if not os.access(above, os.W_OK):
         return Finding("rights", f"{above} cannot be written: run this with sudo, or give --folder", good=False)
+    if why := objection(str(above)):
+        text = f"whoever may put another authority beside the keys is this machine's orchestrator: {why}; give --folder"
+        return Finding("rights", text, good=False)
     return Finding("rights", f"keys go to {folder}")
 
 

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationError
 
 from skytether.api.manifest import Name, Strict
 from skytether.api.node import Address, Port
+from skytether.guard.folder import objection
 
 DEFAULT_FOLDER = Path("/etc/skytether/node")
 _CONFIG, _AUTHORITY, _IDENTITY = "node.json", "authority.pem", "identity.pem"
@@ -60,9 +61,11 @@ class NodeStore:
         """How it was joined.
 
         Raises:
-            NodeError: It was not, or the file is damaged.
+            NodeError: It was not, the file is damaged, or somebody else could have put it there.
         """
         path = self.folder / _CONFIG
+        if self.folder.is_dir() and (why := objection(str(self.folder))):
+            raise NodeError(f"what is in {self.folder} is not trusted: {why}")
         try:
             return NodeConfig.model_validate_json(path.read_bytes())
         except FileNotFoundError:
