@@ -43,10 +43,8 @@ def add_navigation(_app: Sphinx, document: str, source: list[str]) -> None:
     for heading, text in zip(parts[1::2], parts[2::2], strict=True):
         heads = re.findall(r"^(?:- |\| )(.+?)(?:: | \| )", text, re.MULTILINE)
         links = [link for head in heads for link in re.findall(r"\[([^\]]+)\]\(([^)#]+\.md)\)", head)]
-        if heading == "Explanation":  # a page for each part, which come and go with the parts
-            links += [("", f"internals/{page.name}") for page in sorted((ROOT / "docs" / "internals").glob("*.md"))]
         if links:
-            rows = "\n".join(f"{title.replace('`', '')} <{path}>" if title else path for title, path in links)
+            rows = "\n".join(f"{title.replace('`', '')} <{path}>" for title, path in links)
             source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {heading}\n\n{rows}\n```\n"
 
 
