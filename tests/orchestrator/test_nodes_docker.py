@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from docker.errors import APIError
 from docker_site import DockerSite
 from node_scene import NodeScene, program, until
 
@@ -15,6 +16,9 @@ from skytether.api.rest import InstanceCreate, Invite, State
 from skytether.node.join import join
 from skytether.orchestrator.app import create_app
 from skytether.orchestrator.core import Orchestrator
+from skytether.orchestrator.runtimes.docker.client import Client as Engine
+from skytether.orchestrator.runtimes.docker.objects import holder
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.settings import Nodes, Settings, Timing
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
@@ -54,6 +58,7 @@ def test_what_runs_at_a_node_that_is_unplugged_runs_on_and_is_found_again(
         (container,) = docker_site.containers()
         began = docker_site.docker("inspect", "-f", "{{.State.StartedAt}}", container)
         assert house.operator.logs(made.id)
+        refuses_to_be_had(house, docker_site, container)
         house.shut()
         until(lambda: house.state() == "unreachable")
         assert docker_site.docker("inspect", "-f", "{{.State.Running}}", container) == "true"
@@ -67,3 +72,29 @@ def test_what_runs_at_a_node_that_is_unplugged_runs_on_and_is_found_again(
         # By way of the node what is left there goes with the site.
         assert house.operator.delete_site("edge")
         assert docker_site.containers() == docker_site.helpers() == []
+
+
+def refuses_to_be_had(house: NodeScene, docker_site: DockerSite, ours: str) -> None:
+    """Whoever has the orchestrator gets neither the node's files, nor what else runs there, nor a shell in it."""
+    way = f"unix://{house.core.settings.state_dir}/sites/edge/engine.sock"
+    image = docker_site.images.name("base")
+    good = holder(DockerOptions(network=docker_site.network), docker_site.owner, image)
+    stranger = docker_site.docker("create", "--entrypoint", "/bin/sleep", image, "60")
+    client = Engine(way, version="1.41", timeout=30)
+    try:
+        client.remove_container(client.create_container_from_config(good)["Id"])
+        for key, value in (("Binds", ["/:/host"]), ("Privileged", True), ("NetworkMode", "host"), ("PidMode", "host")):
+            with pytest.raises(
+                APIError, match=f"this machine's node refuses it: .*{'host' if key == 'NetworkMode' else key}"
+            ):
+                client.create_container_from_config({**good, "HostConfig": {**good["HostConfig"], key: value}})
+        with pytest.raises(APIError, match="is nothing that a site needs"):
+            client.exec_create(ours, "/bin/true")
+        with pytest.raises(APIError, match="is not of an orchestrator"):
+            client.remove_container(stranger, force=True)
+        with pytest.raises(APIError, match="something else of this machine"):
+            client.create_volume("skytether-x", driver_opts={"type": "none", "o": "bind", "device": "/"})
+        assert docker_site.docker("inspect", "-f", "{{.State.Status}}", stranger) == "created"
+    finally:
+        client.close()
+        docker_site.docker("rm", "-f", stranger)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
 
 from .node import ANSWER_S
 
@@ -18,13 +19,24 @@ _UNHEARD_S = 20
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def splice(one: Stream, other: Stream, pace: Callable[[int], Awaitable[None]] | None = None) -> None:
+async def splice(
+    one: Stream,
+    other: Stream,
+    pace: Callable[[int], Awaitable[None]] | None = None,
+    there: Callable[[Stream, Stream], Coroutine[Any, Any, None]] | None = None,
+) -> None:
     """Pass bytes both ways until one side has ended, and what it said before has arrived.
 
     Neither end of the other side is kept then: who asks an engine over HTTP ends when it has its answer.
-    ``pace`` is awaited with the number of bytes that the other said, before more of it is read.
+
+    Args:
+        one: A connection.
+        other: Another one.
+        pace: Awaited with the number of bytes that ``other`` said, before more of it is read.
+        there: Passes on what ``one`` says, until that ends; None: all of it, as it is.
     """
-    ways = [asyncio.create_task(_pass(one[0], other[1])), asyncio.create_task(_pass(other[0], one[1], pace))]
+    told = there(one, other) if there else _pass(one[0], other[1])
+    ways = [asyncio.create_task(told), asyncio.create_task(_pass(other[0], one[1], pace))]
     try:
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         for _, writer in (one, other):

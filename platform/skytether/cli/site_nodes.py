@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from http import HTTPStatus
@@ -123,6 +124,17 @@ def join_node(
     echo_port: Annotated[
         int, typer.Option(min=0, max=65_535, help="UDP port of the echo for robots' probes; 0: none.")
     ] = 8600,
+    device: Annotated[
+        list[str] | None,
+        typer.Option(help="File of a device that services here may have, such as /dev/video0; may be given again."),
+    ] = None,
+    unfiltered: Annotated[
+        bool,
+        typer.Option(
+            "--unfiltered",
+            help="Pass on whatever the orchestrator asks of the engine: whoever takes it over is root here then.",
+        ),
+    ] = False,
     folder: Folder = _FOLDER,
     unit: Annotated[
         bool, typer.Option("--unit/--no-unit", help="Have systemd run it; otherwise run `skytether site run` yourself.")
@@ -144,6 +156,8 @@ def join_node(
         advertise=advertise,
         ports=_ports(ports),
         echo=echo_port or None,
+        devices=_devices(device),
+        unfiltered=unfiltered,
         folder=folder.expanduser().absolute(),
         unit=unit,
     )
@@ -171,6 +185,13 @@ def _token(file: str | None, text: str | None) -> str:
         return sys.stdin.readline() if file == "-" else Path(str(file)).read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         fail(f"cannot read the token file {file}: {getattr(error, 'strerror', None) or 'it is no text'}", 2)
+
+
+def _devices(given: list[str] | None) -> tuple[str, ...]:
+    for path in given or ():
+        if not path.startswith("/dev/") or not re.fullmatch(r"[A-Za-z0-9._/-]+", path):
+            fail(f"--device {path}: write the path of a device, such as /dev/video0", 2)
+    return tuple(given or ())
 
 
 def _ports(text: str | None) -> tuple[int, int] | None:

@@ -50,6 +50,10 @@ class JoinOptions:
     """That robots are told; None: the address by which this machine reaches the orchestrator, whatever it is then."""
     ports: tuple[int, int] | None = None
     echo: int | None = 8600
+    devices: tuple[str, ...] = ()
+    """That containers may have."""
+    unfiltered: bool = False
+    """Let an orchestrator ask the engine for anything."""
     folder: Path = Path("/etc/skytether/node")
     unit: bool = True
     program: str = ""
@@ -124,6 +128,8 @@ def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: Non
         address=address,
         follow=options.advertise is None,
         echo=options.echo,
+        devices=options.devices,
+        unfiltered=options.unfiltered,
         unit=options.unit,
     )
     try:

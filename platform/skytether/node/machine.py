@@ -74,14 +74,24 @@ def ask_engine(path: str) -> EngineInfo:
 
 
 def _get(path: str, what: str) -> Any:
+    status, document = ask_json(path, what)
+    if status != http.HTTPStatus.OK:
+        raise ValueError(f"what listens at {path} is no Docker engine: it answers {status} to {what}")
+    return document
+
+
+def ask_json(path: str, what: str) -> tuple[int, Any]:
+    """Status and document that an engine answers with.
+
+    Raises:
+        OSError: It does not answer.
+        ValueError: It answers something else.
+    """
     connection = _Connection(path)
     try:
         connection.request("GET", what)
         answer = connection.getresponse()
-        body = answer.read(_MOST)
-        if answer.status != http.HTTPStatus.OK:
-            raise ValueError(f"what listens at {path} is no Docker engine: it answers {answer.status} to {what}")
-        return json.loads(body)
+        return answer.status, json.loads(answer.read(_MOST))
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
     finally:

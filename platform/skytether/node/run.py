@@ -39,6 +39,7 @@ from skytether.api.splice import PIECE, Stream, closed, keep_alive, splice
 
 from . import calls
 from .calls import RefusedError, address_of, explained, read_answer, trusting
+from .engine_gate import EngineGate
 from .machine import address_towards, ask_engine, describe
 from .store import NodeError, NodeStore, new_key, renew_due, request_for
 
@@ -77,6 +78,8 @@ class NodeProgram:
         self._store = store
         self._config = store.config()
         self._trust: ssl.SSLContext = trusting(store.authority(), store.identity)
+        config = self._config
+        self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices)
         self._on_linked = on_linked
         self._links: dict[str, asyncio.Task[None]] = {}
         self._told: dict[str, str] = {}
@@ -286,7 +289,7 @@ class NodeProgram:
                     doubt.set()
                 raise
             try:
-                await splice((reader, writer), engine)
+                await splice((reader, writer), engine, there=self._gate.pass_requests if self._gate else None)
             finally:
                 engine[1].transport.abort()
         except (OSError, asyncio.IncompleteReadError):

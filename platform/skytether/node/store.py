@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from pydantic import Field, ValidationError
 
-from skytether.api.manifest import Name, Strict
+from skytether.api.manifest import Device, Name, Strict
 from skytether.api.node import Address, Port
 from skytether.guard.folder import objection
 
@@ -38,6 +38,10 @@ class NodeConfig(Strict):
     """Whether that is the machine's present address, for nobody named one."""
     echo: Port | None = None
     """UDP port of the echo; None: it has none."""
+    devices: tuple[Device, ...] = ()
+    """Files of devices that containers may have."""
+    unfiltered: bool = False
+    """Whether an orchestrator may ask the engine for anything, and so has all of this machine."""
     unit: bool = True
     """Whether a unit of systemd runs it."""
 

@@ -26,6 +26,7 @@ locals {
   join_words = var.orchestrator == null ? [] : concat(
     ["site", "join", var.orchestrator, "--ports", local.ports, "--echo-port", tostring(coalesce(var.echo_port, 0))],
     var.advertise == null ? [] : ["--advertise", var.advertise],
+    flatten([for device in var.devices : ["--device", device]]),
   )
 
   packages = distinct(concat(

@@ -58,6 +58,17 @@ variable "advertise" {
   }
 }
 
+variable "devices" {
+  description = "Files of devices that services there may have, such as \"/dev/video0\": the machine refuses its orchestrator any other. The site's option `devices` names them, too."
+  type        = list(string)
+  default     = []
+
+  validation {
+    condition     = alltrue([for device in var.devices : can(regex("^/dev/[A-Za-z0-9._/-]+$", device))])
+    error_message = "devices are paths such as \"/dev/video0\"."
+  }
+}
+
 variable "engine" {
   description = "Install Debian's Docker engine, for services. It listens on the machine's own socket only: whoever needs it from elsewhere comes by SSH."
   type        = bool

@@ -52,6 +52,12 @@ run "an_advertised_address_with_a_port" {
   expect_failures = [var.advertise]
 }
 
+run "a_device_that_is_a_folder_of_the_system" {
+  command = plan
+  variables { devices = ["/etc"] }
+  expect_failures = [var.devices]
+}
+
 run "a_site_without_an_engine" {
   command = plan
   variables {

@@ -36,6 +36,7 @@ run "a_site" {
     orchestrator  = "https://cloud.example.org:8603"
     session_ports = { first = 30000, last = 30009 }
     advertise     = "203.0.113.7"
+    devices       = ["/dev/video0"]
     ssh_from      = ["192.0.2.0/24", "2001:db8::/32"]
     ssh_keys      = ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGJlbGlldmVtZWl0aXNub3RhcmVhbGtleWF0YWxsISEh me"]
     package       = { source = "/opt/wheels/skytether-0.1.0-py3-none-any.whl[docker]", options = ["--no-index", "--find-links=/opt/wheels"] }
@@ -46,9 +47,9 @@ run "a_site" {
   assert {
     condition = strcontains(
       one([for file in yamldecode(output.user_data).write_files : file.content if file.path == "/usr/local/sbin/skytether-join"]),
-      "skytether site join https://cloud.example.org:8603 --ports 30000-30009 --echo-port 8600 --advertise 203.0.113.7 --token-file -",
+      "skytether site join https://cloud.example.org:8603 --ports 30000-30009 --echo-port 8600 --advertise 203.0.113.7 --device /dev/video0 --token-file -",
     )
-    error_message = "the machine joins its orchestrator with its ports and its address"
+    error_message = "the machine joins its orchestrator with its ports, its address and its devices"
   }
   assert {
     condition = alltrue([for line in [

@@ -1,0 +1,208 @@
+"""What an orchestrator may ask of a node's engine: what its Docker sites need, and nothing that is the machine itself.
+
+An engine gives whoever reaches it the whole machine: a container may mount ``/``, or be in the machine's own network.
+So a node passes on those calls only that start, watch and end closed containers of ours. All here is pure.
+
+What is asked is named by allow-lists, by method and path and by key of what a container is made of: what an engine
+learns in a later version is refused until somebody has thought of it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
+"""Labels of what orchestrators made."""
+_ID = r"([A-Za-z0-9][A-Za-z0-9_.-]*)"
+_BEFORE = re.compile(r"^/v1\.\d{1,3}(?=/)")
+_CALLS = tuple(
+    (methods.split(), re.compile(pattern.replace("ID", _ID)), kind)
+    for methods, pattern, kind in (
+        ("GET HEAD", r"/_ping|/version|/info|/events|/system/df|/containers/json|/volumes", ""),
+        ("POST", r"/containers/create", "create"),
+        ("POST", r"/containers/prune", "prune"),
+        ("GET", r"/containers/ID/(?:json|logs|stats)", "container"),
+        ("GET HEAD PUT", r"/containers/ID/archive", "container"),
+        ("POST", r"/containers/ID/(?:start|kill|wait)", "container"),
+        ("POST", r"/containers/ID/update", "update"),
+        ("DELETE", r"/containers/ID", "container"),
+        ("GET", r"/images/[A-Za-z0-9](?:[A-Za-z0-9_:@-]|[./](?![./]))*/json", ""),
+        ("POST", r"/images/create", "pull"),
+        ("GET", r"/networks/ID", ""),
+        ("POST", r"/networks/create", "network made"),
+        ("POST", r"/networks/ID/(?:connect|disconnect)", "joined"),
+        ("DELETE", r"/networks/ID", "network"),
+        ("POST", r"/volumes/create", "volume made"),
+        ("DELETE", r"/volumes/ID", "volume"),
+    )
+)
+_LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
+_CONTAINER = {"Image", "Healthcheck", "User", "Env", "ExposedPorts", "Labels", "HostConfig", "Entrypoint", "Cmd"}
+_HOST = _LIMITS | {
+    *("NetworkMode", "PortBindings", "Dns", "ExtraHosts", "Init", "ReadonlyRootfs", "CapDrop", "CapAdd", "SecurityOpt"),
+    *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig"),
+}
+_NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
+_BRIDGES, _VOLUMES = "skt-", "skytether-"
+"""What names of ours begin with: of interfaces, and of volumes that outlive their containers."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """One request."""
+
+    method: str
+    path: str
+    """Without what is escaped in it."""
+    query: Mapping[str, str]
+    body: Any
+    """What its JSON says; None: it has none, or is an archive."""
+
+
+Subject = tuple[str, str]
+"""Kind (``containers``, ``networks``, ``volumes``) and name of what must be ours, if it is there at all."""
+
+
+def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
+    """Why a call is not passed on, in a sentence, and what must be ours before it is.
+
+    Args:
+        call: What is asked.
+        devices: Files of devices that containers may have.
+    """
+    path = _BEFORE.sub("", call.path)
+    for methods, pattern, kind in _CALLS:
+        if call.method in methods and (found := pattern.fullmatch(path)):
+            name = found[1] if found.groups() else ""
+            return _judge(kind, name, call, devices)
+    return f"{call.method} {path[:100]} is nothing that a site needs", ()
+
+
+def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[str | None, tuple[Subject, ...]]:
+    body, expects = call.body, kind in ("create", "update", "network made", "joined", "volume made")
+    if expects and not isinstance(body, dict):
+        return "the call wants an object", ()
+    match kind:
+        case "create":
+            within = str(_at(body, "HostConfig").get("NetworkMode", "")).partition("container:")[2]
+            return _container(body, set(devices)), (("containers", within),) if within else ()
+        case "update":
+            return _only(body, _LIMITS, "limits"), (("containers", name),)
+        case "joined":
+            settings = {key: one for key, one in _at(body, "EndpointConfig").items() if one}
+            refused = _only(body, {"Container", "EndpointConfig", "Force"}, "the call") or _only(settings, set(), "it")
+            return refused, (("containers", str(body.get("Container", ""))),)
+        case "network made":
+            return _network(body), ()
+        case "volume made":
+            return _volume(body), ()
+        case "prune":
+            filters = _json(call.query.get("filters", ""))
+            ours = isinstance(filters, dict) and filters.get("label") in ([OLD_GUARD], {OLD_GUARD: True})
+            return None if ours else "only what earlier releases left is pruned", ()
+        case "pull":
+            return _only(call.query, {"fromImage", "tag"}, "a pull"), ()
+        case "container" | "network" | "volume":
+            return None, ((f"{kind}s", name),)
+    return None, ()
+
+
+def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
+    host = _at(body, "HostConfig")
+    mode = str(host.get("NetworkMode", ""))
+    checks = (
+        _only(body, _CONTAINER, "a container"),
+        _only(host, _HOST, "a container"),
+        None if OWNER in _at(body, "Labels") else f"it has no label {OWNER}",
+        None if re.fullmatch(f"(?:container:)?{_ID}", mode) and mode != "host" else f"its network is '{mode[:80]}'",
+        None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
+        _rights(host.get("CapAdd") or [], mode),
+        _security(host.get("SecurityOpt")),
+        None if host.get("IpcMode", "none") in ("none", "private") else "it shares memory with others",
+        None if _at(host, "LogConfig").get("Type", "json-file") == "json-file" else "its log goes elsewhere",
+        _only(_at(host, "LogConfig"), {"Type", "Config"}, "a log"),
+        *(_mount(mount) for mount in _list(host, "Mounts")),
+        *(_device(one, devices) for one in _list(host, "Devices")),
+        *(_gpu(one) for one in _list(host, "DeviceRequests")),
+    )
+    return next(filter(None, checks), None)
+
+
+def _rights(added: Any, mode: str) -> str | None:
+    if not added or (added == ["NET_ADMIN"] and mode.startswith("container:")):
+        return None  # the right of a guard, to the network of that container
+    return f"it has the rights {str(added)[:80]}"
+
+
+def _security(options: Any) -> str | None:
+    given = options if isinstance(options, list) else []
+    profiles = [str(one) for one in given if one != "no-new-privileges"]
+    if len(profiles) == len(given) or not all(isinstance(_json(p.removeprefix("seccomp=")), dict) for p in profiles):
+        return "its SecurityOpt lets go of what holds it"
+    return None
+
+
+def _mount(mount: Any) -> str | None:
+    if not isinstance(mount, dict) or mount.get("Type") != "volume":
+        return "it mounts something of this machine"
+    name = mount.get("Source") or _VOLUMES
+    if not str(name).startswith(_VOLUMES):
+        return f"it mounts the volume '{str(name)[:80]}', which is not ours"
+    labels_only = _only(_at(mount, "VolumeOptions"), {"Labels"}, "a volume")
+    return labels_only or _only(mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount")
+
+
+def _device(device: Any, devices: set[str]) -> str | None:
+    path = device.get("PathOnHost") if isinstance(device, dict) else device
+    if path in devices:
+        return _only(device, {"PathOnHost", "PathInContainer", "CgroupPermissions"}, "a device")
+    return f"it has the device {str(path)[:80]}, and this machine gives none but by `site join --device {path}`"
+
+
+def _gpu(request: Any) -> str | None:
+    gpus = isinstance(request, dict) and request.get("Driver") == "nvidia"
+    return _only(request, {"Driver", "DeviceIDs", "Capabilities"}, "a GPU") if gpus else "it asks for odd devices"
+
+
+def _network(body: Mapping[str, Any]) -> str | None:
+    options = _at(body, "Options")
+    ours = NETWORK in _at(body, "Labels") and body.get("Driver") == "bridge" and not body.get("IPAM")
+    if not ours or not str(options.get("com.docker.network.bridge.name", "")).startswith(_BRIDGES):
+        return "it is no network of ours, which is a bridge of its own"
+    known = {"Name", "CheckDuplicate", "Driver", "Options", "IPAM", "Labels"}
+    return _only(options, _NETWORK_OPTIONS, "a network") or _only(body, known, "a network")
+
+
+def _volume(body: Mapping[str, Any]) -> str | None:
+    if body.get("DriverOpts") or body.get("Driver") not in (None, "", "local"):
+        return "the volume is something else of this machine"
+    if not str(body.get("Name", "")).startswith(_VOLUMES) or OWNER not in _at(body, "Labels"):
+        return "it is no volume of ours"
+    return _only(body, {"Name", "Driver", "DriverOpts", "Labels"}, "a volume")
+
+
+def _only(given: Mapping[str, Any], known: set[str], what: str) -> str | None:
+    """Exact keys: an engine takes them in any case, and so knows more spellings than are asked for."""
+    odd = sorted(key for key in given if key not in known)
+    return f"{what} has '{odd[0][:40]}', which no site asks for" if odd else None
+
+
+def _at(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = given.get(key) or {}
+    return found if isinstance(found, dict) else {"": found}
+
+
+def _list(given: Mapping[str, Any], key: str) -> list[Any]:
+    found = given.get(key) or []
+    return found if isinstance(found, list) else [found]
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None

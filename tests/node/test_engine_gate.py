@@ -1,0 +1,162 @@
+"""A node's engine gets the requests that were judged, and not a byte more, however they are written."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socketserver
+import tempfile
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skytether.api.splice import closed, splice
+from skytether.node.engine_gate import EngineGate
+
+ID = "f" * 64
+
+
+class Engine:
+    """Answers, and keeps what it was asked."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+        self.asked: list[tuple[str, dict[str, str], bytes]] = []
+        engine = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def _serve(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                engine.asked.append((f"{self.command} {self.path}", dict(self.headers), body))
+                labels = {"skytether.io/owner": "edge"} if ID in self.path else {}
+                text = json.dumps({"Id": ID, "Config": {"Labels": labels}, "Labels": labels}).encode()
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(text)))
+                self.end_headers()
+                self.wfile.write(text)
+
+            do_GET = do_POST = do_PUT = do_DELETE = _serve  # noqa: N815 (the library's names)
+
+            def log_message(self, *_: Any) -> None:
+                pass
+
+            def address_string(self) -> str:
+                return "node"
+
+        class Server(socketserver.ThreadingUnixStreamServer):
+            daemon_threads = True
+
+        self.server = Server(self.path, Handler)
+        threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
+
+    @property
+    def lines(self) -> list[str]:
+        return [line for line, _, _ in self.asked]
+
+
+@pytest.fixture
+def engine() -> Iterator[Engine]:
+    with tempfile.TemporaryDirectory(prefix="sky-") as folder:
+        made = Engine(Path(folder) / "e.sock")
+        yield made
+        made.server.shutdown()
+        made.server.server_close()
+
+
+def say(engine: Engine, sent: bytes) -> bytes:
+    """What somebody who sends this, and then no more, gets back."""
+
+    async def run() -> bytes:
+        gate, path, over = EngineGate(engine.path, ()), engine.path + ".way", asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            there = await asyncio.open_unix_connection(engine.path)
+            try:
+                await splice((reader, writer), there, there=gate.pass_requests)
+            finally:
+                there[1].transport.abort()
+                writer.transport.abort()
+                await closed()
+                over.set()
+
+        async with await asyncio.start_unix_server(serve, path):
+            reader, writer = await asyncio.open_unix_connection(path)
+            writer.write(sent)
+            got = b""
+            async with asyncio.timeout(20):
+                while b"403 Forbidden" not in got and got.count(b"HTTP/1.1 200") < sent.count(b" HTTP/1.1\r\n"):
+                    piece = await reader.read(65536)
+                    if not piece:
+                        break
+                    got += piece
+                if b"403 Forbidden" in got:
+                    got += await reader.read()
+            writer.close()
+            await over.wait()
+            await closed()
+            return got
+
+    return asyncio.run(run())
+
+
+def request(line: str, body: bytes = b"", *headers: str) -> bytes:
+    rows = "".join(f"{header}\r\n" for header in (f"Content-Length: {len(body)}", *headers))
+    return f"{line} HTTP/1.1\r\nHost: a\r\n{rows}\r\n".encode() + body
+
+
+def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine: Engine) -> None:
+    odd = ("Connection: Upgrade", "Upgrade: tcp", "X-Odd: 1", "Content-Type: application/json")
+    body = b' {"Memory": 1, "Memory": 2}'
+    sent = request("GET /v1.41/info") + request(f"POST /v1.41/containers/{ID}/update", body, *odd)
+    assert say(engine, sent).count(b"HTTP/1.1 200") == 2
+    looked = f"GET /containers/{ID}/json"
+    assert sorted(engine.lines[:-1]) == [looked, "GET /v1.41/info"]  # which of them first, the engine's threads say
+    assert engine.lines[-1] == f"POST /v1.41/containers/{ID}/update"
+    _, headers, got = engine.asked[-1]
+    assert {name.lower() for name in headers} == {"host", "content-length", "content-type"}
+    assert got == b'{"Memory": 2}'
+
+
+def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
+    archive = bytes(range(256)) * 1000
+    assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Frun", archive))
+    line, _, got = engine.asked[-1]
+    assert (line, got) == (f"PUT /containers/{ID}/archive?path=%2Frun", archive)
+
+
+@pytest.mark.parametrize(
+    ("sent", "says"),
+    [
+        (request("DELETE /containers/database"), b"database is not of an orchestrator"),
+        (request("POST /containers/database/kill"), b"database is not of an orchestrator"),
+        (request("DELETE /networks/bridge"), b"bridge is not of an orchestrator"),
+        (request("PUT /containers/data%62ase/archive", b"tar"), b"database is not of an orchestrator"),
+        (request("POST /containers/database%2Fexec", b"{}"), b"nothing that a site needs"),
+        (request("POST /containers/create", b'{"HostConfig": {"Binds": ["/:/host"]}}'), b"'Binds'"),
+        (request("GET /info", b"POST /build HTTP/1.1\r\n\r\n"), b"its body is no JSON"),
+        (request("GET /info", b"", "Content-Length: 5"), b"no plain request"),
+        (request("GET /info", b"", "Transfer-Encoding: chunked"), b"no plain request"),
+        (request("GET /info", b"", " folded: 1"), b"no plain request"),
+        (request("GET /info", b"", "Content-Length : 5"), b"no plain request"),
+        (request("GET http://a/info"), b"no plain request"),
+        (b"GET /info\r\n\r\n", b"no plain request"),
+        (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"no plain request"),
+        (request("POST /images/create?fromImage=a&fromImage=b"), b"its query or its length is odd"),
+        (b"POST /images/create HTTP/1.1\r\nContent-Length: 99999999999\r\n\r\n", b"its query or its length is odd"),
+        (request("POST /containers/create", b"[" * 100_000), b"its body is no JSON"),
+        (b"GET /" + b"a" * 200_000, b"refuses it"),
+    ],
+)
+def test_what_is_refused_is_told_and_the_engine_hears_nothing_of_it(engine: Engine, sent: bytes, says: bytes) -> None:
+    got = say(engine, sent + request("GET /version"))
+    assert b"403 Forbidden" in got
+    assert says in got
+    assert [
+        line for line in engine.lines if not line.startswith("GET /containers/") and line != "GET /networks/bridge"
+    ] == []
