@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine slow-others slow-kubernetes unit images fuzz jepsen check terraform checkov iaas fmt docs site licences audit lock clean
+.PHONY: demo test slow-engine slow-others slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -33,6 +33,11 @@ slow-others: $(READY)
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile
+
+coverage: $(READY) ## the quick tests, and what share of each package they run; takes two to three times as long
+	@mkdir -p build/coverage
+	$(UNIT) -n 2 --dist loadfile --cov --cov-report json:build/coverage/files.json || echo "Tests failed: those that judge moments may, beside what counts."
+	@$(BIN)/python .ci/coverage.py < build/coverage/files.json
 
 images: $(READY) ## the container images, on the Docker engine of this machine; prints build time and size of each
 	$(BIN)/python images/build.py --sbom build/images/sbom
