@@ -48,7 +48,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "recorder": ("recorder",),
     "navigation": ("navigation",),
     "follow-in-front": ("follow-in-front",),
-    "orchestrator": ("orchestrator", "docker", "kubernetes", "postgres", "recorder"),
+    "orchestrator": ("orchestrator", "docker", "kubernetes", "openstack", "postgres", "recorder"),
 }
 """Images with wheels of their own, and the extras that these are; all but the base's, which they are built on."""
 _NUMERICAL = ("numpy", "numpy.libs")

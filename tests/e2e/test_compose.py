@@ -24,13 +24,26 @@ from docker_site import DockerSite, Images
 from skytether.api.client import Client
 from skytether.api.groups import GroupCreate
 from skytether.api.manifest import Manifest
-from skytether.api.rest import GateReport, InstanceCreate, Renew, Report, Resize, RobotCreate, SiteCreate, TopicReport
+from skytether.api.rest import (
+    GateReport,
+    InstanceCreate,
+    Invite,
+    Renew,
+    Report,
+    Resize,
+    RobotCreate,
+    SiteCreate,
+    TopicReport,
+)
+from skytether.node.join import JoinOptions, join
+from skytether.node.store import NodeStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.compose]
 
 ROOT = Path(__file__).parents[2]
 SUPPORT = ROOT / "tests" / "support" / "compose"
-FILES = [ROOT / "compose.yaml", ROOT / "images/orchestrator/engine-local.yaml", SUPPORT / "stand-ins.yaml"]
+MORE = [ROOT / f"images/orchestrator/{name}.yaml" for name in ("engine-local", "nodes")]
+FILES = [ROOT / "compose.yaml", *MORE, SUPPORT / "stand-ins.yaml"]
 PATIENCE = 120.0
 STARTED = ("passwords", "postgres", "orchestrator", "token", "prometheus")
 
@@ -100,6 +113,9 @@ def stack(compose_programs: None, docker_images: Images) -> Iterator[Stack]:
             **os.environ,
             "SKYTETHER_IMAGE": docker_images.name("orchestrator"),
             "SKYTETHER_PORT": "0",
+            "SKYTETHER_NODES_URL": "https://192.0.2.7:8603",
+            "SKYTETHER_NODES_ADDRESS": "127.0.0.1",
+            "SKYTETHER_NODES_PORT": "0",
             "STAND_IN": stand_in,
             "DOCKER_GID": str(Path("/var/run/docker.sock").stat().st_gid),
         },
@@ -139,6 +155,36 @@ def test_the_orchestrator_is_at_home_in_its_container(stack: Stack) -> None:
     stack.inside("orchestrator", "ssh", "-G", "edge.example")  # it refuses a user that it does not know
 
 
+def test_a_machine_joins_by_the_port_that_is_published_for_it(
+    stack: Stack, docker_site: DockerSite, tmp_path: Path
+) -> None:
+    port = run("docker", "port", stack.container("orchestrator"), "8603/tcp").rpartition(":")[2]
+    options = {key: value for key, value in docker_site.options().items() if key != "engine"}
+    with stack.client as client:
+        token = client.invite(Invite(name="ward", options=options)).token
+        urls = (f"https://127.0.0.1:{port}",)
+        store = NodeStore(tmp_path / "node")
+        joined = join(JoinOptions(urls, token, advertise="127.0.0.1", echo=None, folder=store.folder, unit=False))
+        assert joined.stands.state == "ready", joined.stands.reason
+        assert "https://192.0.2.7:8603" in store.config().urls
+        assert client.delete_site("ward", force=True)
+    assert stack.inside("orchestrator", "stat", "-c", "%a", "/var/lib/skytether/nodes.key") == "600"
+
+
+def test_machines_can_be_made_at_a_cloud_without_a_package_more(stack: Stack) -> None:
+    """The image has openstacksdk, with what that finds by entry points: it asks a cloud, which is not there."""
+    auth = {"auth_url": "http://127.0.0.1:9/v3", "application_credential_id": "i", "application_credential_secret": "s"}
+    clouds = {"clouds": {"lab": {"auth_type": "v3applicationcredential", "auth": auth, "region_name": "r"}}}
+    for name, text in (("clouds.yaml", json.dumps(clouds)), ("machine.yaml", "#cloud-config @SKYTETHER_TOKEN@")):
+        stack.inside("orchestrator", "sh", "-c", f"umask 077; printf %s '{text}' >/tmp/{name}")
+    named = {"cloud": "lab", "clouds_file": "/tmp/clouds.yaml", "user_data": "/tmp/machine.yaml"}
+    options = {**named, "flavor": "f", "image": "i", "network": "n"}
+    with stack.client as client:
+        made = client.create_group(GroupCreate(name="far", provider="openstack", max=1, options=options))
+        assert "cloud 'lab' does not answer" in made.reason
+        assert client.delete_group("far")
+
+
 def test_the_database_can_be_copied(stack: Stack) -> None:
     copied = stack.inside("postgres", "pg_dump", "--username=skytether", "--data-only", "--table=tokens", "skytether")
     assert "prometheus" in copied
@@ -153,7 +199,11 @@ def test_alerts_are_raised_by_what_they_say(compose_programs: None) -> None:
 
 
 def test_what_is_missing_is_told(compose_programs: None) -> None:
-    for name, variable in (("engine-local", "DOCKER_GID"), ("engine-remote", "SKYTETHER_ENGINES")):
+    for name, variable in (
+        ("engine-local", "DOCKER_GID"),
+        ("engine-remote", "SKYTETHER_ENGINES"),
+        ("nodes", "SKYTETHER_NODES_URL"),
+    ):
         command = [
             "docker-compose",
             "-f",
