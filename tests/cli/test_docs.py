@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 from functools import cache
@@ -148,6 +149,28 @@ def test_each_rule_of_the_bridge_that_the_code_cites_is_on_its_page() -> None:
     }
     assert len(cited) > 20
     assert {number for _, number in cited} <= rules.keys()
+
+
+@pytest.mark.parametrize("package", ["wire"])
+def test_what_a_page_of_internals_names_is_there(package: str) -> None:
+    page = (ROOT / "docs" / "internals" / f"{package}.md").read_text()
+    platform, tests = ROOT / "platform" / "skytether", ROOT / "tests" / package
+    files = re.findall(r"`([\w/]+\.py)`", page)
+    assert len(files) > 20
+    for file in files:
+        homes = (platform / package, platform, tests)
+        assert any((home / file).is_file() for home in homes), file
+    defined = {
+        (type_.name, name)
+        for folder in (platform / package, platform / "bridge")
+        for path in folder.rglob("*.py")
+        for type_ in ast.parse(path.read_text()).body
+        if isinstance(type_, ast.ClassDef)
+        for name in re.findall(r"(?:def |self\.)(\w+)", ast.unparse(type_))
+    }
+    named = re.findall(r"`([A-Z]\w+)\.(\w+)`", page)
+    assert len(named) > 30
+    assert set(named) <= defined
 
 
 def test_the_page_of_runtimes_shows_its_example_as_it_is() -> None:
