@@ -7,13 +7,19 @@ import contextlib
 import gc
 import math
 import socket
+import ssl
 import weakref
+from asyncio.sslproto import SSLProtocol
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from certificates import certificate
 from uvicorn import Config
 from uvicorn.server import ServerState
 
+from skytether.api.splice import closed
 from skytether.orchestrator.door import Book, Door, GuardedProtocol, Guest, place_of
 from skytether.orchestrator.settings import Limits
 from skytether.orchestrator.strain import Strain
@@ -235,3 +241,37 @@ def test_what_comes_after_a_body_is_no_header() -> None:
     answers, served = asyncio.run(answers_to(head + chunks, make=Watched))
     assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/a"])
     assert [name for name, _ in seen] == [b"host", b"transfer-encoding"]
+
+
+class Plain(asyncio.Protocol):
+    """Does nothing."""
+
+
+async def fail_a_handshake(tls: ssl.SSLContext) -> None:
+    """Somebody begins to agree upon TLS, and leaves."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        context: Any = SimpleNamespace(context=tls)
+        door = Door(listener, Plain, context, Limits(), 100, (), Strain())
+        try:
+            with socket.create_connection(listener.getsockname()) as stranger:
+                stranger.send(b"\x16\x03\x01\x02\x00\x01\x00")
+                while not door.book.guests:
+                    await asyncio.sleep(0.005)
+            while door.book.guests:
+                await asyncio.sleep(0.005)
+        finally:
+            door.close()
+            await door.wait_closed()
+            await closed()
+
+
+def test_a_handshake_that_failed_leaves_nothing_that_waits_for_the_collector(tmp_path: Path) -> None:
+    """256 KiB each: strangers who came and went took a gigabyte and more."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*certificate(tmp_path))
+    gc.disable()
+    try:
+        asyncio.run(fail_a_handshake(context))
+        assert not [one for one in gc.get_objects() if isinstance(one, SSLProtocol)]
+    finally:
+        gc.enable()

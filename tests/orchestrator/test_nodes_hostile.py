@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import socket
 import tempfile
 import threading
 import time
+from asyncio.sslproto import SSLProtocol
 from pathlib import Path
 from typing import Any
 
@@ -235,3 +237,19 @@ def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])
+
+
+def test_a_handshake_that_failed_leaves_nothing_that_waits_for_the_collector(nodes: NodeScene) -> None:
+    gc.collect()
+    gc.disable()
+    try:
+        before = sum(isinstance(one, SSLProtocol) for one in gc.get_objects())
+        for _ in range(3):
+            with socket.create_connection(("127.0.0.1", nodes.port), timeout=10) as stranger:
+                stranger.sendall(b"\x16\x03\x01\x02\x00\x01\x00")
+                stranger.shutdown(socket.SHUT_WR)
+                with contextlib.suppress(ConnectionError):
+                    assert stranger.recv(100) == b""
+        until(lambda: sum(isinstance(one, SSLProtocol) for one in gc.get_objects()) <= before)
+    finally:
+        gc.enable()

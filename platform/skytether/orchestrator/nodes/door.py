@@ -12,7 +12,6 @@ import logging
 import math
 import secrets
 import socket
-import ssl
 import threading
 import time
 from collections import Counter
@@ -48,7 +47,7 @@ from skytether.api.splice import closed, keep_alive
 from skytether.bridge.echo import EchoClient
 
 from ..db import GONE
-from ..door import Book, Guest, place_of
+from ..door import Book, Guest, forget_frames, place_of
 from ..errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
 from ..logs import AUDIT
 from ..settings import Limits
@@ -276,8 +275,8 @@ class NodeDoor:
             )
             writer = asyncio.StreamWriter(transport, protocol, reader, self._loop)
             await self._converse(reader, writer, guest)
-        except (OSError, ssl.SSLError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
-            pass  # it left, was late, or speaks something else
+        except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError) as error:
+            forget_frames(error)  # it left, was late, or speaks something else
         finally:
             self._book.leave(guest)
             guest.socket = None
