@@ -6,15 +6,19 @@ import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Barrier, Thread
+from typing import Any
 
 import pytest
 from node_scene import MadeUpEngine, program
 from orchestrator_program import Program, until
 
 from skytether.api.client import Client
+from skytether.api.node import Issued, Join
 from skytether.api.rest import Invite
+from skytether.node.calls import RefusedError, call, first_call, trusting
 from skytether.node.join import JoinOptions, join
-from skytether.node.store import NodeStore
+from skytether.node.store import NodeStore, new_key, request_for
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]
 ANSWERS = ("ready", "blocked")
@@ -69,3 +73,32 @@ def test_when_the_leader_is_killed_the_next_one_has_the_nodes_engine_at_once(
                 assert other.log.count("is linked from") == links, "by the link that it had"
         finally:
             engine.stop()
+
+
+def test_of_many_joins_with_one_token_at_several_orchestrators_one_is_done(two: list[Program], tmp_path: Path) -> None:
+    one, other = two
+    with client_of(one, tmp_path / "secrets"), client_of(other, tmp_path / "secrets") as second:
+        urls = [(program_.folder / "nodes.address").read_text().strip() for program_ in two]
+        for name in ("ward", "hall", "attic"):
+            token = second.invite(Invite(name=name)).token
+            trust = trusting(first_call(urls[0], token.partition(".")[2]).authority)
+            together, said = Barrier(6), []
+
+            def ask(
+                url: str, token: str = token, trust: Any = trust, together: Any = together, said: Any = said
+            ) -> None:
+                asked = Join(token=token, request=request_for(new_key()), address="127.0.0.1")
+                together.wait(60)
+                try:
+                    said.append(call(url, trust, asked, Issued).name)
+                except RefusedError as error:
+                    said.append(str(error))
+
+            threads = [Thread(target=ask, args=(urls[number % 2],)) for number in range(6)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            assert said.count(name) == 1
+            assert [text for text in said if "was used at" not in text] == [name]
+            assert [site.name for site in second.sites()].count(name) == 1

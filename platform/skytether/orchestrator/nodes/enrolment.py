@@ -117,13 +117,21 @@ class Enrolment:
             UnauthenticatedError: Nothing, or nothing any more; the text says which.
             ConflictError: There is a site of its name by now.
         """
+        invitation = self._unused(token)
+        try:
+            self._check_free(invitation)
+        except ConflictError:
+            self._unused(token)  # the site may be what somebody just made by this token
+            raise
+        return invitation
+
+    def _unused(self, token: str) -> Invitation:
         invitation = self._find(token)
         if invitation.used_at is not None:
             raise UnauthenticatedError(
                 f"this join token was used at {_when(invitation.used_at)} from {invitation.used_from}: each is good "
                 f"for one machine; {_another(invitation.site.name)}"
             )
-        self._check_free(invitation)
         return invitation
 
     def _find(self, token: str) -> Invitation:
