@@ -46,6 +46,8 @@ class PlainRuntime(Runtime):
         self._folder, self._options = folder, options
         self._statuses: dict[int, int | None] = {}
         """Of our own children that have ended, by pid."""
+        self._asked: set[int] = set()
+        """Who was asked to end: once only, for a service may take a second signal for impatience."""
 
     def refuses(self, spec: ServiceSpec) -> str | None:
         return None if spec.entrypoint else "the service has no entrypoint"
@@ -73,6 +75,8 @@ class PlainRuntime(Runtime):
             began = psutil.Process(pid).create_time()
         except (OSError, psutil.Error) as error:
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
+        self._asked.discard(pid)  # pids come again
+        self._statuses.pop(pid, None)
         write(folder / "run.json", json.dumps({"attempt": launch.attempt, "pid": pid, "began": began}))
 
     def observe(self) -> Mapping[str, Observation]:
@@ -95,7 +99,8 @@ class PlainRuntime(Runtime):
         run = read(self._folder / instance / "run.json")
         if force:
             self._end(run)
-        elif process := self._process(run):
+        elif (process := self._process(run)) and process.pid not in self._asked:
+            self._asked.add(process.pid)
             with suppress(psutil.NoSuchProcess):
                 process.terminate()
 

@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,8 +52,8 @@ def main() -> int:
     print(wanted.say)  # noqa: T201 (a service's log is its standard output)
     if wanted.exit_status is not None:
         return wanted.exit_status
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: None if wanted.ignore_sigterm else ended.set())
+    # Taken by `sigtimedwait` below: to set an event in a handler hangs where the event is just being waited for.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     if wanted.environment:
         print("environment " + " ".join(sorted(os.environ)))  # noqa: T201
     if wanted.child:
@@ -77,7 +76,7 @@ def main() -> int:
             draft = ready.with_suffix(".new")
             draft.write_text(json.dumps({"port": bound.getsockname()[1], "pid": os.getpid()}))
             draft.replace(ready)
-        while not ended.wait(_BEAT_S):
+        while signal.sigtimedwait({signal.SIGTERM}, _BEAT_S) is None or wanted.ignore_sigterm:
             with suppress(OSError):  # its folder may be gone
                 os.utime(ready)
     del hoard
