@@ -114,7 +114,10 @@ def navigation(
     cluttered: Annotated[
         int | None, typer.Option(min=1, max=1000, help="Instead: through so many fields of cylinders.")
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, max=1000, help="In each field.")] = 10,
+    runs: Annotated[
+        int | None,
+        typer.Option(min=1, max=1000, help="In each field (10), or over each link with each compensation (1)."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the world's noise, of links and fields.")] = 1,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")] = False,
 ) -> None:
@@ -130,10 +133,10 @@ def navigation(
     try:
         with console.status("loading ...") as line:
             if delays:
-                found = bench_driving("navigation-delays", goals=goals, seed=seed, progress=line.update)
+                found = bench_driving("navigation-delays", goals=goals, runs=runs or 1, seed=seed, progress=line.update)
             elif cluttered is not None:
                 found = bench_driving(
-                    "navigation-cluttered", worlds=cluttered, runs=runs, seed=seed, progress=line.update
+                    "navigation-cluttered", worlds=cluttered, runs=runs or 10, seed=seed, progress=line.update
                 )
             else:
                 found = bench_driving(
@@ -175,6 +178,7 @@ def _print_delays(found: dict[str, Any]) -> None:
         "round trip",
         "jitter",
         "loss",
+        "told",
         "compensation",
         "ended",
         "time",
@@ -188,13 +192,19 @@ def _print_delays(found: dict[str, Any]) -> None:
             f"{1000 * row['round_trip']:.0f} ms",
             f"{1000 * row['jitter']:.0f} ms",
             f"{100 * row['loss']:g} %",
+            f"{1000 * row['told']:.0f} ms" if row["compensation"] == "fixed" else "",
             row["compensation"],
             row["state"],
-            f"{row['seconds']:.1f} s",
-            *(f"{1000 * row[error]:.1f} mm" for error in ("path_error", "prediction_error", "prediction_across")),
+            _with_std(row, "seconds", 1, "s"),
+            *(_with_std(row, error, 1000, "mm") for error in ("path_error", "prediction_error", "prediction_across")),
             str(row["contacts"]),
         )
     console.print(table)
+    for test in found["fixed_against_measured"]:
+        link = ", ".join(f"{name} {1000 * test[key]:.0f} ms" for name, key in _LINK)
+        console.print(
+            f"{link}: {test['error']} of fixed against measured: t = {test['t']}, p = {test['p']:.2g}.", highlight=False
+        )
     for name, text in (
         ("time_within_bar", "At the longest round trip within 5 % of the time without delay"),
         (
@@ -204,6 +214,14 @@ def _print_delays(found: dict[str, Any]) -> None:
         ("measured_halves_off", "and leaves at most half the path error of none"),
     ):
         console.print(f"{text}: {'yes' if found[name] else 'no'}.", highlight=False)
+
+
+_LINK = (("round trip", "round_trip"), ("jitter", "jitter"), ("told", "told"))
+
+
+def _with_std(row: dict[str, Any], name: str, scale: float, unit: str) -> str:
+    std = row[f"{name}_std"]
+    return f"{scale * row[name]:.1f}{'' if std is None else f' ± {scale * std:.1f}'} {unit}"
 
 
 def _print_cluttered(found: dict[str, Any]) -> None:

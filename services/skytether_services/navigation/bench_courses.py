@@ -33,7 +33,10 @@ Progress = Callable[[str], None]
 ROUND_TRIPS = (0.0, 0.05, 0.1, 0.15, 0.2)
 """Without jitter and loss [s]."""
 JITTER, LOSS = 0.04, 0.02
-"""Of the last rows, at the longest round trip: standard deviation of a round trip [s], and share lost on each way."""
+"""Of one more link, at the longest round trip: standard deviation of a round trip [s], and share lost on each way."""
+CHANGED = (0.05, 0.35)
+"""Round trips over which the fixed compensation is told the longest of those above: the link has changed [s]."""
+_ERRORS = ("seconds", "path_error", "prediction_error", "prediction_across")
 TIME_MARGIN = 1.05
 """The compensated drive at the longest round trip may take so many times what it takes without delay."""
 SUCCESS_BAR, SCORE_BAR = 0.95, 0.44
@@ -166,28 +169,75 @@ def distance_from(path: NDArray[np.float64], point: tuple[float, float]) -> floa
     return float(np.linalg.norm(to_point - along[:, None] * pieces, axis=1).min())
 
 
-def measure_delays(*, goals: int, seed: int, progress: Progress) -> dict[str, Any]:
+def measure_delays(*, goals: int, runs: int, seed: int, progress: Progress) -> dict[str, Any]:
     """Time and path error with each compensation over links of more and more delay; nobody walks there.
 
     Args:
         goals: So many of the building's are driven to, at most.
-        seed: Of the world's noise, and of the link's.
+        runs: Over each link with each compensation, with the next seed.
+        seed: The first of the world's noise, and of the link's.
         progress: Told before each drive.
     """
     plan = replace(building(), people=())
     longest = ROUND_TRIPS[-1]
-    links = [(trip, 0.0, 0.0) for trip in ROUND_TRIPS] + [(longest, JITTER, LOSS)]
-    rows = []
-    for trip, jitter, loss in links:
+    links = [(trip, 0.0, 0.0, trip) for trip in ROUND_TRIPS] + [(longest, JITTER, LOSS, longest)]
+    links += [(trip, 0.0, 0.0, longest) for trip in CHANGED]
+    rows: list[dict[str, Any]] = []
+    for trip, jitter, loss, told in links:
         for compensation in Compensation:
-            progress(f"{1000 * trip:.0f} ms, jitter {1000 * jitter:.0f} ms, loss {100 * loss:g} %: {compensation}")
-            # Each way has its own jitter: those of both add up by their squares.
-            link = LinkConditions(delay=trip / 2, jitter=jitter / math.sqrt(2), loss=loss, seed=seed)
-            delay = {"compensation": str(compensation), "fixed_delay": trip}
-            course = _to_goals(plan, goals, {"delay": delay}, seed, link)
-            rows.append({"round_trip": trip, "jitter": jitter, "loss": loss, "compensation": str(compensation)})
-            rows[-1].update(asdict(course))
-    return {"goals": min(goals, len(plan.goals)), "seed": seed, "rows": rows, **delay_verdict(rows)}
+            if compensation is Compensation.OFF and told != trip:
+                continue  # it is told nothing
+            courses = []
+            for run in range(seed, seed + runs):
+                progress(
+                    f"{1000 * trip:.0f} ms, jitter {1000 * jitter:.0f} ms, loss {100 * loss:g} %: {compensation}, {run}"
+                )
+                # Each way has its own jitter: those of both add up by their squares.
+                link = LinkConditions(delay=trip / 2, jitter=jitter / math.sqrt(2), loss=loss, seed=run)
+                delay = {"compensation": str(compensation), "fixed_delay": told}
+                courses.append(_to_goals(plan, goals, {"delay": delay}, run, link))
+            link_given = {"round_trip": trip, "jitter": jitter, "loss": loss, "told": told}
+            rows.append({**link_given, "compensation": str(compensation), **summed_up(courses)})
+    return {
+        "goals": min(goals, len(plan.goals)),
+        "seed": seed,
+        "runs": runs,
+        "rows": rows,
+        "fixed_against_measured": compared(rows),
+        **delay_verdict(rows),
+    }
+
+
+def summed_up(courses: list[Course]) -> dict[str, Any]:
+    """Means, standard deviations and single values of drives; one that did not succeed gives all its state."""
+    states = [course.state for course in courses]
+    found: dict[str, Any] = {"state": next((state for state in states if state != "succeeded"), "succeeded")}
+    for name in _ERRORS:
+        values = [float(getattr(course, name)) for course in courses]
+        found[name] = float(np.mean(values))
+        found[f"{name}_std"] = float(np.std(values, ddof=1)) if len(values) > 1 else None
+        found[f"{name}_each"] = values
+    return {**found, "contacts": sum(course.contacts for course in courses)}
+
+
+def compared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Student's t-test of fixed against measured compensation over each link; none of a single drive each."""
+    from scipy.stats import ttest_ind
+
+    by: dict[tuple[float, float, float], dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        by.setdefault((row["round_trip"], row["jitter"], row["told"]), {})[row["compensation"]] = row
+    found = []
+    for (trip, jitter, told), kinds in by.items():
+        fixed, measured = kinds[Compensation.FIXED], kinds[Compensation.MEASURED]
+        for error in ("path_error", "prediction_error"):
+            each = fixed[f"{error}_each"], measured[f"{error}_each"]
+            if min(len(values) for values in each) < 2 or np.ptp(np.concatenate(each)) == 0:
+                continue
+            t, p = ttest_ind(*each)
+            link = {"round_trip": trip, "jitter": jitter, "told": told, "error": error}
+            found.append({**link, "t": round(float(t), 2), "p": float(p)})
+    return found
 
 
 def delay_verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -196,7 +246,9 @@ def delay_verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
     Fixed and measured compensation are compared by what each predicts. Both leave in the path about what the robot errs
     by without delay, so their path errors differ by chance.
     """
-    by = {(row["round_trip"], row["jitter"], row["compensation"]): row for row in rows}
+    by = {
+        (row["round_trip"], row["jitter"], row["compensation"]): row for row in rows if row["told"] == row["round_trip"]
+    }
     longest = ROUND_TRIPS[-1]
 
     def row(trip: float, jitter: float, compensation: Compensation) -> dict[str, Any]:

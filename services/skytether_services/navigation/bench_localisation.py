@@ -97,9 +97,9 @@ def run(
 
     result = _tracking(field, drive, seeds, progress)
     if starts:
-        result |= _global(field, drive, starts, progress)
+        result |= _global(field, drive, starts, seeds[0], progress)
     if kidnaps:
-        result |= _kidnapped(field, drive, kidnaps, progress)
+        result |= _kidnapped(field, drive, kidnaps, seeds[0], progress)
     return result
 
 
@@ -181,63 +181,76 @@ def driving_seconds(data: Drive) -> Array:
     return np.cumsum(np.where(moved, gaps, 0.0))
 
 
-def _in_map(field: LikelihoodField, data: Drive) -> NDArray[np.bool_]:
-    """Whether the robot is where the map has seen the floor, for each scan."""
-    return np.array([0 <= field.grid.at(float(pose[0]), float(pose[1])) < 50 for pose in data.truth])
+def _on_floor(field: LikelihoodField, poses: Array) -> NDArray[np.bool_]:
+    """Whether each pose is where the map has seen the floor."""
+    return np.array([0 <= field.grid.at(float(pose[0]), float(pose[1])) < 50 for pose in poses])
 
 
 def _global(
-    field: LikelihoodField, drive: Callable[[int], Drive], starts: int, progress: Callable[[str], None]
+    field: LikelihoodField, drive: Callable[[int], Drive], starts: int, seed: int, progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    data = drive(1000)
+    data = drive(1000 * seed)
     driven = driving_seconds(data)
-    mapped = _in_map(field, data)
+    mapped = _on_floor(field, data.truth)
     # Evenly over all places in the map from which there is still enough to drive.
     possible = np.nonzero(mapped & (driven <= driven[-1] - FOUND_S))[0]
     if len(possible) == 0:
         raise ValueError("the log's last part has no place in the map from which 10 s are driven")
     chosen = possible[np.linspace(0, len(possible) - 1, starts).astype(int)]
-    right = sure = wrong = 0
+    rows: list[dict[str, Any]] = []
     search_ms: list[float] = []
     for number, begin in enumerate(chosen):
-        data = drive(1000 + number)
-        localisation = Localisation(field, np.random.default_rng((number, 2)))
-        ever_wrong = False
+        data = drive(1000 * seed + number)
+        localisation = Localisation(field, np.random.default_rng((seed, number, 2)))
         index = int(begin)
         estimate = localisation.update(np.zeros(3), data.points[index])
+        wrong = False
+        sure_after: float | None = None
         while index + 1 < len(driven) and driven[index + 1] - driven[begin] <= FOUND_S:
             index += 1
             before = time.perf_counter()
             estimate = localisation.update(data.steps[index], data.points[index])
             if estimate.searched:
                 search_ms.append(1000 * (time.perf_counter() - before))
-            ever_wrong |= estimate.sure and not is_right(estimate, data.truth[index])
-        right += is_right(estimate, data.truth[index])
-        sure += estimate.sure
-        wrong += ever_wrong
-        outcome = "right" if is_right(estimate, data.truth[index]) else "wrong"
-        progress(f"start {number}: {outcome}, {'sure' if estimate.sure else 'not sure'}")
+            wrong |= estimate.sure and not is_right(estimate, data.truth[index])
+            if estimate.sure and sure_after is None:
+                sure_after = round(float(driven[index] - driven[begin]), 1)
+        right = is_right(estimate, data.truth[index])
+        seen = _on_floor(field, data.truth[begin : index + 1])
+        rows.append(
+            {
+                "truth": np.round(data.truth[index], 2).tolist(),
+                "estimate": np.round(estimate.pose, 2).tolist(),
+                "right": right,
+                "sure": estimate.sure,
+                "sure_after_s": sure_after,
+                "sure_and_wrong": wrong,
+                "way_in_map": round(float(seen.mean()), 2),
+            }
+        )
+        progress(f"start {number}: {'right' if right else 'wrong'}, {'sure' if estimate.sure else 'not sure'}")
     return {
         "global_starts": starts,
-        "global_right": int(right),
-        "global_sure": int(sure),
-        "global_sure_and_wrong": int(wrong),
+        "global_right": sum(row["right"] for row in rows),
+        "global_sure": sum(row["sure"] for row in rows),
+        "global_sure_and_wrong": sum(row["sure_and_wrong"] for row in rows),
+        "global_each": rows,
         "search_p99_ms": round(float(np.percentile(search_ms, 99)), 1) if search_ms else None,
     }
 
 
 def _kidnapped(
-    field: LikelihoodField, drive: Callable[[int], Drive], kidnaps: int, progress: Callable[[str], None]
+    field: LikelihoodField, drive: Callable[[int], Drive], kidnaps: int, seed: int, progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    data = drive(2000)
+    data = drive(2000 * seed)
     driven = driving_seconds(data)
-    mapped = _in_map(field, data)
+    mapped = _on_floor(field, data.truth)
     possible = np.nonzero(mapped & (driven >= 5) & (driven <= driven[-1] - FOUND_AGAIN_S))[0]
-    random = np.random.default_rng(3)
+    random = np.random.default_rng((seed, 3))
     found = 0
     seconds: list[float] = []
     for number in range(kidnaps):
-        data = drive(2000 + number)
+        data = drive(2000 * seed + number)
         places = [
             (int(a), int(b))
             for a, b in random.choice(possible, (200, 2))
@@ -246,7 +259,7 @@ def _kidnapped(
         if not places:
             raise ValueError("the log's last part has no two places in the map that are 3 m apart")
         before, after = places[0]
-        localisation = Localisation(field, np.random.default_rng((number, 4)))
+        localisation = Localisation(field, np.random.default_rng((seed, number, 4)))
         first = int(np.searchsorted(driven, driven[before] - 5))
         localisation.place(data.truth[first], np.diag([0.04, 0.04, 0.01]))
         for index in range(first, before + 1):

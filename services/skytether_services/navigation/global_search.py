@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,14 @@ from skytether_services.navigation.compiled import compiled
 from skytether_services.navigation.likelihood_field import (
     Explained,
     LikelihoodField,
+    blurred_likelihood,
     explain,
     score_beams,
     to_cell_poses,
 )
-from skytether_services.navigation.poses import wrap
+from skytether_services.navigation.poses import between, compose, wrap
 from skytether_services.navigation.scan_align import align
+from skytether_services.navigation.seen_floor import Floor, seen_floor
 
 Array = NDArray[np.float64]
 
@@ -37,10 +39,14 @@ class SearchParams:
         turn: Of the headings [rad].
         sigma: Standard deviation of a point in the coarse comparison: covers the spacing [m].
         points: So many points are compared coarsely.
-        sifted: So many of the best places by their points alone are compared by beams, which pass no wall.
-        beams: So many beams of each.
+        sifted: So many of the best places by their points alone are compared by beams, which pass no wall, and so many
+            of these once more.
+        beams: By so many beams of each, and then by so many.
         seeds: So many of the best by beams are looked at finely.
         judged: By so many beams of each; the hypotheses by all.
+        climb: First and last step with which a hypothesis is moved to where it explains the most [m]; each is half of
+            the one before.
+        climb_turn: Turn that goes with a step of a metre [rad/m].
         hypotheses: So many different ones are returned at most.
         apart: Nearer ones are the same place [m].
         apart_turn: And the same heading [rad].
@@ -51,10 +57,12 @@ class SearchParams:
     turn: float = math.radians(4)
     sigma: float = 0.25
     points: int = 150
-    sifted: int = 4000
-    beams: int = 60
+    sifted: tuple[int, int] = (20_000, 3000)
+    beams: tuple[int, int] = (30, 150)
     seeds: int = 100
     judged: int = 600
+    climb: tuple[float, float] = (0.1, 0.025)
+    climb_turn: float = 0.3
     hypotheses: int = 12
     apart: float = 0.6
     apart_turn: float = math.radians(20)
@@ -66,7 +74,8 @@ class Hypothesis:
 
     Attributes:
         pose: x [m], y [m], heading [rad], map frame.
-        score: Mean log-likelihood of a beam; one through a wall counts as an outlier.
+        score: Mean log-likelihood of a beam; one through a wall counts as an outlier. Less what the map says against
+            the floor that was seen.
         explained: How the map explains the beams from there.
     """
 
@@ -99,6 +108,8 @@ def search(
     random: np.random.Generator,
     params: SearchParams | None = None,
     also: Sequence[Array] = (),
+    way: Array | None = None,
+    from_first: bool = False,
 ) -> list[Hypothesis]:
     """Places that a scan fits, the best first.
 
@@ -109,6 +120,9 @@ def search(
         random: Which points and beams are compared.
         params: How to search.
         also: Poses that are looked at in any case.
+        way: n by 3: where the robot was, oldest first, in its frame now [m, rad]; None: only here.
+        from_first: The places that are tried are of the oldest of these, not of the robot now. Only places that the map
+            shows as free are tried, and the robot may have left what the map knows.
     """
     params = params or SearchParams()
     if len(ends) == 0 or len(field.free) == 0:
@@ -116,25 +130,32 @@ def search(
     squares = np.floor(ends / params.thinned).astype(np.int64)
     _, kept = np.unique(squares[:, 0] * 2_000_003 + squares[:, 1], return_index=True)
     spread, beams = random.permutation(kept), random.permutation(len(ends))
-    places = _coarse(field, ends[spread[: params.points]], params)
-    few, more = beams[: params.beams], beams[: params.judged]
-    seeds = _sift(field, starts[few], ends[few], places, params)
+    way = np.zeros((1, 3)) if way is None else way
+    home = between(way[0], np.zeros(3)) if from_first else np.zeros(3)
+    points = np.pad(ends[spread[: params.points]], ((0, 0), (0, 1)))
+    places = compose(_coarse(field, compose(home, points)[:, :2], params), home)
+    more = beams[: params.judged]
+    seeds = _sift(field, starts[spread], ends[spread], places, params)
+    floor = Floor(seen_floor(starts, ends), way[:, :2])
     found = [
-        judge(field, pose, starts[more], ends[more])
+        judge(field, pose, starts[more], ends[more], floor)
         for pose in _aligned(field, ends[spread[: 4 * params.points]], np.array([*also, *seeds]), params)
     ]
     found.sort(key=lambda hypothesis: -hypothesis.score)
     poses = np.array([hypothesis.pose for hypothesis in found])
-    best = poses[distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
-    return sorted((judge(field, pose, starts, ends) for pose in best), key=lambda hypothesis: -hypothesis.score)
+    best = [found[index] for index in distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
+    best = [_climb(field, hypothesis, starts[more], ends[more], floor, params) for hypothesis in best]
+    return sorted(
+        (judge(field, one.pose, starts, ends, floor) for one in best), key=lambda hypothesis: -hypothesis.score
+    )
 
 
 def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Array:
     """Poses of the best places, n by 3, map frame."""
     resolution = field.grid.resolution
-    # Neutral where nothing is known, so zero; above it what is near an obstacle, below it what is in the open.
-    soft = np.exp(-(field.distance**2) / (2 * params.sigma**2))
-    score = np.where(field.known != 0, np.rint(100 * soft - 40), 0).astype(np.int16)
+    # Nothing is known: zero; above it what is near an obstacle, below it what is in the open.
+    likelihood = blurred_likelihood(field, params.sigma) / field.model.unknown
+    score = np.rint(100 * np.log(likelihood)).astype(np.int16)
     stride = max(1, round(params.spacing / resolution))
     # A place for each square of the spacing that has a free cell: its middle.
     squares = np.unique(field.free // stride, axis=0)
@@ -149,7 +170,7 @@ def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Arra
     # The best of its neighbourhood in heading alone; the fine step makes one of neighbours in place.
     peak = (best >= np.roll(best, 1, axis=1)) & (best >= np.roll(best, -1, axis=1))
     flat = np.where(peak, best, -(2**40)).ravel()
-    count = min(params.sifted, flat.size)
+    count = min(params.sifted[0], flat.size)
     place, turn = np.divmod(np.argpartition(-flat, count - 1)[:count], turns)
     return np.column_stack(
         (field.grid.to_points(places[place].astype(np.float64) + 0.5), headings[turn] + field.grid.origin[2])
@@ -158,8 +179,9 @@ def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Arra
 
 def _sift(field: LikelihoodField, starts: Array, ends: Array, poses: Array, params: SearchParams) -> Array:
     """The best of the poses, by beams: points alone fit through walls, and where the map knows little."""
-    scores = score_beams(field, poses, starts, ends, params.sigma)
-    poses = poses[np.argsort(-scores, kind="stable")]
+    for count, beams in zip((params.sifted[1], len(poses)), params.beams, strict=True):
+        scores = score_beams(field, poses, starts[:beams], ends[:beams], params.sigma)
+        poses = poses[np.argsort(-scores, kind="stable")[:count]]
     return poses[distinct(poses, 1.5 * params.spacing, 1.5 * params.turn, params.seeds)]
 
 
@@ -178,16 +200,49 @@ def _aligned(field: LikelihoodField, points: Array, seeds: Array, params: Search
     return found
 
 
-def judge(field: LikelihoodField, pose: Array, starts: Array, ends: Array) -> Hypothesis:
-    """How well beams fit the map from one pose: the score by which hypotheses are compared."""
+def _climb(
+    field: LikelihoodField, best: Hypothesis, starts: Array, ends: Array, floor: Floor, params: SearchParams
+) -> Hypothesis:
+    """Move a hypothesis to where its score is best near it: points alone are drawn to what stands behind walls, too."""
+    size, last = params.climb
+    for _ in range(_CLIMBS):
+        if size < last:
+            break
+        tried = [best.pose + size * step * (1, 1, params.climb_turn) for step in _STEPS]
+        found = max(
+            (judge(field, pose, starts, ends, floor) for pose in tried), key=lambda hypothesis: hypothesis.score
+        )
+        if found.score > best.score:
+            best = found
+        else:
+            size /= 2
+    return replace(best, pose=np.array([*best.pose[:2], float(wrap(best.pose[2]))]))
+
+
+_CLIMBS = 40
+"""Steps and halvings at most."""
+_STEPS = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
+
+
+def judge(field: LikelihoodField, pose: Array, starts: Array, ends: Array, floor: Floor) -> Hypothesis:
+    """How well beams and the floor that they crossed fit the map from one pose: by that score hypotheses are compared.
+
+    Args:
+        field: Of the map.
+        pose: x [m], y [m], heading [rad], map frame.
+        starts: m by 2: where each beam starts, in the robot's frame [m].
+        ends: m by 2: where it ends [m].
+        floor: That they crossed, and that the robot drove on.
+    """
+    against = floor.against(field, pose)
     explained = explain(field, pose, starts, ends)
     if len(ends) == 0:
-        return Hypothesis(pose, math.log(field.model.unknown), explained)
+        return Hypothesis(pose, math.log(field.model.unknown) - against, explained)
     near = math.log(field.model.outlier)
     share = explained.known * explained.share
     # Explained beams count 0, what the map does not know a little, the rest as outliers.
     score = (1 - explained.known) * math.log(field.model.unknown) + (explained.known - share) * near
-    return Hypothesis(pose, score, explained)
+    return Hypothesis(pose, score - against, explained)
 
 
 def distinct(poses: Array, apart: float, apart_turn: float, count: int) -> list[int]:

@@ -150,6 +150,19 @@ def _score_beams(
         total[index] = sum_all
 
 
+def blurred_likelihood(field: LikelihoodField, sigma: float) -> Array:
+    """Of a beam that ends in the cell, as seen from a pose that is some way off: rows by columns.
+
+    Args:
+        field: Of the map.
+        sigma: Standard deviation of an end from its obstacle, the error of the pose included [m].
+    """
+    model = field.model
+    hit = np.exp(-(field.distance**2) / (2 * sigma**2))
+    known = (field.grid.cells >= 0) | (field.distance <= sigma)
+    return np.where(known, model.outlier + (1 - model.outlier) * hit, model.unknown)
+
+
 def score_beams(field: LikelihoodField, poses: Array, starts: Array, ends: Array, sigma: float) -> Array:
     """How well beams fit the map from each of many poses that are some way off; one through a wall is an outlier.
 
@@ -164,9 +177,7 @@ def score_beams(field: LikelihoodField, poses: Array, starts: Array, ends: Array
         For each pose the sum of the beams' log-likelihoods.
     """
     model, resolution = field.model, field.grid.resolution
-    hit = np.exp(-(field.distance**2) / (2 * sigma**2))
-    known = (field.grid.cells >= 0) | (field.distance <= sigma)
-    likelihood = np.where(known, model.outlier + (1 - model.outlier) * hit, model.unknown)
+    likelihood = blurred_likelihood(field, sigma)
     total = np.empty(len(poses))
     _score_beams(
         np.log(likelihood).astype(np.float32),

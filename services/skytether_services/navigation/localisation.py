@@ -166,7 +166,7 @@ class Localisation:
         self._since_asked = np.zeros(3)
         self._since_search = math.inf
         self._search_wait = 0.0
-        self._kept_before = 0
+        self._kept_before = self._searches = 0
         self._agreed = self._doubted = self._regained = 0.0
         self._hypotheses: list[Array] = []
         self._before: deque[float] = deque(maxlen=10)
@@ -345,12 +345,14 @@ class Localisation:
         seen = explain(self._field, cluster.mean, np.broadcast_to(origin, points.shape), points)
         return Estimate(cluster.mean, cluster.covariance, self._sure, cluster.weight, seen.share, seen.known, searched)
 
-    def _recent(self, origin: Array) -> tuple[Array, Array]:
-        """Beams of the scans that were kept last, as starts and ends in the robot's frame now [m].
+    def _recent(self, origin: Array) -> tuple[Array, Array, Array]:
+        """Beams of the scans that were kept last, as starts and ends, and the poses from which they were.
+
+        All are in the robot's frame now [m, rad], the oldest first.
 
         What was kept while the pose was not in doubt is not among them: it may be of the place before.
         """
-        starts, ends = [], []
+        starts, ends, poses = [], [], []
         keys = list(self._odometry.keys)
         count = min(self.params.search_keys, self._odometry.kept - self._kept_before, len(keys))
         for key in keys[len(keys) - count :]:
@@ -359,9 +361,10 @@ class Localisation:
             turn = np.array([[cos, sin], [-sin, cos]])
             ends.append(key.points[:, :2] @ turn + at[:2])
             starts.append(np.broadcast_to(origin @ turn + at[:2], ends[-1].shape))
+            poses.append(at)
         if not ends:
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        return np.vstack(starts), np.vstack(ends)
+            return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((1, 3))
+        return np.vstack(starts), np.vstack(ends), np.array(poses)
 
     def _search(self, origin: Array, also: list[Array]) -> list[Hypothesis]:
         """Search the map, and believe what was the best for long enough; the hypotheses if there is no such.
@@ -372,8 +375,12 @@ class Localisation:
         """
         params = self.params
         driven = self._since_search if math.isfinite(self._since_search) else 0.0
-        starts, ends = self._recent(origin)
-        found = search(self._field, starts, ends, self._random, params.search, also)
+        starts, ends, way = self._recent(origin)
+        # From where the robot is now and from where it was first, in turn: it may have left what the map knows, or have
+        # come onto it.
+        from_first = self._searches % 2 == 1
+        self._searches += 1
+        found = search(self._field, starts, ends, self._random, params.search, also, way, from_first)
         if not found:
             return []
         self._since_search = 0.0

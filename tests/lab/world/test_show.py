@@ -3,6 +3,7 @@ import json
 import pytest
 from PIL import Image
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_msg
 from typer.testing import CliRunner
 
 from skytether.cli.app import app
@@ -24,12 +25,20 @@ def test_a_recording_opens_with_ros_2_types(tmp_path) -> None:
         for _ in range(25):
             recorder(world, world.tick())
     with (tmp_path / "world.mcap").open("rb") as stream:
-        reader = make_reader(stream)
+        reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         assert summary is not None
         topics = {channel.topic for channel in summary.channels.values()}
         schemas = {schema.name: schema.encoding for schema in summary.schemas.values()}
         messages = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
+    # What a player needs to jump about in it, and to read it by what it holds itself.
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(messages)
+    assert summary.chunk_indexes
+    assert all(chunk.message_index_offsets for chunk in summary.chunk_indexes)
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+    for schema in summary.schemas.values():
+        assert schema.name in get_types_from_msg(schema.data.decode(), schema.name)
     assert {"/map", "/goals", "/scan", "/tf", "/odom", "/truth", "/people", "/robot_1/scan"} <= topics
     assert set(schemas.values()) == {"ros2msg"}
     assert "sensor_msgs/msg/LaserScan" in schemas

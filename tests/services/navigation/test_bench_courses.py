@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from skytether.control.admittance import Velocity
-from skytether_services.navigation.bench_courses import Predictions, delay_verdict, distance_from, score
+from skytether_services.navigation.bench_courses import (
+    Course,
+    Predictions,
+    compared,
+    delay_verdict,
+    distance_from,
+    score,
+    summed_up,
+)
 from skytether_services.navigation.prediction import State
 from skytether_services.planar.geometry import Pose
 
@@ -57,7 +65,7 @@ def test_score_counts_time_between_two_and_eight_optimal_ones() -> None:
 
 def rows(off: float, fixed: float, measured: float, late: float, state: str = "succeeded") -> list[dict[str, Any]]:
     def row(trip: float, jitter: float, kind: str, error: float, seconds: float) -> dict[str, Any]:
-        told = {"round_trip": trip, "jitter": jitter, "compensation": kind}
+        told = {"round_trip": trip, "jitter": jitter, "told": trip, "compensation": kind}
         return {
             **told,
             "path_error": error,
@@ -84,3 +92,25 @@ def rows(off: float, fixed: float, measured: float, late: float, state: str = "s
 def test_verdict_of_the_delays(given: Any, expected: tuple[bool, bool, bool]) -> None:
     found = delay_verdict(rows(*given))
     assert (found["time_within_bar"], found["measured_beats_fixed"], found["measured_halves_off"]) == expected
+
+
+def test_drives_over_one_link_are_summed_up_and_a_failed_one_is_told() -> None:
+    courses = [Course("succeeded", 40.0, 0.02, 0.01, 0.001, 0), Course("failed", 44.0, 0.04, 0.03, 0.001, 1)]
+    found = summed_up(courses)
+    assert (found["state"], found["contacts"], found["seconds"]) == ("failed", 1, 42.0)
+    assert found["path_error"] == pytest.approx(0.03)
+    assert found["path_error_std"] == pytest.approx(0.02 / np.sqrt(2))
+    assert summed_up(courses[:1])["path_error_std"] is None
+
+
+def test_fixed_is_compared_with_measured_over_the_link_that_it_was_told_another_delay_of() -> None:
+    def row(kind: str, told: float, errors: list[float]) -> dict[str, Any]:
+        courses = [Course("succeeded", 40.0, error, 0.01, 0.001, 0) for error in errors]
+        return {"round_trip": 0.35, "jitter": 0.0, "told": told, "compensation": kind, **summed_up(courses)}
+
+    rows = [row("fixed", 0.2, [3.0, 4.0, 5.0]), row("measured", 0.2, [1.0, 2.0, 3.0])]
+    (found,) = compared(rows)  # the predictions do not differ at all
+    assert (found["told"], found["error"]) == (0.2, "path_error")
+    # Two units apart, both with variance 1: t = 2 / sqrt(2/3).
+    assert found["t"] == pytest.approx(2.45)
+    assert found["p"] == pytest.approx(0.07, abs=0.01)

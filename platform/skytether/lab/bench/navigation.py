@@ -139,17 +139,19 @@ class StepBench(Protocol):
 class DelaysBench(Protocol):
     """The entry point ``navigation-delays``."""
 
-    def __call__(self, *, goals: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    def __call__(self, *, goals: int, runs: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
         """Drive over links of more and more delay, with each compensation.
 
         Args:
             goals: So many of the building's.
-            seed: Of the world's noise and the link's.
+            runs: Over each link with each compensation.
+            seed: The first of the world's noise and the link's.
             progress: Told before each drive.
 
         Returns:
-            ``time_within_bar, measured_beats_fixed, measured_halves_off``, and ``rows``, each a drive: ``round_trip,
-            jitter, loss, compensation, state, seconds, path_error, prediction_error, prediction_across, contacts``.
+            ``time_within_bar, measured_beats_fixed, measured_halves_off``, ``fixed_against_measured`` (t-tests), and
+            ``rows``: ``round_trip, jitter, loss, told, compensation, state, contacts``, and means over the runs, with
+            ``_std`` and ``_each``: ``seconds, path_error, prediction_error, prediction_across``.
 
         Raises:
             skytether.lab.world.model.WorldError: The simulated world cannot be made.
