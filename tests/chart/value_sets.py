@@ -173,7 +173,7 @@ CASES: list[tuple[str, str, str, Any]] = [
     ("defaults", _ORCHESTRATOR, f"spec selector matchLabels {_KIND_OF_LABELS}component", "orchestrator"),
     ("defaults", _ORCHESTRATOR, f"spec selector matchLabels {_KIND_OF_LABELS}instance", "demo"),
     ("defaults", _ORCHESTRATOR, f"{_BOX} image", "skytether/orchestrator:1"),
-    ("defaults", _ORCHESTRATOR, f"{_BOX} imagePullPolicy", "IfNotPresent"),
+    ("defaults", _ORCHESTRATOR, f"{_BOX} imagePullPolicy", "Never"),
     ("defaults", _ORCHESTRATOR, f"{_BOX} args", ["--config", "/run/skytether/orchestrator.yaml"]),
     ("defaults", _ORCHESTRATOR, f"{_BOX} ports 0 containerPort", 8600),
     ("defaults", _ORCHESTRATOR, f"{_BOX} livenessProbe httpGet path", "/healthz"),

@@ -115,6 +115,18 @@ def test_where_pods_go_and_how_images_come_are_the_sites_options() -> None:
     assert {"name": "TZ", "value": "UTC"} in spec["containers"][0]["env"]
 
 
+@pytest.mark.parametrize("image", ["skytether/virtual-trail:1", "docker.io/skytether/recorder", "skytether/x"])
+def test_our_own_names_are_never_pulled_and_others_are(image: str) -> None:
+    def policy(name: str) -> str:
+        return str(
+            pod(launch(image=name), options(pull="always"), "o1", None, {})["spec"]["containers"][0]["imagePullPolicy"]
+        )
+
+    assert policy(image) == "Never"
+    for owned in (f"{image}@sha256:{'a' * 64}", "registry.example/skytether/x:1", "example/toy:1"):
+        assert policy(owned) == "Always"
+
+
 def test_the_key_is_in_the_secret_alone_which_goes_with_its_pod() -> None:
     document = made()
     assert KEY not in json.dumps(document)

@@ -43,6 +43,13 @@ annotations:
 {{- end -}}
 {{- end -}}
 
+{{/* Nobody of ours owns `skytether/` at the public index: a node must not ask there for whoever took it. */}}
+{{- define "skytether.pullPolicy" -}}
+{{- with .Values.image -}}
+{{- if and (not .digest) (regexMatch "^((index\\.)?docker\\.io/)?skytether/" .repository) }}Never{{ else }}{{ .pullPolicy }}{{ end -}}
+{{- end -}}
+{{- end -}}
+
 {{- define "skytether.account" -}}
 {{- if .Values.serviceAccount.create -}}
 {{- default (printf "%s-orchestrator" (include "skytether.fullname" .)) .Values.serviceAccount.name -}}
@@ -175,7 +182,7 @@ template:
 {{/* What all containers have: dict root, values. */}}
 {{- define "skytether.container" -}}
 image: {{ include "skytether.image" .root | quote }}
-imagePullPolicy: {{ .root.Values.image.pullPolicy }}
+imagePullPolicy: {{ include "skytether.pullPolicy" .root }}
 {{- with .root.Values.securityContext }}
 securityContext:
   {{- toYaml . | nindent 2 }}

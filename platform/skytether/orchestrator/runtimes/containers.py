@@ -13,6 +13,10 @@ USER = 65_532
 """Who every service is, and who owns its files; nobody on the machine."""
 INNER_PORT = 7600
 """UDP port inside the container; robots are told the one by which it is reached."""
+_UNOWNED = "skytether/"
+"""What the names of our own images begin with, as `make images` builds them."""
+_PUBLIC = ("docker.io", "index.docker.io")
+"""Whom engines ask for names without a registry."""
 _ROOM_MB = 32
 """Memory that is left beside what is used, however little that is [MiB]."""
 _SIGNALLED, _SIGNALS = 128, 64
@@ -48,6 +52,17 @@ def image_refusal(spec: ServiceSpec, *, pinned: bool) -> str | None:
     if pinned and "@sha256:" not in spec.image:
         return f"image '{spec.image}' is named without its digest, and the site takes pinned images only"
     return None
+
+
+def is_pulled(image: str) -> bool:
+    """Whether a registry may be asked for a name: not for those of our own images, which nobody owns in any registry.
+
+    Whoever registered the name there first would run code on all engines. A digest says what comes, whoever sends it.
+    """
+    if "@sha256:" in image:
+        return True
+    host, _, rest = image.partition("/")
+    return not (rest if host in _PUBLIC else image).startswith(_UNOWNED)
 
 
 def most_cores(spec: ServiceSpec) -> float:

@@ -8,18 +8,17 @@ import stat
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from docker.auth import INDEX_NAME, AuthConfig, load_config, resolve_authconfig, resolve_repository_name
+from docker.auth import AuthConfig, load_config, resolve_authconfig, resolve_repository_name
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
 
 from skytether.api.pull import Pull
 
 from ..base import RuntimeFailure
+from ..containers import is_pulled
 from .engine import Engine, explain
 from .options import DockerOptions
 from .signed import check
 
-_UNOWNED = "skytether/"
-"""What the names of our own images begin with, as `make images` builds them."""
 _PULL_SILENCE_S = 120.0
 """A registry that sends nothing for so long is given up."""
 
@@ -73,17 +72,6 @@ def check_credentials(path: str) -> None:
         raise RuntimeFailure(f"registry_auth {path} can be read by others: chmod 600 {path}")
     if not isinstance(document, dict) or not isinstance(document.get("auths", {}), dict):
         raise RuntimeFailure(f"registry_auth {path} has no 'auths': make it with `docker login`")
-
-
-def is_pulled(image: str) -> bool:
-    """Whether a registry may be asked for a name: not for those of our own images, which nobody owns in any registry.
-
-    Whoever registered the name there first would run code on all engines. A digest says what comes, whoever sends it.
-    """
-    if "@sha256:" in image:
-        return True
-    registry, name = resolve_repository_name(image)
-    return not (registry == INDEX_NAME and name.startswith(_UNOWNED))
 
 
 def ensure_image(

@@ -15,7 +15,7 @@ from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import Opening, ServiceSpec
 
 from ..base import Capacity, Launch
-from ..containers import INNER_PORT, USER, data_name, image_refusal
+from ..containers import INNER_PORT, USER, data_name, image_refusal, is_pulled
 from ..egress import refusal_of
 from .options import KubernetesOptions
 from .resize import quantity, resources_of
@@ -168,7 +168,7 @@ def pod(
                 {
                     "name": "service",
                     "image": spec.image,
-                    "imagePullPolicy": _PULL[options.pull],
+                    "imagePullPolicy": _PULL[options.pull if is_pulled(spec.image or "") else "never"],
                     "env": [{"name": key, "value": value} for key, value in environment.items()],
                     "ports": [reached],
                     "resources": _resources(spec),

@@ -61,7 +61,8 @@ class KubernetesOptions(Strict):
     priority_class: str | None = None
     """Of the pods; it has to be there."""
     pull: Literal["missing", "always", "never"] = "missing"
-    """When a node fetches a service's image from its registry."""
+    """When a node fetches a service's image from its registry. `skytether/...` without a registry is never fetched but
+    by its digest, as on Docker: anybody may have the name at the public index."""
     pinned: bool = False
     """Take only images that are named with their digest, NAME@sha256:..."""
     image_pull_secrets: tuple[str, ...] = ()
