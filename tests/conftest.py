@@ -439,7 +439,8 @@ def kubeconfig(docker_engine: str) -> Iterator[str]:
     program = os.environ.get("SKYTETHER_CLUSTER", "")
     if not program:
         require("kubernetes", "SKYTETHER_CLUSTER does not name the program that starts a cluster for tests")
-    disk = shutil.disk_usage("/var/lib/docker")
+    root = subprocess.run(["docker", "info", "-f", "{{.DockerRootDir}}"], check=True, capture_output=True, text=True)
+    disk = shutil.disk_usage(root.stdout.strip())
     if disk.free < 0.18 * disk.total:  # at 85 % the node removes images that no pod uses now, those of our tests too
         require("kubernetes", f"{disk.free / disk.total:.0%} of the engine's disk is free; a cluster's node wants 18 %")
     # Its proxy lets packets of loopback leave the machine, from then on; other tests count on the kernel's refusal.

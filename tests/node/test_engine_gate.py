@@ -17,7 +17,12 @@ import pytest
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
 
-ID = "f" * 64
+ID, OTHER = "f" * 64, "e" * 64
+CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
+"CapDrop": ["ALL"], "SecurityOpt": ["no-new-privileges"]}}"""
+WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
+    b'"CapDrop"', b'"Mounts": [{"Type": "volume", "Source": "skytether-main_state", "Target": "/d"}], "CapDrop"'
+)
 
 
 class Engine:
@@ -26,6 +31,8 @@ class Engine:
     def __init__(self, path: Path) -> None:
         self.path = str(path)
         self.asked: list[tuple[str, dict[str, str], bytes]] = []
+        self.ended = False
+        """It takes connections, and answers nobody."""
         engine = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -33,6 +40,9 @@ class Engine:
 
             def _serve(self) -> None:
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                if engine.ended:
+                    self.close_connection = True
+                    return
                 engine.asked.append((f"{self.command} {self.path}", dict(self.headers), body))
                 labels = {"skytether.io/owner": "edge"} if ID in self.path else {}
                 text = json.dumps({"Id": ID, "Config": {"Labels": labels}, "Labels": labels}).encode()
@@ -90,12 +100,12 @@ def say(engine: Engine, sent: bytes) -> bytes:
             writer.write(sent)
             got = b""
             async with asyncio.timeout(20):
-                while b"403 Forbidden" not in got and got.count(b"HTTP/1.1 200") < sent.count(b" HTTP/1.1\r\n"):
+                while b"Connection: close" not in got and got.count(b"HTTP/1.1 200") < sent.count(b" HTTP/1.1\r\n"):
                     piece = await reader.read(65536)
                     if not piece:
                         break
                     got += piece
-                if b"403 Forbidden" in got:
+                if b"Connection: close" in got:
                     got += await reader.read()
             writer.close()
             await over.wait()
@@ -133,10 +143,17 @@ def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("sent", "says"),
     [
-        (request("DELETE /containers/database"), b"database is not of an orchestrator"),
-        (request("POST /containers/database/kill"), b"database is not of an orchestrator"),
+        (request(f"DELETE /containers/{OTHER}"), b"is not of an orchestrator"),
+        (request(f"POST /containers/{OTHER}/kill"), b"is not of an orchestrator"),
+        (request(f"POST /containers/{ID[:12]}/kill"), b"nothing that a site needs"),
+        (request("GET /containers/database/json"), b"nothing that a site needs"),
         (request("DELETE /networks/bridge"), b"bridge is not of an orchestrator"),
-        (request("PUT /containers/data%62ase/archive", b"tar"), b"database is not of an orchestrator"),
+        (request(f"PUT /containers/%65{OTHER[1:]}/archive", b"tar"), b"is not of an orchestrator"),
+        (request("POST /containers/create", CREATED % b"bridge"), b"bridge is not of an orchestrator"),
+        (request("POST /containers/create", CREATED % b"0123456789ab"), b"its network is"),
+        (request("POST /containers/create", CREATED % f"container:{OTHER}".encode()), b"is not of an orchestrator"),
+        (request("POST /networks/bridge/connect", b'{"Container": "%s"}' % ID.encode()), b"bridge is not of"),
+        (request("POST /containers/create", WITH_VOLUME), b"skytether-main_state is not of an orchestrator"),
         (request("POST /containers/database%2Fexec", b"{}"), b"nothing that a site needs"),
         (request("POST /containers/create", b'{"HostConfig": {"Binds": ["/:/host"]}}'), b"'Binds'"),
         (request("GET /info", b"POST /build HTTP/1.1\r\n\r\n"), b"its body is no JSON"),
@@ -149,6 +166,7 @@ def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
         (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"no plain request"),
         (request("POST /images/create?fromImage=a&fromImage=b"), b"its query or its length is odd"),
         (b"POST /images/create HTTP/1.1\r\nContent-Length: 99999999999\r\n\r\n", b"its query or its length is odd"),
+        (b"POST /images/create HTTP/1.1\r\nContent-Length: " + b"9" * 5000 + b"\r\n\r\n", b"its length is odd"),
         (request("POST /containers/create", b"[" * 100_000), b"its body is no JSON"),
         (b"GET /" + b"a" * 200_000, b"refuses it"),
     ],
@@ -157,6 +175,10 @@ def test_what_is_refused_is_told_and_the_engine_hears_nothing_of_it(engine: Engi
     got = say(engine, sent + request("GET /version"))
     assert b"403 Forbidden" in got
     assert says in got
-    assert [
-        line for line in engine.lines if not line.startswith("GET /containers/") and line != "GET /networks/bridge"
-    ] == []
+    looks = ("GET /containers/", "GET /networks/", "GET /volumes/")
+    assert [line for line in engine.lines if not line.startswith(looks)] == []
+
+
+def test_an_engine_that_does_not_answer_is_told_apart_from_a_refusal(engine: Engine) -> None:
+    engine.ended = True
+    assert b"503 Service Unavailable" in say(engine, request(f"POST /containers/{ID}/start"))

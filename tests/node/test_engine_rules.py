@@ -10,6 +10,7 @@ import pytest
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.node.engine_rules import Call, judge
+from skytether.node.seccomp_rules import holds
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker.objects import Declared, Namespace, container, epoch_volume, guard, holder
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
@@ -100,7 +101,10 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
     )
     assert asked("POST", "/containers/prune", filters='{"label": ["skytether.io/guard"], "until": ["60s"]}') is None
     joins = {"Container": ID, "EndpointConfig": {"IPAMConfig": {}}}
-    assert judge(Call("POST", "/networks/n/connect", {}, joins)) == (None, (("containers", ID),))
+    assert judge(Call("POST", "/networks/n/connect", {}, joins)) == (
+        None,
+        (("containers", ID), ("joined networks", "n")),
+    )
 
 
 HOST = {"NetworkMode": "skytether", "CapDrop": ["ALL"], "SecurityOpt": SECURITY}
@@ -121,6 +125,8 @@ HOST = {"NetworkMode": "skytether", "CapDrop": ["ALL"], "SecurityOpt": SECURITY}
         ({"MaskedPaths": []}, "'MaskedPaths'"),
         ({"NetworkMode": "host"}, "its network is 'host'"),
         ({"NetworkMode": "ns:/proc/1/ns/net"}, "its network is 'ns:"),
+        ({"NetworkMode": "container:database"}, "its network is 'container:database'"),
+        ({"PortBindings": {"53/udp": [{"HostPort": "53"}]}}, "'53/udp', which no site asks for"),
         ({"IpcMode": "host"}, "it shares memory"),
         ({"CapDrop": []}, "it keeps rights of root"),
         ({"CapAdd": ["SYS_ADMIN"]}, "it has the rights ['SYS_ADMIN']"),
@@ -193,8 +199,72 @@ def test_nothing_else_is_passed_on(method: str, path: str, body: Any, query: dic
 
 
 def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are() -> None:
-    held = {**HOST, "NetworkMode": "container:abc", "CapAdd": ["NET_ADMIN"]}
+    volume = {"Type": "volume", "Source": "skytether-a", "Target": "/d"}
+    held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": [volume]}
     made = {"Image": "a", "Labels": OWNER, "HostConfig": held}
-    assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("containers", "abc"),))
+    assert judge(Call("POST", "/containers/create", {}, made)) == (
+        None,
+        (("containers", ID), ("volumes", "skytether-a")),
+    )
+    made["HostConfig"] = HOST
+    assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
     assert judge(Call("DELETE", "/networks/n", {}, None)) == (None, (("networks", "n"),))
-    assert judge(Call("PUT", "/containers/abc/archive", {}, None)) == (None, (("containers", "abc"),))
+    assert judge(Call("PUT", f"/containers/{ID}/archive", {}, None)) == (None, (("containers", ID),))
+
+
+@pytest.mark.parametrize("name", ["abc", "0123456789ab", ID[:63], "skytether-a"])
+def test_a_container_is_named_by_its_whole_id_alone(name: str) -> None:
+    """A name may be that of another one by the time when the engine looks: the beginning of its id."""
+    made = {"Image": "a", "Labels": OWNER, "HostConfig": {**HOST, "NetworkMode": f"container:{name}"}}
+    assert asked("POST", "/containers/create", made)
+    assert asked("POST", "/networks/n/connect", {"Container": name})
+    for call in ("start", "kill", "wait", "update"):
+        assert asked("POST", f"/containers/{name}/{call}", {})
+    assert asked("PUT", f"/containers/{name}/archive")
+    assert asked("DELETE", f"/containers/{name}")
+
+
+def allowed(*names: str, **more: Any) -> dict[str, Any]:
+    return {"names": list(names), "action": "SCMP_ACT_ALLOW", **more}
+
+
+NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ"}
+
+
+@pytest.mark.parametrize(
+    ("entry", "good"),
+    [
+        (allowed("read", "write"), True),
+        (allowed("clone", args=[NEW]), True),
+        (allowed("unshare", includes={"caps": ["CAP_SYS_ADMIN"]}), True),
+        ({"names": ["clone3", "mount"], "action": "SCMP_ACT_ERRNO", "errnoRet": 38}, True),
+        (allowed("read", "unshare"), False),
+        ({"name": "mount", "action": "SCMP_ACT_ALLOW"}, False),
+        (allowed("unshare", includes={"caps": ["CAP_NET_ADMIN"]}), False),
+        (allowed("unshare", includes={"arches": ["amd64"]}), False),
+        (allowed("clone"), False),
+        (allowed("clone", args=[{**NEW, "value": 0}]), False),
+        (allowed("clone", args=[7]), False),
+        ({"Names": ["unshare"], "action": "SCMP_ACT_ALLOW"}, False),
+        ({"names": ["unshare"], "action": "SCMP_ACT_LOG"}, False),
+        ({"names": ["unshare"], "action": "SCMP_ACT_NOTIFY"}, False),
+    ],
+)
+def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: bool) -> None:
+    assert holds(json.dumps({"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [entry]})) is good
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"defaultAction": "SCMP_ACT_ALLOW"}',
+        '{"defaultAction": "SCMP_ACT_ERRNO", "DefaultAction": "SCMP_ACT_ALLOW"}',
+        '{"defaultAction": "SCMP_ACT_ALLOW", "defaultAction": "SCMP_ACT_ERRNO"}',
+        '{"defaultAction": "SCMP_ACT_ERRNO", "listenerPath": "/run/x"}',
+        "unconfined",
+        "[]",
+        "[" * 100_000,
+    ],
+)
+def test_a_profile_that_holds_nothing_is_refused(text: str) -> None:
+    assert not holds(text)

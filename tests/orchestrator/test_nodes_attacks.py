@@ -230,8 +230,7 @@ def test_a_node_has_ways_to_no_engine_but_its_own_and_only_when_it_is_asked(node
         # The other one has no link, so it has no ways; and there is no field in which it could name another.
         with pytest.raises(RefusedError, match="while its link stands"):
             calls.call(nodes.url, context_of(nodes.store("other")), Way(), Stands)
-        with pytest.raises(ValueError, match="no request"):
-            read_request(b'{"do": "way", "name": "edge"}')
+        assert read_request(b'{"do": "way", "name": "edge"}') == Way()
         # Linked, it gets no way that it was not asked for.
         hostile = context_of(nodes.store("other"))
         with connection(nodes, hostile) as link, contextlib.ExitStack() as stack:
@@ -346,7 +345,9 @@ def test_ways_that_wait_are_not_forgotten_by_a_nat(nodes: NodeScene) -> None:
         ends = [one for one in here if nodes.port in (one.laddr.port, one.raddr.port)]
         assert len(ends) >= 2 * ways._SPARE
         for end in ends:
-            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(end.fd)) as one:  # some end just now
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(end.fd)) as one:
+                if one.family != end.family:
+                    continue  # it has ended just now, and another has its number
                 assert one.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
                 assert one.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) <= 60
 
@@ -392,7 +393,9 @@ def test_a_certificate_is_for_the_key_that_was_asked_for_whatever_the_request_sa
 
 
 def test_what_a_node_says_of_itself_is_bounded(nodes: NodeScene) -> None:
-    for wrong in ({"hostname": "x" * 10_000}, {"cpu": -1}, {"cpu": float("inf")}, {"secret": 1}):
+    for wrong in ({"hostname": "x" * 10_000}, {"cpu": -1}, {"cpu": float("inf")}):
         line = json.dumps(Link().model_dump() | {"machine": wrong}).encode()
         with pytest.raises(ValueError, match="no request"):
             read_request(line)
+    more = json.dumps(Link().model_dump() | {"machine": {"secret": 1}}).encode()
+    assert read_request(more) == Link(machine=Machine()), "what nobody asked for is not kept"

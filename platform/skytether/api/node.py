@@ -11,7 +11,7 @@ import re
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from .manifest import Name, Strict, Tier
 
@@ -37,7 +37,13 @@ _ODD = re.compile(r"[\s\x00-\x1f\x7f]")
 Port = Annotated[int, Field(ge=1, le=65_535)]
 
 
-class Machine(Strict):
+class Heard(Strict):
+    """Base of all of it. What a later version says beyond is left out: orchestrators and nodes are updated in turn."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class Machine(Heard):
     """What a node says of itself."""
 
     id: Annotated[str, Field(max_length=64)] = ""
@@ -59,20 +65,20 @@ class Machine(Strict):
     """UDP port of the echo for robots' probes; None: it has none."""
 
 
-class Hello(Strict):
+class Hello(Heard):
     """Who are you? Asked before anything is believed; the answer is checked by what the join token says."""
 
     do: Literal["hello"] = "hello"
 
 
-class Look(Strict):
+class Look(Heard):
     """Is this join token good?"""
 
     do: Literal["look"] = "look"
     token: Annotated[str, Field(max_length=256, repr=False)]
 
 
-class Join(Strict):
+class Join(Heard):
     """Make this machine a site."""
 
     do: Literal["join"] = "join"
@@ -88,14 +94,14 @@ class Join(Strict):
     machine: Machine = Machine()
 
 
-class Renew(Strict):
+class Renew(Heard):
     """Another certificate, by the one of this connection."""
 
     do: Literal["renew"] = "renew"
     request: _PEM
 
 
-class Link(Strict):
+class Link(Heard):
     """This connection stays: here the orchestrator says what it needs."""
 
     do: Literal["link"] = "link"
@@ -104,7 +110,7 @@ class Link(Strict):
     """That robots are told from now on; None: as before."""
 
 
-class Way(Strict):
+class Way(Heard):
     """This connection is for somebody who asks the engine: after `GO` come the bytes of both."""
 
     do: Literal["way"] = "way"
@@ -112,13 +118,13 @@ class Way(Strict):
     """Of which link it is: its `Linked.link`."""
 
 
-class Standing(Strict):
+class Standing(Heard):
     """How does the site look from there?"""
 
     do: Literal["standing"] = "standing"
 
 
-class Leave(Strict):
+class Leave(Heard):
     """This machine is to be no site any more."""
 
     do: Literal["leave"] = "leave"
@@ -126,7 +132,7 @@ class Leave(Strict):
     """At once, whatever runs here; otherwise what can be moved is moved first."""
 
 
-class Welcome(Strict):
+class Welcome(Heard):
     """Answer to `Hello`."""
 
     time: float
@@ -134,7 +140,7 @@ class Welcome(Strict):
     authority: _PEM
 
 
-class Invited(Strict):
+class Invited(Heard):
     """Answer to `Look`."""
 
     name: Name
@@ -143,7 +149,7 @@ class Invited(Strict):
     urls: tuple[str, ...] = ()
 
 
-class Issued(Strict):
+class Issued(Heard):
     """Answer to `Join` and `Renew`."""
 
     name: Name
@@ -152,7 +158,7 @@ class Issued(Strict):
     """Of all orchestrators, as far as this one was told."""
 
 
-class Stands(Strict):
+class Stands(Heard):
     """Answer to `Standing` and `Leave`."""
 
     state: Literal["ready", "unreachable", "blocked", "gone"]
@@ -168,7 +174,7 @@ class Stands(Strict):
     memory_mb: int | None = None
 
 
-class Linked(Strict):
+class Linked(Heard):
     """Answer to `Link`, before anything else comes there."""
 
     time: float
@@ -180,7 +186,7 @@ class Linked(Strict):
     urls: tuple[str, ...] = ()
 
 
-class Told(Strict):
+class Told(Heard):
     """A line that the orchestrator sends on a link."""
 
     ping: int | None = None
@@ -188,7 +194,7 @@ class Told(Strict):
     """So many more ways are wanted."""
 
 
-class Said(Strict):
+class Said(Heard):
     """A line that a node sends on its link."""
 
     pong: int | None = None
@@ -198,7 +204,7 @@ class Said(Strict):
     """So many of the ways that were wanted could not be opened."""
 
 
-class Refused(Strict):
+class Refused(Heard):
     """Instead of any answer."""
 
     error: Annotated[str, Field(max_length=2000)]

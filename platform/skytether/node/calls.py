@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import socket
 import ssl
@@ -133,15 +134,12 @@ def read_answer(line: bytes, answer: type[Answer], url: str) -> Answer:
         RefusedError: No.
         NodeError: Nothing that is understood.
     """
+    with contextlib.suppress(ValidationError):
+        raise RefusedError(Refused.model_validate_json(line))
     try:
         return answer.model_validate_json(line)
     except ValidationError:
-        pass
-    try:
-        refused = Refused.model_validate_json(line)
-    except ValidationError:
         raise NodeError(f"the answer of {url} is not understood: has the orchestrator another version?") from None
-    raise RefusedError(refused)
 
 
 def _check_protocol(spoken: str | None, url: str) -> None:

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl, unquote, urlencode
 
 from skytether.api.splice import PIECE, Stream
 
-from .engine_rules import NETWORK, OWNER, Call, Subject, judge
+from .engine_rules import NETWORK, OPEN, OWNER, Call, Subject, judge
 from .machine import ask_json
 
 log = logging.getLogger(__name__)
@@ -26,12 +26,20 @@ _PASSED = (b"accept", b"content-type", b"x-registry-auth")
 """Headers that the engine gets as they are."""
 _MOST_JSON, _MOST_ARCHIVE = 1 << 20, 64 << 20
 """Bytes of a request's body."""
+_MOST_DIGITS = 12
+"""Of a length."""
+_MARKS = {"containers": {OWNER}, "volumes": {OWNER}, "networks": {NETWORK}, "joined networks": {NETWORK, OPEN}}
+"""By kind, labels of which one makes a thing ours."""
 _KNOWN = 4096
 """Containers that are remembered to be ours."""
 
 
 class RefusedCall(Exception):  # noqa: N818 (an answer)
     """One sentence."""
+
+    def __init__(self, text: str, status: HTTPStatus = HTTPStatus.FORBIDDEN) -> None:
+        super().__init__(text)
+        self.status = status
 
 
 class EngineGate:
@@ -53,13 +61,15 @@ class EngineGate:
         except asyncio.IncompleteReadError:
             return  # it has ended
         except (RefusedCall, asyncio.LimitOverrunError) as error:
+            status = error.status if isinstance(error, RefusedCall) else HTTPStatus.FORBIDDEN
             text = f"this machine's node refuses it: {error}"
             if text not in self._told:
                 self._told = {*list(self._told)[-99:], text}
                 log.warning("an orchestrator's call to the engine: %s", error)
             body = json.dumps({"message": text}).encode()
-            head = f"HTTP/1.1 403 Forbidden\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n"
-            back.write(f"{head}Connection: close\r\n\r\n".encode() + body)
+            rows = ("Content-Type: application/json", f"Content-Length: {len(body)}", "Connection: close")
+            head = "\r\n".join((f"HTTP/1.1 {status.value} {status.phrase}", *rows))
+            back.write(f"{head}\r\n\r\n".encode() + body)
             with contextlib.suppress(OSError):
                 await back.drain()
 
@@ -74,7 +84,8 @@ class EngineGate:
         pairs = parse_qsl(asked, keep_blank_values=True)
         query, length = dict(pairs), headers.get(b"content-length", b"0")
         archive = method == "PUT"
-        if len(query) != len(pairs) or not length.isdigit() or int(length) > (_MOST_ARCHIVE if archive else _MOST_JSON):
+        most = _MOST_ARCHIVE if archive else _MOST_JSON
+        if len(query) != len(pairs) or not length.isdigit() or len(length) > _MOST_DIGITS or int(length) > most:
             raise RefusedCall("its query or its length is odd")
         body = b"" if archive else await reader.readexactly(int(length))
         try:
@@ -107,21 +118,22 @@ class EngineGate:
         kind, name = subject
         if name in self._ours:
             return True
-        path = f"/{kind}/{name}/json" if kind == "containers" else f"/{kind}/{name}"
+        what = kind.rpartition(" ")[2]
+        path = f"/{what}/{name}/json" if what == "containers" else f"/{what}/{name}"
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
             return False
         try:
             status, found = await asyncio.to_thread(ask_json, self._engine, path)
-        except ValueError:
-            return False
+        except (OSError, ValueError) as error:
+            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if status == HTTPStatus.NOT_FOUND:
-            return True
+            return what == kind
         document = found if isinstance(found, dict) else {}
-        config = document.get("Config") if kind == "containers" else document
+        config = document.get("Config") if what == "containers" else document
         labels = config.get("Labels") if isinstance(config, dict) else None
-        if not isinstance(labels, dict) or (NETWORK if kind == "networks" else OWNER) not in labels:
+        if not isinstance(labels, dict) or not _MARKS[kind] & labels.keys():
             return False
-        if kind == "containers" and name == document.get("Id"):  # its labels never change
+        if what == "containers" and name == document.get("Id"):  # its labels never change
             self._ours = self._ours if len(self._ours) < _KNOWN else set()
             self._ours.add(name)
         return True

@@ -15,21 +15,28 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from .seccomp_rules import holds
+
 OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
 """Labels of what orchestrators made."""
+OPEN = "skytether.io/open"
+"""Label of a network that the machine's owner made, and that containers of sites may be in."""
+_CONTAINER_ID = "[0-9a-f]{64}"
+"""Whole: an engine takes names and beginnings of ids, too, and what these mean may change between two calls."""
 _ID = r"([A-Za-z0-9][A-Za-z0-9_.-]*)"
 _BEFORE = re.compile(r"^/v1\.\d{1,3}(?=/)")
 _CALLS = tuple(
-    (methods.split(), re.compile(pattern.replace("ID", _ID)), kind)
+    (methods.split(), re.compile(pattern.replace("CID", f"({_CONTAINER_ID})").replace("ID", _ID)), kind)
     for methods, pattern, kind in (
         ("GET HEAD", r"/_ping|/version|/info|/events|/system/df|/containers/json|/volumes", ""),
         ("POST", r"/containers/create", "create"),
         ("POST", r"/containers/prune", "prune"),
-        ("GET", r"/containers/ID/(?:json|logs|stats)", "container"),
-        ("GET HEAD PUT", r"/containers/ID/archive", "container"),
-        ("POST", r"/containers/ID/(?:start|kill|wait)", "container"),
-        ("POST", r"/containers/ID/update", "update"),
-        ("DELETE", r"/containers/ID", "container"),
+        ("GET", r"/containers/CID/(?:json|logs|stats)", "container"),
+        ("GET", r"/containers/(skytether-[A-Za-z0-9_.-]+)/json", "container"),
+        ("GET HEAD PUT", r"/containers/CID/archive", "container"),
+        ("POST", r"/containers/CID/(?:start|kill|wait)", "container"),
+        ("POST", r"/containers/CID/update", "update"),
+        ("DELETE", r"/containers/CID", "container"),
         ("GET", r"/images/[A-Za-z0-9](?:[A-Za-z0-9_:@-]|[./](?![./]))*/json", ""),
         ("POST", r"/images/create", "pull"),
         ("GET", r"/networks/ID", ""),
@@ -47,6 +54,8 @@ _HOST = _LIMITS | {
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
+_PORTS = {"7600/udp"}
+"""Inside: where a service's end of the bridge is."""
 _BRIDGES, _VOLUMES = "skt-", "skytether-"
 """What names of ours begin with: of interfaces, and of volumes that outlive their containers."""
 
@@ -64,7 +73,8 @@ class Call:
 
 
 Subject = tuple[str, str]
-"""Kind (``containers``, ``networks``, ``volumes``) and name of what must be ours, if it is there at all."""
+"""Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all; and ``joined
+networks``, which must be there, and be ours or open to us."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -88,14 +98,23 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
         return "the call wants an object", ()
     match kind:
         case "create":
-            within = str(_at(body, "HostConfig").get("NetworkMode", "")).partition("container:")[2]
-            return _container(body, set(devices)), (("containers", within),) if within else ()
+            host = _at(body, "HostConfig")
+            network = str(host.get("NetworkMode", ""))
+            within = network.partition("container:")[2]
+            volumes = [one.get("Source") for one in _list(host, "Mounts") if isinstance(one, dict)]
+            return _container(body, set(devices)), (
+                ("containers", within) if within else ("joined networks", network),
+                *(("volumes", str(name)) for name in volumes if name),
+            )
         case "update":
             return _only(body, _LIMITS, "limits"), (("containers", name),)
         case "joined":
             settings = {key: one for key, one in _at(body, "EndpointConfig").items() if one}
             refused = _only(body, {"Container", "EndpointConfig", "Force"}, "the call") or _only(settings, set(), "it")
-            return refused, (("containers", str(body.get("Container", ""))),)
+            container = str(body.get("Container", ""))
+            if not re.fullmatch(_CONTAINER_ID, container):
+                return "a container is named by its whole id", ()
+            return refused or _network_name(name), (("containers", container), ("joined networks", name))
         case "network made":
             return _network(body), ()
         case "volume made":
@@ -106,7 +125,9 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             return None if ours else "only what earlier releases left is pruned", ()
         case "pull":
             return _only(call.query, {"fromImage", "tag"}, "a pull"), ()
-        case "container" | "network" | "volume":
+        case "network":
+            return _network_name(name), (("networks", name),)
+        case "container" | "volume":
             return None, ((f"{kind}s", name),)
     return None, ()
 
@@ -118,7 +139,10 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         _only(body, _CONTAINER, "a container"),
         _only(host, _HOST, "a container"),
         None if OWNER in _at(body, "Labels") else f"it has no label {OWNER}",
-        None if re.fullmatch(f"(?:container:)?{_ID}", mode) and mode != "host" else f"its network is '{mode[:80]}'",
+        None if re.fullmatch(f"container:{_CONTAINER_ID}|{_ID}", mode) else f"its network is '{mode[:80]}'",
+        None if mode.startswith("container:") else _network_name(mode),
+        _only(_at(body, "ExposedPorts"), _PORTS, "a container"),
+        _only(_at(host, "PortBindings"), _PORTS, "a container"),
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
         _rights(host.get("CapAdd") or [], mode),
         _security(host.get("SecurityOpt")),
@@ -141,9 +165,15 @@ def _rights(added: Any, mode: str) -> str | None:
 def _security(options: Any) -> str | None:
     given = options if isinstance(options, list) else []
     profiles = [str(one) for one in given if one != "no-new-privileges"]
-    if len(profiles) == len(given) or not all(isinstance(_json(p.removeprefix("seccomp=")), dict) for p in profiles):
+    if len(profiles) == len(given) or not all(p.startswith("seccomp=") and holds(p[8:]) for p in profiles):
         return "its SecurityOpt lets go of what holds it"
     return None
+
+
+def _network_name(name: str) -> str | None:
+    """Names that an engine might take for the beginning of an id are not taken."""
+    odd = name in ("host", "none", "default") or re.fullmatch("[0-9a-f]+", name)
+    return f"its network is '{name[:80]}'" if odd else None
 
 
 def _mount(mount: Any) -> str | None:
@@ -158,7 +188,7 @@ def _mount(mount: Any) -> str | None:
 
 def _device(device: Any, devices: set[str]) -> str | None:
     path = device.get("PathOnHost") if isinstance(device, dict) else device
-    if path in devices:
+    if isinstance(path, str) and path in devices:
         return _only(device, {"PathOnHost", "PathInContainer", "CgroupPermissions"}, "a device")
     return f"it has the device {str(path)[:80]}, and this machine gives none but by `site join --device {path}`"
 
@@ -173,6 +203,8 @@ def _network(body: Mapping[str, Any]) -> str | None:
     ours = NETWORK in _at(body, "Labels") and body.get("Driver") == "bridge" and not body.get("IPAM")
     if not ours or not str(options.get("com.docker.network.bridge.name", "")).startswith(_BRIDGES):
         return "it is no network of ours, which is a bridge of its own"
+    if body.get("CheckDuplicate") is not True:
+        return "another network may have that name: a site asks for CheckDuplicate"
     known = {"Name", "CheckDuplicate", "Driver", "Options", "IPAM", "Labels"}
     return _only(options, _NETWORK_OPTIONS, "a network") or _only(body, known, "a network")
 

@@ -1,17 +1,20 @@
 """How long a robot is without commands while its service is given more cores and memory, or less.
 
 Everything is real: an orchestrator, the service in a container of this machine's engine (or as a process), a simulated
-walker whose agent drives at 100 Hz. The instance is under load: another program in its container, within its limits,
-keeps half a core busy. Beside each change the same is measured over as long a time without one.
+walker whose agent drives at 100 Hz, an operator in a process of its own. The instance is under load: another program in
+its container, within its limits, keeps half a core busy. Beside each change the same is measured over as long a time
+without one.
 """
 
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 
@@ -106,33 +109,36 @@ def bench_resize(
     with (
         EmbeddedOrchestrator() as orchestrator,
         docker_site(orchestrator, prefix, SERVICE) if runtime == "docker" else nullcontext(),
-        Client(orchestrator.url, orchestrator.operator_token) as operator,
+        ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as operators,
     ):
-        token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
+        access = orchestrator.url, orchestrator.operator_token
+        with Client(*access) as operator:
+            token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
         config = AgentConfig(ROBOT, orchestrator.url, SERVICE, token, bind=("127.0.0.1", 0))
         seen = Commands()
         with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
             wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             instance = instance_of(agent)
+            operators.submit(_look, access, instance, 0.0).result()  # it is there, and has imported all
             with _loaded(instance, runtime):
                 for i in range(n):
                     time.sleep(2 * _AROUND_S)
                     before = len(agent.status().driver.transitions)
-                    began, done = _change(operator, instance, SIZES[i % len(SIZES)], agent)
+                    began, done = operators.submit(_change, access, instance, SIZES[i % len(SIZES)]).result()
+                    if (now := instance_of(agent)) != instance:
+                        raise BenchError(f"the robot was handed over to {now}: the site did not change {instance}")
                     time.sleep(_AROUND_S)
                     gaps.append(seen.longest_gap_ms(began - _AROUND_S, done + _AROUND_S))
                     took.append(done - began)
                     fallbacks += len(agent.status().driver.transitions) > before
                     on_resize(i, gaps[-1])
                     time.sleep(2 * _AROUND_S)
-                    began = time.monotonic()
-                    while time.monotonic() < began + took[-1]:
-                        operator.get_instance(instance)  # what is asked meanwhile costs the robot's process as much
-                        time.sleep(_LOOK_S)
+                    began = operators.submit(_look, access, instance, took[-1]).result()
                     time.sleep(_AROUND_S)
                     still.append(seen.longest_gap_ms(began - _AROUND_S, began + took[-1] + _AROUND_S))
-            restarts = operator.get_instance(instance).restarts
+            with Client(*access) as operator:
+                restarts = operator.get_instance(instance).restarts
     periods, still_periods = np.array(gaps) / PERIOD_MS, np.array(still) / PERIOD_MS
     return ResizeRow(
         runtime,
@@ -149,19 +155,27 @@ def bench_resize(
     )
 
 
-def _change(operator: Client, instance: str, size: Size, agent: Agent) -> tuple[float, float]:
-    """When it was asked for, and when it was seen to be done."""
-    began = time.monotonic()
-    operator.resize_instance(instance, Resize(cpu=size.cpu, memory_mb=size.memory_mb))
-    limit = began + _LIMIT_S
-    while operator.get_instance(instance).size != size:
-        if time.monotonic() > limit:
-            raise BenchError(f"the instance does not have {size} within {_LIMIT_S:.0f} s")
-        time.sleep(_LOOK_S)
-    done = time.monotonic()
-    if (now := instance_of(agent)) != instance:
-        raise BenchError(f"the robot was handed over to {now}: the site did not change {instance}")
-    return began, done
+def _change(access: tuple[str, str], instance: str, size: Size) -> tuple[float, float]:
+    """When it was asked for, and when it was seen to be done; in the operator's process."""
+    with Client(*access) as operator:
+        began = time.monotonic()
+        operator.resize_instance(instance, Resize(cpu=size.cpu, memory_mb=size.memory_mb))
+        while operator.get_instance(instance).size != size:
+            if time.monotonic() > began + _LIMIT_S:
+                raise BenchError(f"the instance does not have {size} within {_LIMIT_S:.0f} s")
+            time.sleep(_LOOK_S)
+        return began, time.monotonic()
+
+
+def _look(access: tuple[str, str], instance: str, seconds: float) -> float:
+    """Ask as often as while it is changed; since when."""
+    with Client(*access) as operator:
+        began = time.monotonic()
+        operator.get_instance(instance)
+        while time.monotonic() < began + seconds:
+            operator.get_instance(instance)
+            time.sleep(_LOOK_S)
+        return began
 
 
 @contextmanager

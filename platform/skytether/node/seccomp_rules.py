@@ -1,0 +1,79 @@
+"""Whether a seccomp profile holds a container at least as an engine's own does. Pure.
+
+What gives a process a namespace, a file system or a part of the kernel that its container has not must be refused. An
+engine reads keys in any case, and of a key that stands twice both: only exact keys are taken, each of them once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+_REFUSES = {f"SCMP_ACT_{word}" for word in ("ERRNO", "KILL", "KILL_PROCESS", "KILL_THREAD", "TRAP")}
+_WAYS_OUT = {
+    *(
+        "unshare",
+        "setns",
+        "clone3",
+        "mount",
+        "umount",
+        "umount2",
+        "pivot_root",
+        "fsopen",
+        "fsconfig",
+        "fsmount",
+        "fspick",
+    ),
+    *("move_mount", "open_tree", "mount_setattr", "open_by_handle_at", "bpf", "perf_event_open", "userfaultfd"),
+    *("init_module", "finit_module", "delete_module", "create_module", "kexec_load", "kexec_file_load", "reboot"),
+    *("add_key", "keyctl", "request_key", "quotactl", "swapon", "swapoff", "acct", "syslog", "nfsservctl", "vm86"),
+}
+_NEW_NAMESPACES = 0x7E020000
+"""Flags of ``clone``."""
+_GUARDS = {"CAP_NET_ADMIN"}
+"""What a container may have of rights: an entry for others of them never applies."""
+_PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
+_ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
+
+
+def holds(text: str) -> bool:
+    """Whether a profile (JSON, as Docker takes it) lets nothing of that through."""
+    try:
+        profile = json.loads(text, object_pairs_hook=_once)
+    except (ValueError, RecursionError):
+        return False
+    if not isinstance(profile, dict) or profile.keys() - _PROFILE or profile.get("defaultAction") not in _REFUSES:
+        return False
+    entries = profile.get("syscalls") or []
+    return isinstance(entries, list) and all(isinstance(one, dict) and _closed(one) for one in entries)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError
+    return found
+
+
+def _closed(entry: Mapping[str, Any]) -> bool:
+    names, includes = entry.get("names") or [], entry.get("includes") or {}
+    if entry.keys() - _ENTRY or not isinstance(names, list) or not isinstance(includes, dict):
+        return False
+    if includes.keys() - {"caps", "arches", "minKernel"} or not isinstance(includes.get("caps") or [], list):
+        return False
+    if entry.get("action") in _REFUSES or set(map(str, includes.get("caps") or [])) - _GUARDS:
+        return True
+    allowed = {*map(str, names), str(entry.get("name"))}
+    return not allowed & _WAYS_OUT and ("clone" not in allowed or _within(entry.get("args")))
+
+
+def _within(arguments: Any) -> bool:
+    """Whether a ``clone`` is let through without a new namespace only."""
+    rows = arguments if isinstance(arguments, list) else []
+    return len(rows) == 1 and rows[0] == {
+        "index": rows[0].get("index") if isinstance(rows[0], dict) else None,
+        "value": _NEW_NAMESPACES,
+        "valueTwo": 0,
+        "op": "SCMP_CMP_MASKED_EQ",
+    }
