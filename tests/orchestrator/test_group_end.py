@@ -32,7 +32,9 @@ def dismantle(folder: Path, *words: str) -> Any:
 
 
 @pytest.mark.slow
-def test_machines_of_a_group_are_gone_and_while_an_orchestrator_leads_nothing_is_touched(tmp_path: Path) -> None:
+def test_machines_of_a_group_are_gone_and_while_an_orchestrator_leads_nothing_is_touched(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     state = tmp_path / "state"
     core = Orchestrator(Settings(state_dir=state, local_site=False))
     core.start()
@@ -55,6 +57,7 @@ def test_machines_of_a_group_are_gone_and_while_an_orchestrator_leads_nothing_is
     store.close()
     again = dismantle(tmp_path, "--state-dir", str(state))
     assert (again.exit_code, "0 machines of cloud are destroyed" in again.output) == (0, True)
+    assert "this database knows no group 'cloud'" in caplog.text
 
 
 def test_without_the_database_that_knows_them_it_refuses_or_says_that_they_stay(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def end_groups(
 
     Args:
         store: The database that knows them; it is brought to our schema.
-        names: Of the groups; one that it does not know has no machines.
+        names: Of the groups; of one that it does not know it is warned: it has no machines, or it is another's.
         folder: Where the providers keep what they note.
         find_provider: Gives a provider by its name.
         patience_s: How long each provider gets until it lists none of them.
@@ -53,8 +53,12 @@ def end_groups(
     try:
         store.migrate()
         ended: list[str] = []
-        for row in filter(None, map(store.site_group, names)):
-            ended += _end(store, row, folder / row.name, find_provider, patience_s, lock)
+        for name in names:
+            row = store.site_group(name)
+            if row is None:
+                log.warning("this database knows no group '%s': if it is not its orchestrators', machines stay", name)
+            else:
+                ended += _end(store, row, folder / row.name, find_provider, patience_s, lock)
         return ended
     finally:
         lock.release()
