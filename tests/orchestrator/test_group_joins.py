@@ -166,12 +166,13 @@ def test_a_lost_answer_and_a_machine_that_does_not_join(
     operator.create_group(group(machines.cloud, tmp_path, join_timeout_s=2))
     made = operator.create_instance(InstanceCreate(robot="w", service="toy", lease_s=600))
     until(lambda: "did not become a site within 2 s" in operator.get_group("cloud").reason)
-    assert len(nova.created) == 1, "the one whose answer was lost"
     until(lambda: not nova.servers)
     machines.joins = True
     nova.lose.clear()
     assert operator.wait_running(made.id, timeout=60).placement.site.startswith("cloud-")
-    assert len(nova.created) == 2
+    ordered = [one["name"] for one in nova.created]
+    assert len(ordered) == len(set(ordered)) >= 2, "one whose answer was lost is not ordered again"
+    assert len(nova.servers) == 1
     scene.engine("late")
     with pytest.raises(NodeError, match="join token was good until"):
         join(scene.options(machines.tokens[0], "late"))
