@@ -23,13 +23,13 @@ test: $(READY) ## every test that this machine can run; what is missing is skipp
 		echo "A cluster, for the tests that need one ..."; $(MAKE) --no-print-directory slow-kubernetes || failed=1; exit $$failed
 
 slow-engine: $(READY)
-	$(SLOW) and together and not kubernetes and docker"
+	$(SLOW) and together and first_row and not kubernetes"
 
 slow-kubernetes: $(READY)
 	$(SLOW) and kubernetes"
 
 slow-others: $(READY)
-	$(SLOW) and together and not docker and not kubernetes"
+	$(SLOW) and together and not first_row and not kubernetes"
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) -n 2 --dist loadfile

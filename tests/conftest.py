@@ -133,6 +133,9 @@ TOGETHER = (
 )
 """Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
 
+FIRST_ROW = ("e2e/test_navigation_guide.py", "ros/ros1/test_gate.py", "ros/ros1/test_own_gate.py")
+"""Of these, what runs beside the others with what needs the Docker engine: so both rows take as long."""
+
 ALONE = (
     "orchestrator/test_server.py::test_a_killed_orchestrator_comes_back",
     "orchestrator/test_server.py::test_a_killed_service_is_seen_within_a_second",
@@ -177,6 +180,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             name = f"{item.path.relative_to(here).as_posix()}::{item.name}"
             if name.startswith(TOGETHER) and not name.startswith(ALONE):
                 item.add_marker(pytest.mark.together)
+                if item.get_closest_marker("docker") or name.startswith(FIRST_ROW):
+                    item.add_marker(pytest.mark.first_row)
             if item.get_closest_marker("flaky"):
                 raise pytest.UsageError(f"{name}: what may be run again stands in RERUN in tests/conftest.py, with why")
             if item.get_closest_marker("slow") and name.startswith(tuple(RERUN)):
