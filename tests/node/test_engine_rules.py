@@ -244,6 +244,9 @@ NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ
         (allowed("unshare", includes={"arches": ["amd64"]}), False),
         (allowed("clone"), False),
         (allowed("clone", args=[{**NEW, "value": 0}]), False),
+        (allowed("clone", args=[{**NEW, "index": 1}]), False),  # whoever calls chooses that one
+        (allowed("clone", args=[{**NEW, "index": 1}], includes={"arches": ["s390", "s390x"]}), True),
+        (allowed("clone", args=[{**NEW, "index": 1}], includes={"arches": ["s390x", "amd64"]}), False),
         (allowed("clone", args=[7]), False),
         ({"Names": ["unshare"], "action": "SCMP_ACT_ALLOW"}, False),
         ({"names": ["unshare"], "action": "SCMP_ACT_LOG"}, False),

@@ -31,6 +31,8 @@ _WAYS_OUT = {
 }
 _NEW_NAMESPACES = 0x7E020000
 """Flags of ``clone``."""
+_FLAGS_SECOND = {"s390", "s390x"}
+"""Where they are its second argument."""
 _GUARDS = {"CAP_NET_ADMIN"}
 """What a container may have of rights: an entry for others of them never applies."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
@@ -65,15 +67,10 @@ def _closed(entry: Mapping[str, Any]) -> bool:
     if entry.get("action") in _REFUSES or set(map(str, includes.get("caps") or [])) - _GUARDS:
         return True
     allowed = {*map(str, names), str(entry.get("name"))}
-    return not allowed & _WAYS_OUT and ("clone" not in allowed or _within(entry.get("args")))
+    return not allowed & _WAYS_OUT and ("clone" not in allowed or _within(entry.get("args"), includes.get("arches")))
 
 
-def _within(arguments: Any) -> bool:
-    """Whether a ``clone`` is let through without a new namespace only."""
-    rows = arguments if isinstance(arguments, list) else []
-    return len(rows) == 1 and rows[0] == {
-        "index": rows[0].get("index") if isinstance(rows[0], dict) else None,
-        "value": _NEW_NAMESPACES,
-        "valueTwo": 0,
-        "op": "SCMP_CMP_MASKED_EQ",
-    }
+def _within(arguments: Any, arches: Any) -> bool:
+    """Whether a ``clone`` is let through without a new namespace only: by its flags, the first of its arguments."""
+    index = 1 if isinstance(arches, list) and arches and set(map(str, arches)) <= _FLAGS_SECOND else 0
+    return bool(arguments == [{"index": index, "value": _NEW_NAMESPACES, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ"}])
