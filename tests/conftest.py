@@ -302,6 +302,18 @@ def ros1() -> None:
 
 
 @pytest.fixture(scope="session")
+def ros2() -> str:
+    """A Python that has ROS 2 (rclpy): the one that ``SKYTETHER_ROS2_PYTHON`` names, or that of `make ros2`."""
+    python = os.environ.get("SKYTETHER_ROS2_PYTHON") or str(Path(__file__).parents[1] / ".venv-ros2/bin/python")
+    if not Path(python).exists():
+        require("ros2", f"there is no {python}: run `make ros2`, or name ROS 2's Python with SKYTETHER_ROS2_PYTHON")
+    tried = subprocess.run([python, "-c", "import rclpy"], capture_output=True, text=True)
+    if tried.returncode:
+        require("ros2", f"{python} cannot import rclpy: {tried.stderr.strip().splitlines()[-1]}; run `make ros2`")
+    return python
+
+
+@pytest.fixture(scope="session")
 def systemd() -> None:
     """The program that reads and scores units."""
     if shutil.which("systemd-analyze") is None:
