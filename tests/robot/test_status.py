@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import httpx
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 from skytether.api.rest import Placement
@@ -99,7 +98,6 @@ def test_the_command_prints_tables_or_json(served):
 def test_what_a_service_said_last_is_shown_as_it_is_and_obeyed_by_nobody(served, monkeypatch):
     said = 'its last line: "[/x] [red]\x1b]0;title\x07"'
     monkeypatch.setattr(served, "_instance", served._instance.model_copy(update={"reason": said}))
-    monkeypatch.setattr("skytether.cli.robot_status.console", Console(stderr=True, width=200))
     result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
     assert result.exit_code == 0
     assert "[/x] [red]\\x1b]0;title\\x07" in result.output
@@ -168,8 +166,38 @@ def test_a_status_that_cannot_be_told_harms_nobody():
     assert CliRunner().invoke(app, ["robot", "status", "--port", str(server.port)]).exit_code == 1
 
 
-def test_a_port_that_is_taken_keeps_no_robot_from_driving(served, base, orchestrator, caplog):
+def test_an_agent_whose_port_is_taken_answers_on_the_next_and_is_found_by_its_robot_s_name(
+    served, base, orchestrator, caplog
+):
+    other = Agent(replace(CONFIG, robot="second", status_port=served.status_port), base, client=orchestrator)
+    other._serve()
+    try:
+        assert other.status_port in range(served.status_port + 1, served.status_port + 16)
+        assert f"the status of robot second is on port {other.status_port}" in caplog.text
+        port = str(served.status_port)
+        for name in ("walker", "second"):
+            found = CliRunner().invoke(app, ["robot", "status", name, "--port", port, "--json"])
+            assert json.loads(found.stdout)["robot"] == name
+        nobody = CliRunner().invoke(app, ["robot", "status", "third", "--port", port])
+        assert nobody.exit_code == 1
+        assert "no agent of robot third answers" in " ".join(nobody.output.split())
+    finally:
+        other.close()
+
+
+def test_no_free_port_keeps_no_robot_from_driving(served, base, orchestrator, caplog, monkeypatch):
+    monkeypatch.setattr("skytether.robot.status.PORTS", 1)
     other = Agent(replace(CONFIG, status_port=served.status_port), base, client=orchestrator)
     other._serve()
     assert other.status_port is None
     assert "no status on port" in caplog.text
+
+
+def test_in_a_pipe_no_row_is_broken_and_a_site_called_local_is_listed_once(served):
+    options = (Option("local", {"delay": 0.3}), Option(None, refused="the fallback only stops, " * 6))
+    served._tasks._decision = replace(served._tasks.decision, options=options)
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    first = [line.split("│")[1].strip() for line in result.stdout.splitlines() if line.count("│") == 4]
+    assert first.count("local") == 1
+    assert "own controller" in first
+    assert "the fallback only stops, " * 5 in result.stdout

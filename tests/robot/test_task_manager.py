@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs
 from skytether.robot.task_manager import (
+    OWN_CONTROLLER,
     Mode,
     PathQuality,
     Policy,
@@ -38,7 +39,7 @@ def test_costs_are_those_of_the_model():
     # 1.0 * (50 + 2 * 10) / 100; 1.0 * 0.02 / 0.1
     assert found["cloud"].parts == pytest.approx({"delay": 0.7, "loss": 0.2, "energy": 0.09})
     # 2; 0.5 * (0.2 + 0.1 / 4); 0.5 * 0.6 * 0.225
-    assert found["local"].parts == pytest.approx({"service": 2.0, "processor": 0.1125, "energy": 0.0675})
+    assert found[OWN_CONTROLLER].parts == pytest.approx({"service": 2.0, "processor": 0.1125, "energy": 0.0675})
     onboard = costs([SiteView("me", "robot", PathQuality(0.001, 0.0, 0.0))], robot)["me"]
     assert onboard.parts["processor"] == pytest.approx(0.5 * (0.2 + 1 / 4))
 
@@ -67,7 +68,7 @@ def test_what_cannot_be_is_ruled_out_with_its_number(site, robot, why):
 def test_tiers_and_a_fallback_that_only_stops_are_ruled_out():
     found = costs([EDGE], replace(ROBOT, drives=False), Needs(tiers=("cloud",)))
     assert found["edge"].refused == "is of tier edge, needed is cloud"
-    assert found["local"].refused == "the fallback only stops"
+    assert found[OWN_CONTROLLER].refused == "the fallback only stops"
 
 
 def test_before_anything_is_measured_the_orchestrator_chooses():
@@ -79,7 +80,8 @@ def test_before_anything_is_measured_the_orchestrator_chooses():
     assert (known.offload, known.site, known.since) == (True, "edge", 2.0)
     assert known.why == (
         "offload: edge 0.14 (delay 0.14, loss 0.00, energy 0.00); "
-        "cloud 0.60 (delay 0.60, loss 0.00, energy 0.00); local 2.11 (service 2.00, processor 0.11, energy 0.00)"
+        "cloud 0.60 (delay 0.60, loss 0.00, energy 0.00); "
+        "own controller 2.11 (service 2.00, processor 0.11, energy 0.00)"
     )
 
 
@@ -129,11 +131,16 @@ def test_from_local_it_goes_back_when_a_site_is_good_again():
     assert run(local, [EDGE], 0.0, 10).site == "edge"
 
 
+def test_a_site_called_local_is_not_taken_for_the_robot_s_own_controller():
+    names = [option.name for option in weigh(POLICY, NEEDS, [SiteView("local", "edge")], ROBOT)]
+    assert names == ["local", OWN_CONTROLLER]
+
+
 def test_modes_decide_for_the_costs():
     local = Policy(mode=Mode.LOCAL)
     assert run(start(local, 0.0), [EDGE], 0.0, 100, local).offload is False
     offload = Policy(mode=Mode.OFFLOAD)
-    assert "local" not in costs([EDGE], policy=offload)
+    assert OWN_CONTROLLER not in costs([EDGE], policy=offload)
     assert run(start(offload, 0.0), [], 0.0, 100, offload).offload is True
 
 

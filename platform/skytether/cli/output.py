@@ -20,6 +20,7 @@ from skytether.api.printable import printable
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
+    from rich.table import Table
     from rich.text import Text
 
 _WIDE = 10_000
@@ -118,8 +119,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         table.add_column(name, no_wrap=i == 0, overflow="fold")  # names and ids stay whole, so that they can be copied
     for row in rows:
         table.add_row(*(cell(value) for value in row))
+    print_whole(table)
+
+
+def print_whole(table: Table) -> None:
+    """A table on standard output; a program that reads lines must not find one row on two of them."""
     out = SafeConsole(highlight=False)
-    # A program that reads lines must not find one row on two of them.
     out.print(table) if out.is_terminal else SafeConsole(highlight=False, width=_WIDE).print(table)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .connection import TokenFile, connected
-from .output import SafeConsole, cell, console, fail, print_json
+from .output import SafeConsole, cell, console, fail, print_json, print_whole
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
@@ -170,8 +170,8 @@ def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) 
             *map(str, counts),
             *("-" if ms is None else f"{ms:.2f}" for ms in delays),
         )
+    print_whole(table)
     out = SafeConsole(highlight=False)
-    out.print(table)
     for path in files:
         out.print(f"written: {path}", markup=False, soft_wrap=True)
     if not files:

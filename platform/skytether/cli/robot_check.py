@@ -24,7 +24,7 @@ from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.services import CallRefusedError
 from skytether.ros.ros1.subscription import Listener
 
-from .output import SafeConsole, cell, console
+from .output import cell, console, print_whole
 from .robot_config import RobotConfig
 from .robot_gate import ASSUMED, NO_GATE
 
@@ -87,7 +87,7 @@ def show(findings: Sequence[Finding]) -> bool:
         table.add_column(head, overflow="fold")
     for f in findings:
         table.add_row("ok" if f.good else "!!", *map(cell, (f.what, f.where, f.kind, f.says)))
-    SafeConsole(highlight=False).print(table)
+    print_whole(table)
     wrong = sum(not f.good for f in findings)
     console.print("all is there" if not wrong else f"{wrong} to mend, marked !!", markup=False)
     return not wrong

@@ -235,7 +235,7 @@ class RobotConfig(Strict):
     """PEM file of the certificate's authority; in the file, relative to its folder; null: the system's."""
     task: TaskConfig = TaskConfig()
     status_port: Annotated[int, Field(ge=0, le=65_535)] | None = DEFAULT_PORT
-    """Of ``/status`` and ``/metrics`` on loopback; 0: any free one; null: there are none."""
+    """Of ``/status`` and ``/metrics`` on loopback, the next if it is taken; 0: any free one; null: there are none."""
     safety: SafetyConfig | None = Field(default_factory=lambda: SafetyConfig.model_validate(WITHOUT_SECTION))
     """The gate's part (``skytether robot gate``): velocities go to the gate and not to the wheels.
 

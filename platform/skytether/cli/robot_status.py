@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .connection import Json
-from .output import cell, console, fail, print_json
+from .output import cell, fail, print_json, print_whole
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 _TIMEOUT_S = 5.0
+_NO_AGENT = "what answers on port {} of this machine is no agent; give its status_port with --port"
 
 
 def status(
+    robot: Annotated[str, typer.Argument(help="Which one, if several have an agent on this machine.")] = "",
     port: Annotated[
         int, typer.Option(min=1, max=65_535, envvar="SKYTETHER_STATUS_PORT", help="status_port of robot.yaml.")
     ] = 8610,
@@ -23,23 +25,53 @@ def status(
 ) -> None:
     """Show who drives this robot and why, where its service runs, and what the link is like.
 
-    Asks the agent on this machine (`skytether robot run`), not the orchestrator.
+    Asks the agent on this machine (`skytether robot run`), not the orchestrator. An agent whose port was taken
+    listens on one of the next; it is found there by the robot's name.
     """
+    found = _of(robot, port) if robot else _ask(port)
+    if found is None:
+        who = f"agent of robot {robot}" if robot else "agent"
+        fail(f"no {who} answers on port {port} of this machine; start one with `skytether robot run robot.yaml`")
+    if json:
+        print_json(found)
+        return
+    try:
+        tables = _tables(found)
+    except (ValueError, KeyError, TypeError):
+        fail(_NO_AGENT.format(port))
+    for table in tables:
+        print_whole(table)
+
+
+def _of(robot: str, port: int) -> dict[str, Any] | None:
+    """What the agent of a robot says."""
+    from skytether.robot.status import ports
+
+    for one in ports(port):
+        try:
+            found = _ask(one)
+        except typer.Exit:  # something else has that port
+            continue
+        if found is not None and found.get("robot") == robot:
+            return found
+    return None
+
+
+def _ask(port: int) -> dict[str, Any] | None:
+    """What the agent at a port says; None: nobody answers."""
     import httpx
 
     try:
         answer = httpx.get(f"http://127.0.0.1:{port}/status", timeout=_TIMEOUT_S, trust_env=False)
         answer.raise_for_status()
         found = answer.json()
-        if json:
-            print_json(found)
-            return
-        for table in _tables(found):
-            console.print(table)
     except (httpx.TransportError, OSError):
-        fail(f"no agent answers on port {port} of this machine; start one with `skytether robot run robot.yaml`")
-    except (httpx.HTTPStatusError, ValueError, KeyError, TypeError):
-        fail(f"what answers on port {port} of this machine is no agent; give its status_port with --port")
+        return None
+    except (httpx.HTTPStatusError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        fail(_NO_AGENT.format(port))
+    return found
 
 
 def _tables(found: dict[str, Any]) -> list[Table]:

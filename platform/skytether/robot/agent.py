@@ -97,7 +97,8 @@ class AgentConfig:
         task: How it is decided whether to ask, and for which site; None: the service is asked for always, at whatever
             site the orchestrator chooses by ``measurements``.
         fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
-        status_port: Port on loopback of ``/status`` and ``/metrics``; 0: any free one; None: there are none.
+        status_port: Port on loopback of ``/status`` and ``/metrics``, the next if it is taken; 0: any free one; None:
+            there are none.
         gate: Folder of the gate before the wheels; None: there is none.
         stop_from_afar: Whether the orchestrator may stop the robot, by the gate.
         route: Where to send what is meant for the service's address; for experiments with an emulated link.
@@ -314,6 +315,15 @@ class Agent:
             )
         except OSError as error:  # somebody else has the port; that is no reason not to drive
             _log.error("no status on port %d of loopback: %s", config.status_port, error.strerror)
+            return
+        if config.status_port not in (0, self._server.port):
+            _log.warning(
+                "port %d of loopback is taken, so the status of robot %s is on port %d: skytether robot status %s",
+                config.status_port,
+                config.robot,
+                self._server.port,
+                config.robot,
+            )
 
     def tick(self, now: float, boot: float | None = None) -> None:
         """One turn of the control loop; called by its thread, or by a test with made-up time."""

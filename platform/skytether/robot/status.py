@@ -5,6 +5,7 @@ On loopback only: there is no password, and nothing in it is secret or changes a
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import socket
@@ -28,6 +29,8 @@ from .task_manager import Decision, Option
 _log = logging.getLogger(__name__)
 
 DEFAULT_PORT = 8610
+PORTS = 16
+"""Tried one after the other, the configured one first: there may be several robots on a machine."""
 _LOOPBACK = "127.0.0.1"
 _PATIENCE_S = 2.0
 """For one request, from its first byte to the last of its answer."""
@@ -110,10 +113,10 @@ class StatusServer:
     """
 
     def __init__(self, port: int, status: Callable[[], dict[str, Any]], metrics: Callable[[], bytes]) -> None:
-        """Bind and begin.
+        """Bind and begin, at the first of `ports` that is free.
 
         Raises:
-            OSError: The port is taken.
+            OSError: None is.
         """
         answers: dict[str, Callable[[], tuple[str, bytes]]] = {
             "/status": lambda: ("application/json", json.dumps(status(), allow_nan=False).encode()),
@@ -123,7 +126,7 @@ class StatusServer:
         class Handler(_Handler):
             pages = answers
 
-        self._server = _Server((_LOOPBACK, port), Handler)
+        self._server = _bound(port, Handler)
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="status", daemon=True)
         self._thread.start()
@@ -133,6 +136,22 @@ class StatusServer:
         self._server.shutdown()
         self._thread.join(_PATIENCE_S)
         self._server.server_close()
+
+
+def ports(first: int) -> range:
+    """Where the agent listens that was told this one: there, or as near above as is free; 0 is any free one."""
+    return range(first, min(first + PORTS, 65_536)) if first else range(1)
+
+
+def _bound(port: int, handler: type[_Handler]) -> _Server:
+    *earlier, last = ports(port)
+    for one in earlier:
+        try:
+            return _Server((_LOOPBACK, one), handler)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+    return _Server((_LOOPBACK, last), handler)
 
 
 class _Server(ThreadingMixIn, HTTPServer):

@@ -49,6 +49,8 @@ WINDOW = 20
 """Probes of a site that count: the newest."""
 LEAST = 3
 """Probes before a site counts as measured."""
+OWN_CONTROLLER = "own controller"
+"""What the robot's own controller is called beside the sites, of which one may well be ``local``."""
 
 
 class Mode(StrEnum):
@@ -195,8 +197,8 @@ class Option:
 
     @property
     def name(self) -> str:
-        """For people."""
-        return self.site or "local"
+        """For people; no site can be called like the robot's own controller."""
+        return self.site or OWN_CONTROLLER
 
     def describe(self) -> str:
         """Cost and parts, or why not."""
