@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from skytether.bridge.echo import EchoServer
 from skytether.cli.app import app
 from skytether.lab.netns import Namespace
-from skytether.robot import examine
+from skytether.robot.diagnosis import examine
 
 ROBOT, SITE = "10.0.7.2", "10.0.7.1"
 

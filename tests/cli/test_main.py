@@ -17,9 +17,9 @@ from skytether.cli.app import app
 from skytether.cli.demo import _told
 from skytether.cli.output import SafeConsole, log_to_console, print_foreign, print_table
 from skytether.cli.robot_check import Finding, show
-from skytether.robot.arbiter import Reason
-from skytether.robot.command import Source
-from skytether.robot.driver import Transition
+from skytether.robot.control.arbiter import Reason
+from skytether.robot.control.command import Source
+from skytether.robot.control.control_loop import Transition
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
 from skytether.cli import replay as command
-from skytether.robot.replay import ReplayConfig, ReplayResult, TopicResult
+from skytether.robot.replay.replay import ReplayConfig, ReplayResult, TopicResult
 
 app = typer.Typer()
 app.command()(command.replay)

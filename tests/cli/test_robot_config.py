@@ -3,7 +3,7 @@ import pytest
 from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
 from skytether.cli.robot_config import DEFAULT_MASTER, load_config, load_token
-from skytether.robot.arbiter import Needs
+from skytether.robot.control.arbiter import Needs
 from skytether.ros.permissions import Allowed
 
 LEAST = """

@@ -15,9 +15,9 @@ import pytest
 
 from skytether.api.client import Client
 from skytether.lab.demo import ROBOT, Demo, DemoSettings
-from skytether.robot.arbiter import Reason
-from skytether.robot.command import Source
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.arbiter import Reason
+from skytether.robot.control.command import Source
+from skytether.robot.control.supervisor import Limits
 
 pytestmark = pytest.mark.slow
 

@@ -32,8 +32,8 @@ from skytether.lab.demo import WalkerBase
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.orchestrator import db
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Source
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Source
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.postgres]
 

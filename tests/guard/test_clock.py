@@ -5,7 +5,7 @@ import time
 import pytest
 
 from skytether.guard import clock
-from skytether.robot import stall
+from skytether.robot.control import stall
 
 
 @pytest.fixture

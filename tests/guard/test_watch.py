@@ -22,9 +22,8 @@ from skytether.guard.systemd import Systemd
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.messages import Twist, Vector3, decode
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety import protocol
-from skytether.robot.safety.sources import Hand
 
 BOUNDS = Bounds(0.25, 0.0, 0.5, 1.0, 2.0, 2.0, 4.0)
 PERIOD, PATIENCE = 0.02, 0.1

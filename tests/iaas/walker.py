@@ -13,8 +13,8 @@ from itertools import groupby
 from skytether.lab.demo import WalkerBase
 from skytether.lab.trail import Trail
 from skytether.lab.walk import STEP, World
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Source
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Source
 
 
 def main(url: str, token: str, patience_s: float) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from skytether.lab.bench import fleet, fleet_robot
 from skytether.lab.bench.fleet import LEAST_ROBOTS, bench_fleet
-from skytether.robot.snapshot import report
+from skytether.robot.agent.snapshot import report
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ from skytether.messages import (
     encode,
     quaternion_from_yaw,
 )
-from skytether.robot.bag import BagError
+from skytether.robot.replay.bag import BagError
 
 PERIOD = 0.1
 MOUNT = (-0.2, 0.05, math.pi)

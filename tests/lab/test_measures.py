@@ -6,7 +6,7 @@ import pytest
 
 from skytether.lab.measures import Judge, Sample, kinematic_tracking_error, measure
 from skytether.lab.trail import Trail
-from skytether.robot.command import Source
+from skytether.robot.control.command import Source
 
 STRAIGHT = Trail([{"length": 4.0}])
 

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 from skytether.lab.measures import Sample
 from skytether.lab.plot import plot_walk
 from skytether.lab.trail import Trail
-from skytether.robot.command import Source
+from skytether.robot.control.command import Source
 
 
 def colours(file: Path) -> set[int]:

@@ -17,8 +17,8 @@ from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Source
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Source
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 

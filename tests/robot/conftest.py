@@ -8,7 +8,7 @@ import pytest
 from skytether.api.client import ApiError
 from skytether.api.rest import Instance, InstanceCreate, Problem, Renew, Session, State
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
-from skytether.robot.session import LiveSession
+from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
 from skytether.wire.stats import SessionStats
 

@@ -9,11 +9,11 @@ from skytether.lab.measures import measure
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.messages import Twist, Vector3, encode
-from skytether.robot.arbiter import Needs
-from skytether.robot.command import Source
-from skytether.robot.driver import Driver
-from skytether.robot.session import LiveSession
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.command import Source
+from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.supervisor import Limits
+from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, Disconnected, MessageReceived
 from skytether_services.virtual_trail.fallback import HoldTrail
 

@@ -20,12 +20,11 @@ from skytether.guard.teller import repeat_s
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.messages import Header, LaserScan, Time
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.footprint import Points
 from skytether.robot.safety.heartbeat import differs
 from skytether.robot.safety.rules import Gate
-from skytether.robot.safety.sources import Hand
 
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""

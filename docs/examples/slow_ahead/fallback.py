@@ -6,7 +6,7 @@ import numpy as np
 
 from skytether.control.admittance import Velocity
 from skytether.messages import LaserScan
-from skytether.robot.fallback import Reading
+from skytether.robot.control.fallback import Reading
 
 
 class SlowAhead:

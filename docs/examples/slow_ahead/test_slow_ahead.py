@@ -5,7 +5,7 @@ import pytest
 
 from skytether.control.admittance import Velocity
 from skytether.messages import LaserScan
-from skytether.robot.fallback import Reading
+from skytether.robot.control.fallback import Reading
 from slow_ahead.fallback import SlowAhead
 
 STILL = Velocity(0.0, 0.0)

@@ -24,9 +24,9 @@ def commission(
     numbers to configure, and the enable signal. End the gate before: no sensor looks where the robot goes meanwhile.
     Questions are on standard error, answers are lines of standard input, the JSON record goes to standard output.
     """
+    from skytether.robot.control.supervisor import Limits
     from skytether.robot.safety.commission import Commission, CommissionError, Plan, Step
     from skytether.robot.safety.rig import HardwareRig
-    from skytether.robot.supervisor import Limits
 
     from .config_file import ConfigError
     from .gate_config import load_safety

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from skytether.lab.demo import Demo, DemoResult
-    from skytether.robot.driver import Transition
+    from skytether.robot.control.control_loop import Transition
 
 
 def demo(
@@ -61,8 +61,8 @@ def _walk(running: Demo) -> DemoResult:
     """Show how it goes while it goes."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from skytether.robot import driver as robot_driver
-    from skytether.robot.snapshot import AgentStatus
+    from skytether.robot.agent.snapshot import AgentStatus
+    from skytether.robot.control import control_loop as robot_driver
 
     handed_over = 0.0
     columns = (

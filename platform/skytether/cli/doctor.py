@@ -14,7 +14,7 @@ from .connection import Json, transport
 from .output import console, fail, print_json
 
 if TYPE_CHECKING:
-    from skytether.robot.doctor import Finding
+    from skytether.robot.diagnosis.doctor import Finding
 
     from .robot_config import RobotConfig
 
@@ -65,7 +65,7 @@ def doctor(
 
 def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str | None) -> Iterator[Finding]:
     from skytether.api.client import addresses
-    from skytether.robot import examine
+    from skytether.robot.diagnosis import examine
 
     from .config_file import ConfigError
     from .robot_config import load_config, load_token
@@ -106,7 +106,7 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
 
 def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
     """The ROS 1 graph: its master, and the types of what the service takes and gives."""
-    from skytether.robot.doctor import Finding
+    from skytether.robot.diagnosis.doctor import Finding
     from skytether.ros.ros1.master import MasterError, call
     from skytether.ros.ros1.node import Node, NodeError
 
@@ -145,7 +145,7 @@ def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
 
 def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
     """The ROS 2 graph: its router, and the types of what the service takes and gives."""
-    from skytether.robot.doctor import Finding
+    from skytether.robot.diagnosis.doctor import Finding
 
     from .config_file import ConfigError
     from .ros2_config import need_extra
@@ -172,7 +172,7 @@ def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
 
 
 def _trouble(check: str, says: str, todo: str) -> Finding:
-    from skytether.robot.doctor import Finding
+    from skytether.robot.diagnosis.doctor import Finding
 
     return Finding(check, "trouble", says, todo)
 

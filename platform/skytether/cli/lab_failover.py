@@ -31,10 +31,10 @@ def failover(
 
     from skytether.lab.bench.failover import RATES_HZ, bench_failover
     from skytether.lab.bench.pair import BenchError
-    from skytether.robot import driver
+    from skytether.robot.control import control_loop
 
     try:
-        with silenced(driver.__name__), console.status("starting ...") as line:
+        with silenced(control_loop.__name__), console.status("starting ...") as line:
             rows = bench_failover(rate or RATES_HZ, n, seed, lambda r, i: line.update(f"{r:g} Hz: cut {i} of {n}"))
     except ValueError as error:
         fail(str(error), 2)
@@ -81,11 +81,11 @@ def alarms(
     from skytether.lab.bench.alarms import bench_alarms
     from skytether.lab.bench.failover import RATES_HZ
     from skytether.lab.bench.pair import BenchError
-    from skytether.robot import driver
+    from skytether.robot.control import control_loop
 
     programs = os.cpu_count() or 1 if busy is None else busy
     try:
-        with silenced(driver.__name__), console.status("starting ...") as line:
+        with silenced(control_loop.__name__), console.status("starting ...") as line:
             rows = bench_alarms(
                 rate or RATES_HZ,
                 seconds,

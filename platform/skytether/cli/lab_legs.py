@@ -29,7 +29,7 @@ def legs(
     """
     from skytether.lab.bench.legs import bench_legs
     from skytether.lab.bench.navigation import NavigationBenchError
-    from skytether.robot.bag import BagError
+    from skytether.robot.replay.bag import BagError
 
     try:
         with console.status("reading ..."):

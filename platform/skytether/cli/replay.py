@@ -14,7 +14,7 @@ from .output import SafeConsole, cell, console, fail, print_json, print_whole
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
-    from skytether.robot.replay import ReplayConfig, ReplayResult
+    from skytether.robot.replay.replay import ReplayConfig, ReplayResult
 
 
 def replay(
@@ -42,8 +42,8 @@ def replay(
     """
     from skytether.api.client import ApiError, Unreachable
     from skytether.lab.embedded import EmbeddedError
-    from skytether.robot.bag import BagError
-    from skytether.robot.replay import ReplayConfig, ReplayError
+    from skytether.robot.replay.bag import BagError
+    from skytether.robot.replay.replay import ReplayConfig, ReplayError
 
     topics = tuple(topic) if topic else None
     config = ReplayConfig(bag, robot, service, topics=topics, remap=_remappings(remap or []), speed=speed)
@@ -71,7 +71,7 @@ def _with_own_orchestrator(config: ReplayConfig, output: Path) -> tuple[ReplayRe
     """Start an orchestrator, replay, and keep what the service wrote."""
     from skytether.api.client import Client
     from skytether.lab.embedded import EmbeddedOrchestrator
-    from skytether.robot.bag import Bag
+    from skytether.robot.replay.bag import Bag
 
     Bag(config.bag).close()  # what is wrong with the recording is told before anything is started
     output.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def _stream(config: ReplayConfig, client: Client) -> ReplayResult:
     """Replay with a bar on standard error."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from skytether.robot import replay
+    from skytether.robot.replay import replay
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

@@ -13,10 +13,10 @@ from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
 from skytether.guard.record import lost_at_reboot
 from skytether.messages import hash_of
-from skytether.robot.ros1 import Ros1RobotConfig
+from skytether.robot.graphs.ros1 import Ros1RobotConfig
+from skytether.robot.graphs.wheels_watch import sentence, strangers
 from skytether.robot.safety.client import GateError, ask, listens
-from skytether.robot.table import spoken
-from skytether.robot.wheels_watch import sentence, strangers
+from skytether.robot.session.topic_table import spoken
 from skytether.ros.names import Names, resolve
 from skytether.ros.permissions import Permissions, refused
 from skytether.ros.ros1.master import MasterError

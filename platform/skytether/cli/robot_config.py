@@ -14,15 +14,15 @@ from skytether.api.manifest import Name, Strict
 from skytether.api.plain import oddity
 from skytether.api.plain_http import is_readable_on_the_way
 from skytether.messages import type_of
-from skytether.robot.arbiter import Needs
-from skytether.robot.graph_base import protected_names as graph_names
+from skytether.robot.agent.status import DEFAULT_PORT
+from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.supervisor import Limits
+from skytether.robot.graphs.graph_base import protected_names as graph_names
+from skytether.robot.offload.task_manager import Mode, Policy
 from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
 from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
 from skytether.robot.safety.config_base import no_switches
 from skytether.robot.safety.protected import protected_names as safety_names
-from skytether.robot.status import DEFAULT_PORT
-from skytether.robot.supervisor import Limits
-from skytether.robot.task_manager import Mode, Policy
 from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
 from skytether.ros.permissions import Access, Allowed, Permissions
 
@@ -174,7 +174,7 @@ class CloudConfig(Strict):
 
 
 class TaskConfig(Strict):
-    """Local or offloaded, and to which site: weights and hysteresis of ``skytether.robot.task_manager.Policy``."""
+    """Local or offloaded, and to which site: weights and hysteresis of `offload.task_manager.Policy`."""
 
     mode: Literal["auto", "offload", "local"] = "auto"
     """``offload``: the service is asked for, always; ``local``: never; ``auto``: the costs decide."""
@@ -223,7 +223,7 @@ class RobotConfig(Strict):
     limits: dict[str, float] = {}
     beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
     """Limits that are meant to be beyond what is plausible: ``limits.NAME`` to reason."""
-    """What the wheels may do: fields of ``skytether.robot.supervisor.Limits``."""
+    """What the wheels may do: fields of ``skytether.robot.control.supervisor.Limits``."""
     needs: LinkNeeds = LinkNeeds()
     """What the link must be like at least."""
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0

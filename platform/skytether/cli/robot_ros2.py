@@ -8,8 +8,8 @@ from pathlib import Path
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.messages import hash_of
-from skytether.robot.ros2 import Ros2Robot, Ros2RobotConfig
-from skytether.robot.table import spoken
+from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.session.topic_table import spoken
 from skytether.ros.names import Names
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches

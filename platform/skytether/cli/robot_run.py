@@ -17,10 +17,10 @@ from .never_wait import never_wait
 from .output import console, fail
 
 if TYPE_CHECKING:
-    from skytether.robot.agent import AgentConfig
-    from skytether.robot.driver import Base
-    from skytether.robot.ros1 import Ros1RobotConfig
-    from skytether.robot.snapshot import AgentStatus
+    from skytether.robot.agent.agent import AgentConfig
+    from skytether.robot.agent.snapshot import AgentStatus
+    from skytether.robot.control.control_loop import Base
+    from skytether.robot.graphs.ros1 import Ros1RobotConfig
     from skytether.ros.ros1.node import Node
 
     from .robot_config import RobotConfig, Ros1Config, Ros2Config
@@ -73,9 +73,9 @@ def run(
 
 
 def _run(settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, seconds: float | None) -> None:
-    from skytether.robot.agent import Agent
-    from skytether.robot.fallback import FallbackError
-    from skytether.robot.ros1 import Ros1Robot
+    from skytether.robot.agent.agent import Agent
+    from skytether.robot.control.fallback import FallbackError
+    from skytether.robot.graphs.ros1 import Ros1Robot
 
     from .robot_gate import gate
 
@@ -103,8 +103,8 @@ def _run_ros2(
     Raises:
         ConfigError: The graph cannot be joined as it is configured.
     """
-    from skytether.robot.agent import Agent
-    from skytether.robot.fallback import FallbackError
+    from skytether.robot.agent.agent import Agent
+    from skytether.robot.control.fallback import FallbackError
 
     from .robot_gate import gate
     from .ros2_config import need_extra
@@ -130,7 +130,7 @@ def _base(settings: RobotConfig, graph: Base) -> Base:
     """The wheels: behind the gate if there is one, else a topic of the graph."""
     if settings.safety is None:
         return graph
-    from skytether.robot.safety.base import GatedBase
+    from skytether.robot.agent.gated_hardware import GatedBase
     from skytether.robot.safety.client import GateLink
 
     return GatedBase(graph, GateLink(settings.safety.place()))
@@ -194,9 +194,9 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         token: The robot's, as it is now.
     """
     from skytether.bridge.interfaces import LocalPath, Wanted
-    from skytether.robot.agent import AgentConfig
-    from skytether.robot.supervisor import Limits
-    from skytether.robot.tasks import TaskConfig
+    from skytether.robot.agent.agent import AgentConfig
+    from skytether.robot.control.supervisor import Limits
+    from skytether.robot.offload.site_prober import TaskConfig
 
     from .robot_config import load_token
 
@@ -232,8 +232,8 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
 
 def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
     """What the graph needs of the configuration."""
-    from skytether.robot.ros1 import Ros1RobotConfig
-    from skytether.robot.supervisor import Limits
+    from skytether.robot.control.supervisor import Limits
+    from skytether.robot.graphs.ros1 import Ros1RobotConfig
 
     return Ros1RobotConfig(
         robot=settings.robot,

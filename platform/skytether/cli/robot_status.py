@@ -45,7 +45,7 @@ def status(
 
 def _of(robot: str, port: int) -> dict[str, Any] | None:
     """What the agent of a robot says."""
-    from skytether.robot.status import ports
+    from skytether.robot.agent.status import ports
 
     for one in ports(port):
         try:

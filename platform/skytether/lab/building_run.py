@@ -21,7 +21,7 @@ import yaml
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.messages import String, Twist, decode
-from skytether.robot.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent, AgentConfig
 
 from .embedded import EmbeddedOrchestrator
 from .nine_goals import LIMITS, ROBOT, SERVICE

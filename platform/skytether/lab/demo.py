@@ -18,9 +18,9 @@ from pathlib import Path
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
 from skytether.messages import JointState, Message, Odometry, Twist, WrenchStamped
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Source
-from skytether.robot.snapshot import AgentStatus
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.snapshot import AgentStatus
+from skytether.robot.control.command import Source
 from skytether.wire.stats import TopicStats
 
 from .embedded import EmbeddedOrchestrator

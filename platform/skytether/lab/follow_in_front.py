@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.messages import Header, Message, Point32, PointCloud, Range
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .follow_in_front_report import IMAGE, LASER, POSE, SCAN, SONAR
 from .follow_in_front_result import FollowResult, FollowTraces

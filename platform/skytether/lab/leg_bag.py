@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.messages import DecodeError, LaserScan, Odometry, Quaternion, TFMessage, decode
-from skytether.robot.bag import Bag, BagError, BagTopic
+from skytether.robot.replay.bag import Bag, BagError, BagTopic
 
 Floats = NDArray[np.float64]
 

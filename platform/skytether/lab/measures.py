@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.robot.command import Source
+from skytether.robot.control.command import Source
 
 from .trail import Progress, Trail
 

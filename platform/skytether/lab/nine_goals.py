@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.messages import Path, decode
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .nine_goals_result import NineGoalsResult, NineGoalsTraces
 from .trial.results import Measured, Point, rounded

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from skytether.robot.command import Source
+from skytether.robot.control.command import Source
 
 from .measures import Sample
 from .trail import Trail

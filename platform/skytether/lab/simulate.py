@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from skytether.messages import Message, Twist
-from skytether.robot.command import Source
+from skytether.robot.control.command import Source
 
 from .measures import Sample
 from .walk import STEP, World

@@ -1,6 +1,13 @@
 """The robot's side: who drives, the last gate before the wheels, and the agent that asks for services.
 
-What decides is pure and takes the time as an argument (`supervisor`, `arbiter`, `fallback`, `link`, `table`);
-what does is thin (`agent`, `asker`, `replay`). Everything here runs on the robot and works with the cable pulled.
-No simulation, no service, no server code belongs here.
+Everything here runs on the robot and works with the cable pulled. No simulation, no service, no server code belongs
+here. Rooms import from those below only (contract "Rooms of the robot")::
+
+    replay                        recordings sent as a robot would
+    agent | diagnosis             the program on the robot | what the doctor looks at
+    safety                        the gate: the last thing before the wheels
+    graphs                        ROS 1, ROS 2
+    control | offload             who drives, how fast | whether and where the service runs
+    session                       one bridge session
+    log_throttle
 """

@@ -7,10 +7,10 @@ from skytether.lab.world.agent import CATCH_UP, Clockwork, WorldBase, WorldGraph
 from skytether.lab.world.plan import building
 from skytether.lab.world.simulation import TICK, Simulation
 from skytether.messages import LaserScan, String, Twist, Vector3, decode, encode
-from skytether.robot.arbiter import Needs
-from skytether.robot.driver import Driver
-from skytether.robot.fallback import Stop
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.fallback import Stop
+from skytether.robot.control.supervisor import Limits
 from skytether.wire.events import MessageReceived
 
 MOVE = Twist(Vector3(x=0.4))

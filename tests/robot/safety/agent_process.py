@@ -5,8 +5,8 @@ import time
 from pathlib import Path
 
 from skytether.messages import Vector3, Wrench, WrenchStamped
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.safety.base import GatedBase
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.gated_hardware import GatedBase
 from skytether.robot.safety.client import GateLink
 
 

@@ -8,15 +8,14 @@ import pytest
 from depth_camera import Camera, Face, cloud_of, optical
 
 from skytether.messages import PointCloud2, Time
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.clouds import CloudMount
 from skytether.robot.safety.coverage import UnseenParams
 from skytether.robot.safety.footprint import polygon
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sensing import RangeSensor
-from skytether.robot.safety.sources import Hand
 from skytether.robot.safety.zones import Zone
-from skytether.robot.supervisor import Limits
 
 BOX = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
 LIMITS = Limits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)

@@ -4,8 +4,8 @@ import pytest
 from rig_wheels import Drives
 
 from skytether.guard.velocity import Velocity
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.commission import Commission, CommissionError, Plan, Step, Stop, fit
-from skytether.robot.supervisor import Limits
 
 LIMITS = Limits(linear_max=0.5, angular_max=1.0, linear_braking=1.0, angular_braking=2.0)
 TURN = 0.01

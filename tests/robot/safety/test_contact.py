@@ -4,12 +4,11 @@ from math import inf, nan
 import pytest
 
 from skytether.messages import Bool, Range, Twist
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.contact import ContactKind, ContactParams, Contacts, feels
 from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.rules import Gate, Rules
-from skytether.robot.safety.sources import Hand
 
 BUMPER = ContactParams()
 CLIFF = ContactParams(ContactKind.CLIFF, above_m=0.1)

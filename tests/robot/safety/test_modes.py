@@ -10,11 +10,10 @@ import yaml
 from skytether.cli.config_file import ConfigError
 from skytether.cli.gate_config import load_safety
 from skytether.messages import LaserScan, String
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.modes import Envelope, ModeRules, Modes
 from skytether.robot.safety.rules import Decision, Gate
-from skytether.robot.safety.sources import Hand
 
 SECTION = {
     "footprint": {"polygon": [[0.3, 0.2], [0.3, -0.2], [-0.3, -0.2], [-0.3, 0.2]]},

@@ -10,9 +10,9 @@ from played_wheels import Wheels, odometry
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Time, Twist, TwistStamped, Vector3
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.motion import Fault, Motion, MotionParams, Seen
 from skytether.robot.safety.stamps import StampRule
-from skytether.robot.supervisor import Limits
 
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
 PARAMS = MotionParams()

@@ -22,9 +22,9 @@ from skytether.api.client import Client
 from skytether.api.rest import GateReport, RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, Wrench, WrenchStamped, decode, encode
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.safety import afar
-from skytether.robot.safety.base import GatedBase
+from skytether.robot.agent import remote_stop
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.gated_hardware import GatedBase
 from skytether.robot.safety.client import GateError, GateLink, ask
 
 pytestmark = pytest.mark.slow
@@ -496,7 +496,7 @@ def test_a_robot_without_an_instance_is_stopped_from_afar_once(robot, tmp_path):
             Client(orchestrator.url, orchestrator.operator_token) as operator,
         ):
             robot.drives()
-            time.sleep(2 * afar.PERIOD_S)
+            time.sleep(2 * remote_stop.PERIOD_S)
             robot.drives()  # an orchestrator that is away stops nobody
             orchestrator.start()
             wait(lambda: "smoke in the hall" in robot.status()["stopped"], "the order to be obeyed", robot)
@@ -513,6 +513,6 @@ def test_a_robot_without_an_instance_is_stopped_from_afar_once(robot, tmp_path):
             ask(robot.folder, {"do": "reset"}, 30)
             robot.start()
             robot.drives()
-            time.sleep(2 * afar.PERIOD_S)
+            time.sleep(2 * remote_stop.PERIOD_S)
             robot.drives()
             assert robot.status()["stopped"] == ""

@@ -8,14 +8,14 @@ from played_wheels import Wheels, odometry
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.motion import MotionParams
 from skytether.robot.safety.real_motion import Handover, OdometryRules
 from skytether.robot.safety.rules import Decision, Gate, Rules
-from skytether.robot.safety.sources import Hand, SourceParams, SourceRules
-from skytether.robot.supervisor import Limits
+from skytether.robot.safety.sources import SourceParams, SourceRules
 
 TURN = 0.02
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0, period_s=TURN, max_step_s=0.1)

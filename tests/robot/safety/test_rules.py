@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Time, Twist
-from skytether.robot.command import Command
-from skytether.robot.notices import Notices
+from skytether.robot.control.command import Command, Hand
+from skytether.robot.control.supervisor import Limits, Objection
+from skytether.robot.log_throttle import Notices
 from skytether.robot.safety.coverage import Action
 from skytether.robot.safety.footprint import Points, polygon
 from skytether.robot.safety.joystick import JoystickParams
@@ -21,9 +22,8 @@ from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.ranges import Mount
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sensing import RangeSensor
-from skytether.robot.safety.sources import Hand, SourceRules
+from skytether.robot.safety.sources import SourceRules
 from skytether.robot.safety.zones import Zone, ZoneParams
-from skytether.robot.supervisor import Limits, Objection
 
 FOOTPRINT = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)

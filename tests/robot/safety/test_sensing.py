@@ -10,15 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.messages import Header, LaserScan, Time
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import polygon
 from skytether.robot.safety.ranges import Mount
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sensing import RangeSensor
-from skytether.robot.safety.sources import Hand
 from skytether.robot.safety.zones import Zone
-from skytether.robot.supervisor import Limits
 
 BOX = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
 LIMITS = Limits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)

@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, Time, Twist, TwistStamped, Vector3
-from skytether.robot import neutral
-from skytether.robot.command import Command
-from skytether.robot.neutral import NEUTRAL_S
+from skytether.robot.control import restart_interlock
+from skytether.robot.control.command import Command, Hand
+from skytether.robot.control.restart_interlock import NEUTRAL_S
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety import joystick
 from skytether.robot.safety.coverage import Action, UnseenParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.joystick import RELEASED_S, Grip, Joystick, JoystickParams
 from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.rules import Decision, Gate, Rules
-from skytether.robot.safety.sources import Hand, LockParams, OnSilence, SourceParams, SourceRules
-from skytether.robot.supervisor import Limits
+from skytether.robot.safety.sources import LockParams, OnSilence, SourceParams, SourceRules
 
 PERIOD = 0.01
 TIMEOUT = 0.5
@@ -218,7 +218,7 @@ def test_a_button_that_is_down_at_the_start_holds_the_robot_until_it_is_let_go()
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.0005, 0.0, 0.2]), st.sampled_from([0.02, 0.06, 0.1, 0.3, 0.6]))))
 def test_a_source_is_neutral_when_it_said_nothing_else_for_long_enough(wants):
     """The oracle looks back from each message: how much of the time since the last other one, or silence, was said."""
-    state, now, heard, free = neutral.require("a reset"), 10.0, [], False
+    state, now, heard, free = restart_interlock.require("a reset"), 10.0, [], False
     for value, then in wants:
         now += then
         if abs(value) > 0.001 or then > TIMEOUT:
@@ -226,36 +226,36 @@ def test_a_source_is_neutral_when_it_said_nothing_else_for_long_enough(wants):
         if abs(value) <= 0.001:
             heard.append(now)
         free = free or sum(min(0.1, later - earlier) for earlier, later in pairwise(heard)) >= NEUTRAL_S - 1e-6
-        state = neutral.want(state, Velocity(value, 0.0), now, TIMEOUT)
+        state = restart_interlock.want(state, Velocity(value, 0.0), now, TIMEOUT)
         assert (not state.why) is free
 
 
 @pytest.mark.parametrize(("rate_hz", "messages"), [(50, 11), (20, 5), (10, 3), (5, 3), (2.5, 3)])
 def test_how_many_messages_make_a_source_neutral(rate_hz, messages):
-    state = neutral.require("a reset")
+    state = restart_interlock.require("a reset")
     for k in range(messages):
         assert state.why
-        state = neutral.want(state, STANDSTILL, 10.0 + k / rate_hz, TIMEOUT)
+        state = restart_interlock.want(state, STANDSTILL, 10.0 + k / rate_hz, TIMEOUT)
     assert not state.why
 
 
 def test_a_standstill_that_nobody_wants_is_not_neutral():
     """An agent that hung, or whose service is not heard, says it for want of a better word."""
-    state = neutral.require("a reset")
+    state = restart_interlock.require("a reset")
     for turn in range(100):
-        state = neutral.want(state, STANDSTILL, 10.0 + 0.02 * turn, TIMEOUT, decided=False)
+        state = restart_interlock.want(state, STANDSTILL, 10.0 + 0.02 * turn, TIMEOUT, decided=False)
         assert state.why
     for at, decided in ((20.0, True), (20.1, False), (20.15, True), (20.25, True)):
-        state = neutral.want(state, STANDSTILL, at, TIMEOUT, decided)
+        state = restart_interlock.want(state, STANDSTILL, at, TIMEOUT, decided)
         assert state.why
-    assert not neutral.want(state, STANDSTILL, 20.35, TIMEOUT).why
+    assert not restart_interlock.want(state, STANDSTILL, 20.35, TIMEOUT).why
 
 
 @pytest.mark.parametrize("now", [inf, -inf, nan])
 def test_a_clock_that_is_no_number_makes_nobody_neutral(now):
-    state = neutral.require("a reset")
+    state = restart_interlock.require("a reset")
     for when in (10.0, 10.09, now, now, 10.09, now):
-        state = neutral.want(state, STANDSTILL, when, TIMEOUT)
+        state = restart_interlock.want(state, STANDSTILL, when, TIMEOUT)
         assert state.why
     up, _ = joystick.hear(PAD, Joystick(), joy(0.0, 0.0, held=False), 10.0)
     assert joystick.hear(PAD, up, joy(1.0, 0.0), now)[0].grip is not Grip.HELD

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.dead_reckoning import Variation
 from skytether.robot.safety.footprint import polygon
 from skytether.robot.safety.stopping import Stages
 from skytether.robot.safety.zones import Zone, ZoneParams, Zones
-from skytether.robot.supervisor import Limits
 
 # A square of 1 m; room of 0.1 m; braking 2 m/s^2 and 4 rad/s^2.
 SQUARE = polygon([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])

@@ -7,7 +7,7 @@ import pytest
 from ros1_graph import wait_for
 
 from skytether.messages import Twist, decode, type_hash
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]

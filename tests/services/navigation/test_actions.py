@@ -29,7 +29,7 @@ from skytether.messages import (
     TriggerRequest,
     Twist,
 )
-from skytether.robot.table import robot_table, spoken
+from skytether.robot.session.topic_table import robot_table, spoken
 from skytether.testing.actions import ActionClient
 from skytether.testing.drive import Drive
 from skytether.testing.service import Harness

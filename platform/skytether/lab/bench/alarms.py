@@ -16,10 +16,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from skytether.robot.agent import Agent
-from skytether.robot.arbiter import Reason
-from skytether.robot.command import Command, Source
-from skytether.robot.driver import DriverStatus
+from skytether.robot.agent.agent import Agent
+from skytether.robot.control.arbiter import Reason
+from skytether.robot.control.command import Command, Source
+from skytether.robot.control.control_loop import DriverStatus
 
 from .failover import LEARN_S, Granted, Wheels, bench_config, start_link, start_service, wait_for
 

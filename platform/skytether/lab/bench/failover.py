@@ -32,10 +32,10 @@ from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.lab.link import LinkConditions, LinkEmulator
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
-from skytether.robot.accrual import least_s
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Command, Source
-from skytether.robot.supervisor import Limits
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Command, Source
+from skytether.robot.control.failure_detector import least_s
+from skytether.robot.control.supervisor import Limits
 from skytether.wire.topic import Role
 
 from .pair import BenchError

@@ -23,7 +23,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from skytether.api.client import Client, Unreachable
 from skytether.api.rest import InstanceCreate, RobotCreate, SiteCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.robot.tally import COUNTERS
+from skytether.robot.session.counter_totals import COUNTERS
 
 from .fleet_robot import LEASE_S, MANIFEST, Series, SimulatedRobot
 from .observe import Spread, cpu_seconds, instance_of

@@ -14,9 +14,9 @@ from skytether.api.rest import Instance, InstanceCreate, Renew, Report, State
 from skytether.bridge.spec import SessionSpec
 from skytether.lab.link_model import LinkConditions
 from skytether.lab.lossy_link import LossyLink
-from skytether.robot.asker import Asker
-from skytether.robot.snapshot import report
-from skytether.robot.tally import COUNTERS, Tally
+from skytether.robot.agent.snapshot import report
+from skytether.robot.offload.lease_client import Asker
+from skytether.robot.session.counter_totals import COUNTERS, Tally
 from skytether.wire import Direction, Role, Session
 
 from .requests import sleeper

@@ -24,9 +24,9 @@ from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Command, Source
-from skytether.robot.supervisor import Objection
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Command, Source
+from skytether.robot.control.supervisor import Objection
 
 from .pair import BenchError
 

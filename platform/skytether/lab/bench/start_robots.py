@@ -18,9 +18,9 @@ from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.plan import building
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import String, decode
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.command import Command
-from skytether.robot.supervisor import Objection
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.command import Command
+from skytether.robot.control.supervisor import Objection
 
 
 @dataclass(slots=True)

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from skytether.control.admittance import AdmittanceParams
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.safety.base import GatedBase
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink
-from skytether.robot.supervisor import Limits
 
 from .robot import LIMITS
 

@@ -20,7 +20,7 @@ from math import inf, isfinite
 from typing import NamedTuple
 
 from skytether.guard.velocity import STANDSTILL, Velocity
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 _STRETCH_S = 0.5
 """Longest stretch over which a change of velocity is looked at: from full speed to standstill and more."""

@@ -20,10 +20,10 @@ from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.lab.bench.failover import Granted
 from skytether.messages import Message, Twist, Vector3, encode
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.safety.base import GatedBase
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink
-from skytether.robot.supervisor import Limits
 from skytether.wire.topic import Role
 
 from .robot import LIMITS

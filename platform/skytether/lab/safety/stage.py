@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from skytether.guard.clock import now
+from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateError
 from skytether.robot.safety.config import SafetyConfig
-from skytether.robot.supervisor import Limits
 
 from .checker import Demand, Finding, Violation, Wheels, check
 from .robot import PlayedRobot, StagingError

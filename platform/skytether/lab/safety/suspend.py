@@ -15,11 +15,10 @@ from skytether.guard.protocol import Beat
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Bool, LaserScan
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.heartbeat import differs
 from skytether.robot.safety.rules import Gate
-from skytether.robot.safety.sources import Hand
 
 from .attacks import Attacks
 from .checker import Demand, Finding, Told, Violation, check

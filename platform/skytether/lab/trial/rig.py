@@ -26,8 +26,8 @@ from skytether.lab.throttle import Throttle, children_of
 from skytether.lab.world.agent import Clockwork, Observer, WorldBase, WorldGraph
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import Message, String, Twist, decode
-from skytether.robot.agent import Agent, AgentConfig
-from skytether.robot.supervisor import Limits
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.control.supervisor import Limits
 
 from .results import Measured, TopicRow
 from .scenario import TrialSettings

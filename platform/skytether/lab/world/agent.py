@@ -1,6 +1,6 @@
 """A simulated robot as the robot agent sees one: a base that is read and written, and a graph of topics.
 
-`WorldBase` is for `skytether.robot.agent.Agent` what a base of ROS is: readings in, a velocity out, one tick of the
+`WorldBase` is for the robot's `Agent` what a base of ROS is: readings in, a velocity out, one tick of the
 control loop after the other. `WorldGraph` is what a graph of ROS is: bytes in and out by topic name, through the same
 `Port`; what a service publishes arrives here, what an experiment publishes (goals) goes to the service. Neither knows
 which service it is.
@@ -17,7 +17,7 @@ from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.local import LocalGraph
 from skytether.bridge.port import Port, Publisher
 from skytether.messages import Encoding, Message, Twist, encode, hash_of
-from skytether.robot.table import Offer, robot_table, spoken
+from skytether.robot.session.topic_table import Offer, robot_table, spoken
 from skytether.wire.events import Event, MessageReceived
 from skytether.wire.topic import Role, Topic
 
@@ -112,7 +112,7 @@ class WorldBase:
 
 
 class WorldGraph:
-    """A `skytether.robot.graph_base.Graph` in this process: what a ROS master is to a real robot.
+    """A `skytether.robot.graphs.graph_base.Graph` in this process: what a ROS master is to a real robot.
 
     Args:
         encoding: Of all its messages.

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
 from skytether.messages import Bool, Message, String
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 from skytether.ros.names import check_name, resolve
 
 from .address import address, numeric

@@ -30,10 +30,11 @@ from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Twist, warm
-from skytether.robot.notices import Notices
-from skytether.robot.wheels_watch import NOBODY, Others, WatchesWheels
-from skytether.robot.wheels_watch import sentence as sentence_of_others
+from skytether.robot.graphs.wheels_watch import NOBODY, Others, WatchesWheels
+from skytether.robot.graphs.wheels_watch import sentence as sentence_of_others
+from skytether.robot.log_throttle import Notices
 
+from ..control.command import Hand
 from .config import SafetyConfig
 from .control import Control
 from .display.feed import Feed
@@ -43,7 +44,6 @@ from .heartbeat import Heartbeat
 from .process import SWITCH_S, log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
 from .rules import Decision, Gate
-from .sources import Hand
 from .ways import open_sensors, open_wheels
 
 _log = logging.getLogger("skytether.gate")

@@ -1,6 +1,6 @@
 """From one velocity to the next, never faster than the robot may: slowing down on the way it is on. Pure.
 
-What a command may ask of the wheels is `skytether.robot.supervisor`'s; here is what a zone may ask of them. Only the
+What a command may ask of the wheels is the supervisor's business; here is what a zone may ask of them. Only the
 standard library is used, so that the guard can use it too.
 """
 
@@ -15,7 +15,7 @@ _ROUNDING = 1e-9
 
 
 class Rates(Protocol):
-    """How fast velocities may change; `skytether.robot.supervisor.Limits` has them [m/s^2, rad/s^2]."""
+    """How fast velocities may change; `skytether.robot.control.supervisor.Limits` has them [m/s^2, rad/s^2]."""
 
     @property
     def linear_acceleration(self) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import inf, nan
 
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .footprint import Footprint, polygon
 from .zones import ZoneParams

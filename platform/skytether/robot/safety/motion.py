@@ -22,7 +22,7 @@ from math import copysign, exp, inf, isfinite, nan
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Message, Odometry, Twist, TwistStamped
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .stamps import Stamp, StampRule, Stamps, date
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .coverage import Unseen, UnseenParams
 from .footprint import Footprint

@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from skytether.guard.velocity import Velocity
-from skytether.robot.command import Command
+from skytether.robot.control.command import Command
 
 _COMMAND = struct.Struct("<4sQQddd?")
 _MAGIC = b"SkG2"

@@ -7,7 +7,7 @@ from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Message
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from .coverage import Action
 from .motion import Motion, MotionParams

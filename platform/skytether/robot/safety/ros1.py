@@ -12,7 +12,7 @@ from functools import partial
 from skytether.control.admittance import Velocity
 from skytether.guard.clock import now as boottime
 from skytether.messages import Bool, MarkerArray, Message, Twist, Vector3, encode, hash_of
-from skytether.robot.wheels_watch import NOBODY, Others, WheelsWatch
+from skytether.robot.graphs.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener

@@ -11,7 +11,7 @@ from functools import partial
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
-from skytether.robot.wheels_watch import NOBODY, Others, WheelsWatch
+from skytether.robot.graphs.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
 from skytether.ros.ros2.node import Ros2Error, Ros2Node

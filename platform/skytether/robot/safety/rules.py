@@ -13,10 +13,11 @@ from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Message, String
-from skytether.robot import supervisor
-from skytether.robot.command import UNUSED_AXES, Command
-from skytether.robot.supervisor import Limits, Objection, Supervised
+from skytether.robot.control import supervisor
+from skytether.robot.control.command import UNUSED_AXES, Command
+from skytether.robot.control.supervisor import Limits, Objection, Supervised
 
+from ..control.command import Hand
 from . import kinematics as reach
 from .contact import ContactParams, Contacts
 from .coverage import Action, UnseenParams
@@ -26,7 +27,7 @@ from .modes import Envelope, ModeRules, Modes
 from .places import Places
 from .real_motion import OdometryRules, RealMotion
 from .sensing import RangeSensor, Sensing
-from .sources import Hand, SourceRules, Sources
+from .sources import SourceRules, Sources
 from .stopping import Stages
 from .zones import Allowed, Asked, Zone, ZoneParams
 

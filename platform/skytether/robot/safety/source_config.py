@@ -9,10 +9,11 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 
+from ..control.command import Hand
 from .config_base import Numbers, Topic
 from .joystick import JoystickParams
 from .latch import ButtonParams
-from .sources import Hand, LockParams, OnSilence, SourceParams, SourceRules
+from .sources import LockParams, OnSilence, SourceParams, SourceRules
 
 Priority = Annotated[int, Field(ge=0, le=255)]
 """As in twist_mux."""

@@ -14,10 +14,10 @@ from math import inf, isfinite, nan
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
-from skytether.robot import neutral
-from skytether.robot.command import Command, unused_axes
-from skytether.robot.neutral import Neutral
-from skytether.robot.supervisor import Limits, with_gap
+from skytether.robot.control import restart_interlock
+from skytether.robot.control.command import Command, Hand, unused_axes
+from skytether.robot.control.restart_interlock import Neutral
+from skytether.robot.control.supervisor import Limits, with_gap
 
 from . import joystick, latch
 from .joystick import Grip, Joystick, JoystickParams
@@ -26,14 +26,6 @@ from .stamps import StampRule, Stamps, date
 
 _STARTED = "the gate was started"
 _RESET = "the reset"
-
-
-class Hand(StrEnum):
-    """Who drives; a further source goes by its name."""
-
-    AGENT = "agent"
-    JOYSTICK = "joystick"
-    NOBODY = "nobody"
 
 
 class OnSilence(StrEnum):
@@ -144,7 +136,7 @@ class Sources:
         self._joystick = Joystick()
         self._latch = Latch(reason=stopped)
         self._locks: dict[str, tuple[bool, float]] = {}
-        wait = neutral.require(_STARTED)
+        wait = restart_interlock.require(_STARTED)
         self._sources: dict[str, _Source] = {Hand.AGENT: _Source(rules.agent_priority, limits.max_gap_s, wait)}
         for params in rules.further.values():
             self._sources[params.name] = _Source(params.priority, params.timeout_s, wait)
@@ -243,7 +235,7 @@ class Sources:
         source = self._sources.get(command.source)
         if source is not None:
             wanted = Velocity(command.linear, command.angular)
-            heard = neutral.want(source.neutral, wanted, now, source.timeout_s, command.decided)
+            heard = restart_interlock.want(source.neutral, wanted, now, source.timeout_s, command.decided)
             self._sources[command.source] = replace(source, wanted=wanted, heard_at=now, neutral=heard)
 
     def look(self, now: float, troubles: dict[str, str]) -> str:
@@ -283,8 +275,8 @@ class Sources:
                 return name
             if source.wanted != STANDSTILL:
                 troubles[f"{name}:neutral"] = (
-                    f"{name}: wants to move without having wanted a standstill for {neutral.NEUTRAL_S:g} s since"
-                    f" {source.neutral.why}; nothing moves by itself: `skytether robot start` lets it go on"
+                    f"{name}: wants to move without having wanted a standstill for {restart_interlock.NEUTRAL_S:g} s"
+                    f" since {source.neutral.why}; nothing moves by itself: `skytether robot start` lets it go on"
                 )
         if held >= floor and held > -inf:
             return Hand.JOYSTICK
@@ -345,7 +337,7 @@ class Sources:
         """All sources of a lower priority must be neutral before they drive again."""
         for name, source in self._sources.items():
             if source.priority < below:
-                self._sources[name] = replace(source, neutral=neutral.require(why), started=False)
+                self._sources[name] = replace(source, neutral=restart_interlock.require(why), started=False)
 
     def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> tuple[Command | None, str]:
         self._joystick, wrong = joystick.hear(params, self._joystick, message, now)

@@ -27,7 +27,7 @@ from skytether.guard.teller import Teller, repeat_s
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Twist, warm
-from skytether.robot.notices import Notices
+from skytether.robot.log_throttle import Notices
 
 from .config import SafetyConfig
 from .hardware import Wheels

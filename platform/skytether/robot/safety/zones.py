@@ -21,7 +21,7 @@ from pydantic import ConfigDict
 
 from skytether.control.admittance import Velocity
 from skytether.control.numbers import check_positive
-from skytether.robot.supervisor import Limits
+from skytether.robot.control.supervisor import Limits
 
 from . import kinematics
 from .dead_reckoning import Variation

@@ -23,8 +23,8 @@ from skytether.messages import (
     Quaternion,
     Vector3,
 )
+from skytether.robot.control.command import Hand
 from skytether.robot.safety.footprint import Footprint, Points
-from skytether.robot.safety.sources import Hand
 from skytether.robot.safety.sweep import boundary
 from skytether.robot.safety.zones import Zone
 

@@ -21,7 +21,7 @@ from skytether.guard.folder import Known
 from skytether.guard.mailbox import bind
 from skytether.guard.settings import thaw
 from skytether.messages import MarkerArray, Message, warm
-from skytether.robot.notices import Notices
+from skytether.robot.log_throttle import Notices
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.display_config import DisplayConfig
 from skytether.robot.safety.hardware import receive_known

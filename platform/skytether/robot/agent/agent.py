@@ -1,0 +1,587 @@
+"""The program on the robot: asks for a service, runs its end of the bridge, drives (Mello, thesis, figure 18(a)).
+
+Three threads that never wait for each other: the control loop at a fixed rate with absolute deadlines, the asker that
+speaks REST, and a watch on the bridge's counters. The bridge has its own, and so has the log. What is decided is
+decided in `driver`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
+from math import nan
+from pathlib import Path
+from random import Random
+from types import TracebackType
+from typing import Any
+
+from skytether.api import rest
+from skytether.api.client import Client
+from skytether.bridge import Bridge, BridgeError, SessionSpec
+from skytether.bridge.interfaces import Wanted
+from skytether.bridge.port import Port
+from skytether.bridge.spec import parse_id, parse_key
+from skytether.messages import Encoding, Message, Twist, type_hash, warm
+from skytether.wire.stats import SessionStats
+from skytether.wire.topic import Role
+
+from ..control import fallback, stall
+from ..control.arbiter import Needs
+from ..control.command import Source
+from ..control.control_loop import Base, Clocks, Driver, Observer
+from ..control.service_manager import ServiceManager, Terms, terms
+from ..control.supervisor import Limits
+from ..graphs.graph_base import Graph
+from ..graphs.wheels_watch import NOBODY, WatchesWheels
+from ..log_throttle import Notices
+from ..offload.lease_client import Asker, Orchestrator
+from ..offload.resolver import Resolver
+from ..offload.shared_topics import Serving, SharedTopics, Sharing
+from ..offload.site_prober import TaskConfig, Tasks
+from ..offload.task_manager import PathQuality, RobotView
+from ..session.counter_totals import Tally
+from ..session.link_quality import Quality
+from ..session.session import Endpoint, LiveSession
+from ..session.topic_table import Offer, robot_table, spoken
+from .gate_report import SaysGate
+from .gate_watch import GateWatch
+from .log_queue import log_queue
+from .remote_stop import StopFromAfar
+from .snapshot import AgentStatus, report
+from .status import StatusServer, document, metrics
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_ANSWER = 1 << 20
+"""Bytes of an answer of the orchestrator: a session of a thousand topics is less, and the control loop waits for no
+reader of more."""
+_WATCH_S = 0.1
+"""Between looks at the bridge's counters."""
+_JOIN_S = 2.0
+"""A thread that does not end by then is left behind; the wheels have been stopped before."""
+
+Address = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """One robot and the service it wants.
+
+    Attributes:
+        robot: Its name at the orchestrator.
+        url: The orchestrator's base address.
+        token: The robot's.
+        service: What it asks for.
+        params: The service's parameters.
+        measurements: What it measured towards the sites, by site.
+        fallback: Entry point of the group ``skytether.fallbacks``.
+        fallback_options: The fallback's.
+        limits: The supervisor's; from here only.
+        needs: The arbiter's patience, and what the link must be like at least. What a session says the service needs
+            (``needs.max_rtt_ms`` and ``needs.max_loss`` of its manifest) only tightens that.
+        command_topic: The service's topic (geometry_msgs/msg/Twist) that drives the robot.
+        rate_hz: Of the control loop.
+        lease_s: The instance ends when the robot was not heard of for this long.
+        renew_s: Between renewals, which carry the report.
+        request_timeout_s: Of each request to the orchestrator.
+        bind: Local address of the robot's end of the bridge; port 0: any.
+        paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
+        ca_file: PEM file of the authority of the orchestrator's certificate; none: the system's.
+        insecure_http: Whether plain http may leave this machine.
+        task: How it is decided whether to ask, and for which site; None: the service is asked for always, at whatever
+            site the orchestrator chooses by ``measurements``.
+        fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
+        status_port: Port on loopback of ``/status`` and ``/metrics``, the next if it is taken; 0: any free one; None:
+            there are none.
+        gate: Folder of the gate before the wheels; None: there is none.
+        stop_from_afar: Whether the orchestrator may stop the robot, by the gate.
+        route: Where to send what is meant for the service's address; for experiments with an emulated link.
+    """
+
+    robot: str
+    url: str
+    service: str
+    token: str = field(repr=False)
+    params: Mapping[str, Any] = field(default_factory=dict)
+    measurements: Mapping[str, rest.Measurement] = field(default_factory=dict)
+    fallback: str = "stop"
+    fallback_options: Mapping[str, Any] = field(default_factory=dict)
+    limits: Limits = field(default_factory=Limits)
+    needs: Needs = field(default_factory=Needs)
+    command_topic: str = "cmd_vel"
+    rate_hz: float = 100.0
+    lease_s: float = 15.0
+    renew_s: float = 2.0
+    request_timeout_s: float = 5.0
+    bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
+    paths: Wanted = ()
+    ca_file: str | None = None
+    insecure_http: bool = False
+    task: TaskConfig | None = None
+    fresh_token: Callable[[], str] | None = None
+    status_port: int | None = None
+    gate: Path | None = None
+    stop_from_afar: bool = False
+    route: Callable[[str, int], Address] = lambda host, port: (host, port)
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A session that is open, the instance that it is of, and what that is held to."""
+
+    session: LiveSession
+    instance: rest.Instance
+    terms: Terms
+    shared: SharedTopics
+
+
+MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
+"""Session, port, address to bind, address of the service."""
+
+
+class Agent:
+    """Drives one robot. A context manager: entering starts it, leaving stops wheels, threads, bridge and instance.
+
+    Args:
+        config: What to do.
+        base: The robot's hardware.
+        graph: The robot's graph, if it has one: what the service takes in and gives out then goes by it as bytes, all
+            but the command topic.
+        observer: Told each command from the cloud; must return at once.
+        client: The orchestrator; made from the configuration if not given.
+        bridge: Makes the robot's end of the bridge.
+        clock: Monotonic seconds; the bridge's must be the same.
+        clocks: The same clock, and one that goes on while the computer sleeps; without it `stall.clocks`, or with a
+            ``clock`` that is made up, that one alone.
+        random: For the jitter of the back-off.
+
+    Raises:
+        FallbackError: The fallback cannot be had.
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        base: Base,
+        *,
+        graph: Graph | None = None,
+        observer: Observer | None = None,
+        client: Orchestrator | None = None,
+        bridge: MakeBridge | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        clocks: Clocks | None = None,
+        random: Random | None = None,
+    ) -> None:
+        self._config = config
+        self._base = base
+        self._graph = graph
+        self._clock = clock
+        self._clocks = clocks or (stall.clocks if clock is time.monotonic else lambda: (self._clock(), None))
+        self._make_bridge = bridge or (
+            lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
+        )
+        local = fallback.load(config.fallback, config.fallback_options)
+        self._driver = Driver(base, local, config.limits, config.needs, clock(), observer, self._clocks)
+        self._own_client = (
+            None
+            if client
+            else Client(
+                config.url,
+                config.token,
+                timeout=config.request_timeout_s,
+                ca_file=config.ca_file,
+                insecure_http=config.insecure_http,
+                largest=_LARGEST_ANSWER,
+            )
+        )
+        speaks: Any = client or self._own_client
+        self._tasks = (
+            None
+            if config.task is None
+            else Tasks(config.task, speaks, config.service, drives=local.drives, clock=clock)
+        )
+        self._asker = Asker(
+            speaks,
+            self._request({}),
+            wanted=self._wanted,
+            elsewhere=self._elsewhere,
+            taken_over=self._taken_over,
+            on_stayed=self._stayed,
+            on_refused=self._another_token,
+            clock=clock,
+            on_instance=self._follow,
+            report=self.report,
+            healthy=lambda: self._driver.source is Source.CLOUD,
+            renew_s=config.renew_s,
+            random=random,
+        )
+        self._gate = None if config.gate is None else GateWatch(config.gate)
+        self._says_gate = (
+            None
+            if self._gate is None
+            else SaysGate(speaks, config.robot, self._gate.last, on_refused=self._another_token, clock=clock)
+        )
+        self._afar = (
+            StopFromAfar(speaks, config.robot, config.gate, clock=clock)
+            if config.gate is not None and config.stop_from_afar
+            else None
+        )
+        self._sharing = Sharing(speaks, self._shares, on_refused=self._another_token, clock=clock)
+        self._token = config.token
+        self._instance: rest.Instance | None = None
+        self._epochs = count(1)
+        self._manager: ServiceManager | None = None
+        self._open_sessions: dict[str, _Opened] = {}
+        """By session id."""
+        self._served = ""
+        """The session that the manager watches."""
+        self._left = ""
+        """The one before; its instance may still be told of."""
+        self._notices = Notices(_log)
+        self._resolver = Resolver()
+        self._stats: SessionStats | None = None
+        self._tally = Tally(uuid.uuid4().hex)
+        self._trouble = ""
+        self._asked_at: float | None = None
+        self._overruns = 0
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._server: StatusServer | None = None
+        self._logs = False
+
+    def start(self) -> None:
+        """Start driving and asking; returns at once. Until `close` no line of the log is waited for (`log_queue`)."""
+        if not self._logs:
+            self._logs = True
+            log_queue.use()
+        warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
+        self._asked_at = self._clock()
+        self._serve()
+        targets: dict[str, Callable[[], object]] = {
+            "control": self._control,
+            "ask": self._ask,
+            "watch": self._watch,
+            "share": partial(self._sharing.run, self._stop),
+            **({"decide": partial(self._tasks.run, self._stop)} if self._tasks else {}),
+            **({"gate": partial(self._gate.run, self._stop)} if self._gate else {}),
+            **({"say_gate": partial(self._says_gate.run, self._stop)} if self._says_gate else {}),
+            **({"afar": partial(self._afar.run, self._stop)} if self._afar else {}),
+        }
+        for name, target in targets.items():
+            thread = threading.Thread(target=target, name=f"agent_{name}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def close(self) -> None:
+        """Stop the wheels first, then the rest; the instance is let go."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(_JOIN_S + self._config.request_timeout_s * (thread.name == "agent_ask"))
+            if thread.is_alive():
+                _log.error("thread %s does not end; going on without it", thread.name)
+        self._threads.clear()
+        self._driver.halt()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        self._drop_sessions()
+        self._asker.release()
+        if self._own_client is not None:
+            self._own_client.close()
+        if self._logs:
+            self._logs = False
+            log_queue.done()
+
+    @property
+    def status_port(self) -> int | None:
+        """Where ``/status`` and ``/metrics`` are on loopback; None: nowhere."""
+        return self._server.port if self._server else None
+
+    def _serve(self) -> None:
+        config = self._config
+        if config.status_port is None:
+            return
+        try:
+            self._server = StatusServer(
+                config.status_port,
+                lambda: document(config.robot, config.service, self.status(), self._clock()),
+                lambda: metrics(config.robot, config.service, self.status(), self.report()),
+            )
+        except OSError as error:  # somebody else has the port; that is no reason not to drive
+            _log.error("no status on port %d of loopback: %s", config.status_port, error.strerror)
+            return
+        if config.status_port not in (0, self._server.port):
+            _log.warning(
+                "port %d of loopback is taken, so the status of robot %s is on port %d: skytether robot status %s",
+                config.status_port,
+                config.robot,
+                self._server.port,
+                config.robot,
+            )
+
+    def tick(self, now: float, boot: float | None = None) -> None:
+        """One turn of the control loop; called by its thread, or by a test with made-up time."""
+        self._driver.tick(now, boot)
+
+    @property
+    def source(self) -> Source:
+        """Who drives now; from any thread."""
+        return self._driver.source
+
+    def status(self) -> AgentStatus:
+        """What is known now; from any thread."""
+        session = self._driver.session
+        return AgentStatus(
+            driver=self._driver.status(),
+            instance=self._instance,
+            trouble=self._asker.trouble or self._trouble or (session.refused if session else ""),
+            asked_at=self._asked_at,
+            connected=session is not None and session.connected,
+            session=self._stats,
+            rtt=self._driver.quality.rtt,
+            loss=self._driver.quality.loss,
+            overruns=self._overruns,
+            log_lines_dropped=log_queue.dropped,
+            gate=self._gate.report if self._gate else None,
+            late=self._driver.quality.late,
+            decision=self._tasks.decision if self._tasks else None,
+            load=self._tasks.robot.load if self._tasks else nan,
+            battery=self._tasks.robot.battery if self._tasks else None,
+            others=self._graph.others if isinstance(self._graph, WatchesWheels) else NOBODY,
+        )
+
+    def report(self) -> rest.Report:
+        """What the orchestrator is told with each renewal."""
+        robot = self._tasks.robot if self._tasks else RobotView()
+        return report(
+            self._driver.status(),
+            self._tally,
+            self._stats,
+            self._driver.quality.rtt,
+            load=robot.load,
+            battery=robot.battery,
+            overruns=self._overruns,
+            gate=self._gate.report if self._gate else None,
+        )
+
+    def _control(self) -> None:
+        period = 1 / self._config.rate_hz
+        deadline = self._clock()
+        try:
+            while not self._stop.is_set():
+                self.tick(*self._clocks())
+                deadline += period
+                late = self._clock() - deadline
+                if late < 0:
+                    self._stop.wait(-late)
+                elif late > period:
+                    self._overruns += 1
+                    deadline += late  # ticks that were missed are not made up for
+        finally:
+            self._driver.halt()
+
+    def _ask(self) -> None:
+        self._asker.run(self._stop)
+
+    def _request(self, measured: Mapping[str, rest.Measurement]) -> rest.InstanceCreate:
+        config = self._config
+        return rest.InstanceCreate(
+            robot=config.robot,
+            service=config.service,
+            params=dict(config.params),
+            measurements={**config.measurements, **measured},
+            lease_s=config.lease_s,
+        )
+
+    def _wanted(self) -> rest.InstanceCreate | None:
+        """What is asked for now; None: nothing, the robot's own controller drives."""
+        if self._tasks is None:
+            return self._request({})
+        if self._tasks.decision.offload:
+            return self._request(self._tasks.measurements())
+        self._drop_sessions()
+        self._instance = None
+        return None
+
+    def _drop_sessions(self) -> None:
+        self._driver.let_go()
+        opened, self._open_sessions = list(self._open_sessions.values()), {}
+        for one in opened:
+            self._end(one.session)
+
+    def _end(self, session: LiveSession) -> None:
+        session.close()
+        if session.bridge is not None:
+            self._tally.take(session, session.bridge.stats(), last=True)
+
+    def _taken_over(self, instance: rest.Instance) -> bool:
+        session = self._driver.session
+        return session is not None and instance.session is not None and session.id == instance.session.id
+
+    def _stayed(self, instance: rest.Instance, reason: str) -> None:
+        """What was to take over does not."""
+        serving = self._driver.session
+        if self._graph is not None and len(self._open_sessions) > 1:
+            # The graph's topics went to the session that is given up: the one that serves is joined anew.
+            self._drop_sessions()
+            self._served = ""
+            serving = None
+        if serving is not None:
+            self._driver.let_go()
+            self._driver.session = serving
+        for session_id in [i for i in self._open_sessions if serving is None or i != serving.id]:
+            self._end(self._open_sessions.pop(session_id).session)
+        if self._tasks is not None:
+            self._tasks.stayed(instance, reason)
+
+    def _elsewhere(self, instance: rest.Instance) -> bool:
+        wanted = self._tasks.decision.site if self._tasks else None
+        return wanted is not None and instance.placement is not None and instance.placement.site != wanted
+
+    def _another_token(self) -> bool:
+        """Look for a newer token where this one came from; True if there is one."""
+        if self._config.fresh_token is None or self._own_client is None:
+            return False
+        try:
+            token = self._config.fresh_token()
+        except Exception as error:  # a file that is being written, or gone
+            self._notices.say("token", f"no newer token: {error}", self._clock())
+            return False
+        known, self._token = self._token, token
+        if token != known:
+            self._own_client.set_token(token)
+        return token != known
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_WATCH_S):
+            self.watch(self._clock())
+
+    def watch(self, now: float) -> None:
+        """Look at the bridge's counters once."""
+        self._settle()
+        for opened in list(self._open_sessions.values()):
+            if opened.session.bridge is not None:
+                self._tally.take(opened.session, opened.session.bridge.stats())
+        session = self._driver.session
+        if session is None or session.bridge is None:
+            return
+        self._stats = session.bridge.stats()
+        if self._manager is not None:
+            self._driver.quality = self._manager.watch(self._stats, now)
+            if self._tasks is not None:
+                found = self._driver.quality
+                known = session.connected
+                self._tasks.live(PathQuality(found.rtt, nan, found.loss) if known else PathQuality())
+            for kind, sentence in self._manager.troubles():
+                self._notices.say(kind, sentence, now)
+
+    def _follow(self, instance: rest.Instance) -> None:
+        """The orchestrator said something about an instance: open a session to it, or follow the service's address.
+
+        Another instance comes beside the one that drives, and takes over with its first command (`Driver.offer`).
+        """
+        granted = instance.session
+        opened = self._open_sessions.get(granted.id) if granted else None
+        if opened is None or granted is None or granted.id == self._served:
+            self._told(instance)
+        if (
+            granted is None
+            or granted.key is None
+            or granted.host is None
+            or granted.port is None
+            or granted.id == self._left
+        ):
+            return
+        peer = self._config.route(granted.host, granted.port)
+        try:
+            peer = self._resolver.address(*peer)
+            if opened is not None:
+                opened.session.move(peer)
+                return
+            session = self._open(granted, peer)
+        except (BridgeError, ValueError) as error:
+            sentence = f"no bridge to {peer[0]}:{peer[1]}: {error}"
+            if sentence != self._trouble:
+                _log.error("%s", sentence)
+                self._trouble = sentence
+            return
+        self._trouble = ""
+        held_to = terms(granted.needs, granted.topics, self._config.command_topic)
+        self._open_sessions[granted.id] = _Opened(session, instance, held_to, SharedTopics.of(granted.topics))
+        self._driver.offer(session)
+
+    def _told(self, instance: rest.Instance) -> None:
+        self._instance = instance
+        if self._tasks is not None:
+            self._tasks.placed(instance)
+
+    def _settle(self) -> None:
+        """Hold the service that serves now to its terms, once it has changed, and close what was left."""
+        session = self._driver.session
+        opened = self._open_sessions.get(session.id) if session else None
+        if opened is not None and session is not None and session.id != self._served:
+            self._left, self._served = self._served, session.id
+            self._told(opened.instance)
+            self._manager = ServiceManager(opened.terms, self._config.command_topic, self._config.limits.silence_s)
+            self._driver.quality = Quality()
+            self._driver.hold_to(opened.terms)
+        while self._driver.left:
+            left = self._driver.left.popleft()
+            self._open_sessions.pop(left.id, None)
+            self._end(left)
+
+    def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
+        for topic in granted.topics:
+            if (topic.name, topic.direction) == (self._config.command_topic, "out") and topic.type != Twist.TYPE:
+                # Bytes of another type may well decode: a Wrench has the shape of a Twist.
+                raise ValueError(f"the service's {topic.name} is a {topic.type}, and only a {Twist.TYPE} may drive")
+        command = self._config.command_topic
+        shared = SharedTopics.of(granted.topics)
+        if self._graph is None:
+            readings = offers({**self._base.topics, **shared.readings})
+            topics = robot_table(spoken(granted.topics, None), readings)
+            names = frozenset(topic.name for topic in topics)
+            session = LiveSession(granted.id, names, command, self._epochs, shared_topic=shared.said)
+        else:
+            encoding = self._graph.encoding
+            topics, port = self._graph.open([topic for topic in granted.topics if not topic.shared], command)
+            between = [topic for topic in granted.topics if topic.shared]
+            topics += robot_table(between, offers(shared.readings, encoding), encoding=encoding)
+            session = LiveSession(
+                granted.id,
+                frozenset(shared.readings),
+                command,
+                self._epochs,
+                encoding=encoding,
+                graph=port,
+                shared_topic=shared.said,
+            )
+        spec = SessionSpec(parse_id(granted.id), parse_key(granted.key or ""), Role.ROBOT, topics)
+        session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
+        return session
+
+    def _shares(self) -> Serving | None:
+        """What serves the robot now, for sharing."""
+        session = self._driver.session
+        opened = self._open_sessions.get(session.id) if session is not None else None
+        return None if opened is None else Serving(opened.session, opened.instance.id, opened.shared)
+
+    def __enter__(self) -> Agent:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def offers(topics: Mapping[str, type[Message]], encoding: Encoding = "cdr") -> dict[str, Offer]:
+    """What a robot with these message classes can send."""
+    return {name: Offer(cls.TYPE, type_hash(cls, encoding), encoding) for name, cls in topics.items()}

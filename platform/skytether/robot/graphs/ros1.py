@@ -1,0 +1,199 @@
+"""A robot that is a ROS 1 graph: its topics for the service, its readings, its wheels."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.bridge.port import Port
+from skytether.guard.clock import now as boottime
+from skytether.messages import Encoding, Message, Twist, hash_of, type_of
+from skytether.ros import notes, permissions
+from skytether.ros.names import Names, bridge_type, namespace_of, resolve
+from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
+from skytether.ros.ros1.master import MasterError, RefusedError
+from skytether.ros.ros1.node import Node
+from skytether.ros.ros1.port import CLOCK, SIM_TIME, Ros1Port
+from skytether.ros.ros1.subscription import Listener
+from skytether.wire.topic import Role, Topic
+
+from ..control.supervisor import Limits
+from ..session.topic_table import Offer, robot_table, spoken
+from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
+from .wheels_watch import NOBODY, Others, WheelsWatch
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Ros1RobotConfig:
+    """Where in its graph the robot's things are.
+
+    Attributes:
+        robot: Its name.
+        service: The service's: what it sends is found below that name.
+        namespace: Of the robot's topics; None: its name.
+        remap: Names in the graph, by topic, call, action or reading.
+        cmd_vel: What the wheels listen to; None: others have the wheels.
+        idle_s: See `skytether.robot.graphs.graph_base.IDLE_S`.
+        fresh_s: The wheels get no velocity that is older [s]: the node's own thread sends it, and this process may
+            stand still meanwhile.
+        readings: Types of what the robot's own control reads, by name.
+        topics: Sent to a service that takes any.
+        params: Handed to the service's graph.
+        use_sim_time: Whether /clock tells the time; None: as the master says.
+        allowed: What the service may publish, call and offer beyond its own namespace.
+        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
+        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
+        drivers: Names of the nodes that publish it for us; empty: this one.
+    """
+
+    robot: str
+    service: str
+    namespace: str | None = None
+    remap: Mapping[str, str] = field(default_factory=dict)
+    cmd_vel: str | None = "cmd_vel"
+    idle_s: float | None = IDLE_S
+    fresh_s: float = Limits().watchdog_s
+    readings: Mapping[str, str] = field(default_factory=dict)
+    topics: Collection[str] = ()
+    params: Collection[str] = ()
+    use_sim_time: bool | None = None
+    allowed: Allowed = NOTHING_MORE
+    protected: Mapping[str, str] = field(default_factory=dict)
+    wheels: str | None = None
+    drivers: Collection[str] = ()
+
+    @property
+    def home(self) -> str:
+        """The namespace of the robot's topics."""
+        return namespace_of(self.robot) if self.namespace is None else resolve(self.namespace, "/")
+
+    def names(self, specs: Sequence[TopicSpec]) -> Names:
+        """Names in the robot's graph.
+
+        Raises:
+            GraphNameError: One is not allowed.
+        """
+        return Names(specs, self.home, namespace_of(self.service), self.remap)
+
+    def permissions(self) -> Permissions:
+        """What the service may do in the robot's graph."""
+        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
+        kept = protected_names(self.names(()), self.home, wheels, self.readings)
+        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
+
+
+class Ros1Robot:
+    """Implements `skytether.robot.graphs.graph_base.Graph`.
+
+    Attributes:
+        base: For the agent: readings and wheels.
+
+    Args:
+        config: What is where.
+        node: Started.
+    """
+
+    encoding: Encoding = "ros1"
+
+    def __init__(self, config: Ros1RobotConfig, node: Node) -> None:
+        self._config = config
+        self._node = node
+        self._port: Ros1Port | None = None
+        send: Callable[[bytes], object] = nowhere
+        if config.cmd_vel is not None:
+            topic = resolve(config.cmd_vel, config.home)
+            wheels = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+
+            def send(payload: bytes) -> None:
+                wheels.publish(payload, boottime() + config.fresh_s)
+
+        readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
+        self.base = GraphBase(readings, "ros1", send, idle_s=config.idle_s)
+        own = config.names(())
+        self._ends: list[Callable[[], None]] = [
+            node.subscribe(own.own(name), cls.TYPE, hash_of(cls.TYPE, "ros1"), self._reader(name))
+            for name, cls in readings.items()
+        ]
+        self._watch: WheelsWatch | None = None
+        if config.wheels is not None:
+            find = partial(node.master.publishers, config.wheels)
+            self._watch = WheelsWatch(config.wheels, config.drivers or (node.name,), find)
+
+    def _reader(self, name: str) -> Listener:
+        return Listener(lambda data, _: self.base.put(name, data))
+
+    @property
+    def others(self) -> Others:
+        """Who else publishes what the wheels listen to."""
+        return self._watch.others if self._watch is not None else NOBODY
+
+    def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
+        specs = spoken(specs, "action")
+        names = self._config.names(specs)
+        may = self._config.permissions()
+        permissions.check(may, specs, names, command_topic)
+        for unused in names.unused(self._config.readings):
+            _log.warning("remap.%s has no effect: the service has no such topic", unused)
+        sim_time = self.sim_time()
+        topics = (
+            *robot_table(specs, self._offers(specs), encoding="ros1"),
+            *((CLOCK,) if sim_time and all(spec.name != CLOCK.name for spec in specs) else ()),
+            *notes.topics(),
+        )
+        if self._port is not None:
+            self._port.close()
+        self._port = Ros1Port(
+            self._node,
+            Role.ROBOT,
+            names,
+            topics,
+            skip=(command_topic,),
+            permissions=may,
+            params=self._config.params,
+            sim_time=sim_time,
+        )
+        return topics, self._port
+
+    def sim_time(self) -> bool:
+        """Whether /clock tells the robot's time."""
+        if self._config.use_sim_time is not None:
+            return self._config.use_sim_time
+        try:
+            return self._node.master.get_param(SIM_TIME) is True
+        except MasterError:
+            return False
+
+    def _offers(self, specs: Sequence[TopicSpec]) -> dict[str, Offer]:
+        rows = [row for spec in specs if spec.kind != "call" for row in spec.rows()]
+        taken = {row.name: row.type for row in rows if row.direction == "in" and row.name != ANY_TOPIC}
+        if any(row.name == ANY_TOPIC for row in rows):
+            taken.update(self._any(set(taken)))
+        return {name: Offer(kind, hash_of(kind, "ros1"), "ros1") for name, kind in taken.items()}
+
+    def _any(self, named: set[str]) -> dict[str, str]:
+        """Topics for a service that takes any, by their names in the graph."""
+        wanted = [resolve(name, self._config.home) for name in self._config.topics]
+        try:
+            types = self._node.master.topic_types() if wanted else {}
+        except (MasterError, RefusedError):
+            types = {}
+        for name in wanted:
+            if types.get(name, "*") == "*":
+                _log.error("topic %s is not sent: nobody published it yet, so its type is not known", name)
+        if not wanted:
+            _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
+        return {n: bridge_type(types[n]) for n in wanted if types.get(n, "*") != "*" and n not in named}
+
+    def close(self) -> None:
+        """Leave the graph; the node stays."""
+        if self._watch is not None:
+            self._watch.close()
+        if self._port is not None:
+            self._port.close()
+        for end in self._ends:
+            end()

@@ -1,0 +1,188 @@
+"""A robot that is a ROS 2 graph: its topics for the service, its readings, its wheels."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.bridge.port import Port
+from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, hash_of, type_of
+from skytether.ros import permissions
+from skytether.ros.names import Names, namespace_of, resolve
+from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
+from skytether.ros.ros2.dialect import Endpoint, Kind
+from skytether.ros.ros2.endpoints import Handle
+from skytether.ros.ros2.node import Ros2Node
+from skytether.ros.ros2.port import Ros2Port
+from skytether.ros.ros2.qos import Qos
+from skytether.wire.topic import Role, Topic
+
+from ..session.topic_table import Offer, robot_table, spoken
+from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
+from .wheels_watch import NOBODY, Others, WheelsWatch
+
+_log = logging.getLogger(__name__)
+
+WHEELS = (Twist.TYPE, TwistStamped.TYPE)
+"""What wheels may take: nav2 and ros2_control have the second from Jazzy on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2RobotConfig:
+    """Where in its graph the robot's things are.
+
+    Attributes:
+        robot: Its name.
+        service: The service's: what it sends is found below that name.
+        namespace: Of the robot's topics; None: its name.
+        remap: Names in the graph, by topic, call, action or reading.
+        cmd_vel: What the wheels listen to; None: others have the wheels.
+        cmd_vel_type: One of `WHEELS`.
+        frame: Coordinate frame of stamped velocities.
+        idle_s: See `skytether.robot.graphs.graph_base.IDLE_S`.
+        readings: Types of what the robot's own control reads, by name.
+        topics: Sent to a service that takes any.
+        allowed: What the service may publish, call and offer beyond its own namespace.
+        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
+        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
+        drivers: Names of the nodes that publish it for us; empty: this one.
+    """
+
+    robot: str
+    service: str
+    namespace: str | None = None
+    remap: Mapping[str, str] = field(default_factory=dict)
+    cmd_vel: str | None = "cmd_vel"
+    cmd_vel_type: str = Twist.TYPE
+    frame: str = "base_link"
+    idle_s: float | None = IDLE_S
+    readings: Mapping[str, str] = field(default_factory=dict)
+    topics: Collection[str] = ()
+    allowed: Allowed = NOTHING_MORE
+    protected: Mapping[str, str] = field(default_factory=dict)
+    wheels: str | None = None
+    drivers: Collection[str] = ()
+
+    @property
+    def home(self) -> str:
+        """The namespace of the robot's topics."""
+        return namespace_of(self.robot) if self.namespace is None else resolve(self.namespace, "/")
+
+    def names(self, specs: Sequence[TopicSpec]) -> Names:
+        """Names in the robot's graph.
+
+        Raises:
+            GraphNameError: One is not allowed.
+        """
+        return Names(specs, self.home, namespace_of(self.service), self.remap, ros=2)
+
+    def permissions(self) -> Permissions:
+        """What the service may do in the robot's graph."""
+        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
+        kept = protected_names(self.names(()), self.home, wheels, self.readings)
+        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
+
+
+class Ros2Robot:
+    """Implements `skytether.robot.graphs.graph_base.Graph`.
+
+    Attributes:
+        base: For the agent: readings and wheels.
+
+    Args:
+        config: What is where.
+        node: Started; it stays the caller's.
+        clock: Unix time in seconds, for stamped velocities.
+    """
+
+    encoding: Encoding = "cdr"
+
+    def __init__(self, config: Ros2RobotConfig, node: Ros2Node, *, clock: Callable[[], float] = time.time) -> None:
+        self._config = config
+        self._node = node
+        self._clock = clock
+        self._port: Ros2Port | None = None
+        self._handles: list[Handle] = []
+        own = config.names(())
+        send: Callable[[bytes], object] = nowhere
+        if config.cmd_vel is not None:
+            wheels = node.publish(self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type))
+            self._handles.append(wheels)
+            send = wheels.put
+        readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
+        make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is
+        self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s)
+        for name, cls in readings.items():
+            endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
+            self._handles.append(node.subscribe(endpoint, partial(self.base.put, name)))
+        self._watch: WheelsWatch | None = None
+        if config.wheels is not None:
+            self._watch = WheelsWatch(config.wheels, config.drivers, partial(self._publishers, config.wheels))
+
+    def _publishers(self, topic: str) -> list[str]:
+        """Names of the nodes of others that publish a topic; this one's is not among them."""
+        return [endpoint.node for endpoint in self._node.endpoints(topic, Kind.PUBLISHER)]
+
+    @property
+    def others(self) -> Others:
+        """Who else publishes what the wheels listen to."""
+        return self._watch.others if self._watch is not None else NOBODY
+
+    def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
+        specs = spoken(specs, "ros2_action")
+        names = self._config.names(specs)
+        may = self._config.permissions()
+        permissions.check(may, specs, names, command_topic)
+        for unused in names.unused((*self._config.readings, self._config.cmd_vel or "")):
+            _log.warning("remap.%s has no effect: the service has no such topic", unused)
+        topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
+        if self._port is not None:
+            self._port.close()
+        self._port = Ros2Port(self._node, topics, Role.ROBOT, name_of=names.of, skip=(command_topic,), permissions=may)
+        return topics, self._port
+
+    def close(self) -> None:
+        """Leave the graph; the node stays."""
+        if self._watch is not None:
+            self._watch.close()
+        if self._port is not None:
+            self._port.close()
+        for handle in self._handles:
+            handle.close()
+
+    def _stamped(self, twist: Twist) -> TwistStamped:
+        return TwistStamped(Header(Time.from_seconds(self._clock()), self._config.frame), twist)
+
+    def _offers(self, specs: Sequence[TopicSpec]) -> dict[str, Offer]:
+        rows = [row for spec in specs for part in spec.parts() if part.kind != "call" for row in part.rows()]
+        taken = {row.name: row.type for row in rows if row.direction == "in" and row.name != ANY_TOPIC}
+        if any(row.name == ANY_TOPIC for row in rows):
+            taken.update(self._any(set(taken)))
+        return {name: Offer(kind, hash_of(kind, "cdr"), self.encoding) for name, kind in taken.items()}
+
+    def _any(self, named: set[str]) -> dict[str, str]:
+        """Topics for a service that takes any, by their names in the graph."""
+        found = {}
+        for name in (resolve(name, self._config.home) for name in self._config.topics):
+            publishers = self._node.endpoints(name, Kind.PUBLISHER)
+            if not publishers:
+                _log.error("topic %s is not sent: nobody published it yet, so its type is not known", name)
+            elif name not in named:
+                found[name] = publishers[0].type
+        if not self._config.topics:
+            _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
+        return found
+
+    @staticmethod
+    def _endpoint(kind: Kind, name: str, type_name: str) -> Endpoint:
+        # A reading takes what there is, reliable or not; wheels that ask for reliable get that.
+        qos = Qos(reliable=kind is Kind.PUBLISHER, depth=1)
+        return Endpoint(kind, name, type_name, hash_of(type_name, "cdr"), qos)
+
+
+def _as_it_is(twist: Twist) -> Message:
+    return twist

@@ -1,0 +1,203 @@
+import json
+import socket
+import threading
+from contextlib import suppress
+from dataclasses import replace
+
+import httpx
+import pytest
+from typer.testing import CliRunner
+
+from skytether.api.rest import Placement
+from skytether.cli.app import app
+from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.status import StatusServer, document, metrics
+from skytether.robot.offload.site_prober import TaskConfig
+from skytether.robot.offload.task_manager import Option
+from skytether.wire.stats import PathStats, SessionStats, TopicStats
+
+CONFIG = AgentConfig(
+    robot="walker", url="", token="secret", service="guide", fallback="admittance", task=TaskConfig(), status_port=0
+)
+
+
+@pytest.fixture
+def agent(base, orchestrator):
+    agent = Agent(CONFIG, base, client=orchestrator, clock=lambda: 50.0)
+    for i in range(10):
+        agent.tick(50.0 + i / 100)
+    return agent
+
+
+@pytest.fixture
+def busy(agent):
+    """After a while: an instance, a session, a decision."""
+    agent._asker.step()
+    agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
+    topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
+    agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
+    agent._tally.take(agent, agent._stats)
+    options = (Option("edge", {"delay": 0.3, "loss": 0.1}), Option("cloud", refused="answers no probe"))
+    agent._tasks._decision = replace(agent._tasks.decision, options=options, challenger=(options[0], 45.0))
+    return agent
+
+
+def test_the_document_says_everything_in_plain_numbers(busy):
+    found = document("walker", "guide", busy.status(), 60.0)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert (found["source"], found["why"]) == ("fallback", "no command has come yet")
+    assert found["instance"] == {"id": "i1", "state": "running", "site": "edge", "reason": ""}
+    assert found["task"]["options"][1] == {"name": "cloud", "cost": None, "parts": {}, "refused": "answers no probe"}
+    assert found["task"]["challenger"] == {"name": "edge", "for_s": 15.0}
+    assert found["link"]["paths"][0]["mtu"] == 1400
+    assert found["transitions"] == [{"ago_s": 10.0, "source": "fallback", "reason": "start"}]
+    assert "secret" not in json.dumps(found)
+
+
+def test_metrics_are_those_of_the_report_and_the_robots_own(busy):
+    text = metrics("walker", "guide", busy.status(), busy.report()).decode()
+    for line in (
+        'skytether_control_source{robot="walker",service="guide",source="fallback"} 1.0',
+        'skytether_fallback_transitions_total{reason="start",robot="walker",service="guide"} 1.0',
+        'skytether_task_cost{option="edge",robot="walker",service="guide"} 0.4',
+        'skytether_task_cost{option="cloud",robot="walker",service="guide"} +Inf',
+        'skytether_session_connected{robot="walker",service="guide"} 0.0',
+        'skytether_control_overruns_total{robot="walker"} 0.0',
+    ):
+        assert line in text
+    assert (
+        'skytether_topic_one_way_delay_seconds{direction="out",priority="127",quantile="0.5",robot="walker",'
+        'service="guide",topic="cmd_vel"} 0.02'
+    ) in text
+
+
+@pytest.fixture
+def served(busy):
+    busy._serve()
+    yield busy
+    busy.close()
+    assert busy.status_port is None
+
+
+def test_both_are_served_on_loopback_and_nothing_else_is(served):
+    url = f"http://127.0.0.1:{served.status_port}"
+    assert httpx.get(f"{url}/status").json()["robot"] == "walker"
+    assert httpx.get(f"{url}/metrics?x=1").headers["content-type"].startswith("text/plain")
+    assert httpx.get(f"{url}/token").status_code == 404
+    assert httpx.post(f"{url}/status").status_code == 501
+
+
+def test_the_command_prints_tables_or_json(served):
+    port = str(served.status_port)
+    result = CliRunner().invoke(app, ["robot", "status", "--port", port, "--json"])
+    assert json.loads(result.stdout)["service"] == "guide"
+    result = CliRunner().invoke(app, ["robot", "status", "--port", port])
+    assert result.exit_code == 0
+
+
+def test_what_a_service_said_last_is_shown_as_it_is_and_obeyed_by_nobody(served, monkeypatch):
+    said = 'its last line: "[/x] [red]\x1b]0;title\x07"'
+    monkeypatch.setattr(served, "_instance", served._instance.model_copy(update={"reason": said}))
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    assert result.exit_code == 0
+    assert "[/x] [red]\\x1b]0;title\\x07" in result.output
+    assert "\x1b]" not in result.output
+
+
+def test_a_web_page_whose_name_was_made_this_address_reads_nothing():
+    server = StatusServer(0, lambda: {"battery": 1.0}, lambda: b"")
+    url = f"http://127.0.0.1:{server.port}"
+    for path in ("/status", "/metrics", "/"):
+        assert httpx.get(url + path, headers={"Host": f"evil.example:{server.port}"}).status_code == 421
+    for host in ("localhost", f"localhost:{server.port}", "[::1]", "192.0.2.7:80"):
+        assert httpx.get(f"{url}/status", headers={"Host": host}).status_code == 200
+    server.close()
+
+
+@pytest.mark.slow
+def test_who_asks_without_end_holds_up_neither_the_others_nor_the_end(capfd):
+    server, ended = StatusServer(0, dict, lambda: b""), threading.Event()
+
+    def drip():
+        with socket.create_connection(("127.0.0.1", server.port)) as link, suppress(OSError):
+            link.sendall(b"GET /status HTTP/1.1\r\nA: ")
+            while not ended.wait(0.1):
+                link.sendall(b"b")
+
+    threads = [threading.Thread(target=drip) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    try:
+        assert httpx.get(f"http://127.0.0.1:{server.port}/status", timeout=30).status_code == 200
+        for thread in threads:
+            thread.join(30)
+        assert not any(thread.is_alive() for thread in threads), "each is ended when its time is over"
+        again = threading.Thread(target=drip)
+        again.start()
+        threads.append(again)
+        server.close()
+        assert not server._thread.is_alive()
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_more_connections_than_there_is_room_for_are_closed(monkeypatch):
+    for patience in ("_PATIENCE_S", "_Handler.timeout"):
+        monkeypatch.setattr(f"skytether.robot.agent.status.{patience}", 60.0)  # it is not this that ends them
+    server = StatusServer(0, dict, lambda: b"")
+    links = [socket.create_connection(("127.0.0.1", server.port), timeout=10) for _ in range(16)]
+    for _ in range(24):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10) as beyond:
+            assert beyond.recv(1) == b""
+    for link in links:
+        link.close()
+    server.close()
+
+
+def test_a_status_that_cannot_be_told_harms_nobody():
+    server = StatusServer(0, lambda: {"x": 1 / 0}, lambda: b"")
+    assert httpx.get(f"http://127.0.0.1:{server.port}/status").status_code == 500
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(server.port)])
+    assert result.exit_code == 1
+    server.close()
+    assert CliRunner().invoke(app, ["robot", "status", "--port", str(server.port)]).exit_code == 1
+
+
+def test_an_agent_whose_port_is_taken_answers_on_the_next_and_is_found_by_its_robot_s_name(
+    served, base, orchestrator, caplog
+):
+    other = Agent(replace(CONFIG, robot="second", status_port=served.status_port), base, client=orchestrator)
+    other._serve()
+    try:
+        assert other.status_port in range(served.status_port + 1, served.status_port + 16)
+        assert f"the status of robot second is on port {other.status_port}" in caplog.text
+        port = str(served.status_port)
+        for name in ("walker", "second"):
+            found = CliRunner().invoke(app, ["robot", "status", name, "--port", port, "--json"])
+            assert json.loads(found.stdout)["robot"] == name
+        nobody = CliRunner().invoke(app, ["robot", "status", "third", "--port", port])
+        assert nobody.exit_code == 1
+        assert "no agent of robot third answers" in " ".join(nobody.output.split())
+    finally:
+        other.close()
+
+
+def test_no_free_port_keeps_no_robot_from_driving(served, base, orchestrator, caplog, monkeypatch):
+    monkeypatch.setattr("skytether.robot.agent.status.PORTS", 1)
+    other = Agent(replace(CONFIG, status_port=served.status_port), base, client=orchestrator)
+    other._serve()
+    assert other.status_port is None
+    assert "no status on port" in caplog.text
+
+
+def test_in_a_pipe_no_row_is_broken_and_a_site_called_local_is_listed_once(served):
+    options = (Option("local", {"delay": 0.3}), Option(None, refused="the fallback only stops, " * 6))
+    served._tasks._decision = replace(served._tasks.decision, options=options)
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    first = [line.split("│")[1].strip() for line in result.stdout.splitlines() if line.count("│") == 4]
+    assert first.count("local") == 1
+    assert "own controller" in first
+    assert "the fallback only stops, " * 5 in result.stdout

@@ -1,0 +1,60 @@
+import pytest
+
+from skytether.robot.graphs.wheels_watch import MOST, UNNAMED, Others, WheelsWatch, strangers
+
+OURS = ("/skytether_guard", "/skytether_gate")
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        ([], ()),
+        ([*OURS], ()),
+        (["/skytether_guard"], ()),
+        ([*OURS, "/teleop"], ("/teleop",)),
+        (["/teleop", "/teleop"], ("/teleop",)),
+        (["", ""], ()),
+        (["", "", ""], (UNNAMED,)),
+        ([*OURS, ""], (UNNAMED,)),
+    ],
+)
+def test_who_is_none_of_ours(found, expected):
+    assert strangers(found, OURS) == expected
+
+
+def test_a_crowd_is_cut_off():
+    assert len(strangers([f"/n{i}" for i in range(1000)], OURS)) == MOST
+
+
+def test_each_is_named_once_while_it_lasts_and_counted(caplog):
+    found = [*OURS]
+    watch = WheelsWatch("/cmd_vel", OURS, lambda: found, look_s=3600)
+    watch.look()
+    assert watch.others == Others((), 0)
+    found.append("/teleop")
+    watch.look()
+    watch.look()
+    assert watch.others == Others(("/teleop",), 1)
+    found.remove("/teleop")
+    watch.look()
+    found.append("/teleop")
+    watch.look()
+    assert watch.others == Others(("/teleop",), 2)
+    assert sum("/teleop publishes /cmd_vel too" in message for message in caplog.messages) == 2
+    watch.close()
+
+
+def test_a_graph_that_does_not_answer_tells_nothing_new():
+    answers = iter([["/teleop"], OSError("no master")])
+
+    def find():
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    watch = WheelsWatch("/cmd_vel", OURS, find, look_s=3600)
+    watch.look()
+    watch.look()
+    assert watch.others == Others(("/teleop",), 1)
+    watch.close()
