@@ -20,9 +20,9 @@ import yaml
 from skytether.api.manifest import Manifest
 from skytether.api.rest import SiteCreate
 from skytether.cli.relay_config import RelayConfig
+from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
-from skytether.orchestrator.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 CHART = ROOT / "helm" / "skytether"

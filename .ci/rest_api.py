@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from skytether.api.manifest import Strict
-from skytether.orchestrator.app import create_app
+from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.settings import Settings
+from skytether.orchestrator.http.app import create_app
 
 _HEAD = """\
 # REST

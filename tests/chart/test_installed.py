@@ -22,7 +22,7 @@ from value_sets import SETS
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate
-from skytether.orchestrator.catalogue import read_builtin
+from skytether.orchestrator.scheduling.catalogue import read_builtin
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 

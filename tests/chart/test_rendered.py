@@ -17,12 +17,12 @@ from value_sets import CASES, SETS, UPSTREAM
 
 from skytether.api.rest import SiteCreate
 from skytether.cli.relay_config import RelayConfig
-from skytether.orchestrator.config import load
-from skytether.orchestrator.declared import read_sites, stored_as
+from skytether.orchestrator.config.declared import read_sites, stored_as
+from skytether.orchestrator.config.settings import Settings
+from skytether.orchestrator.config.sources import load
+from skytether.orchestrator.domain.security import Secrets, new_token
 from skytether.orchestrator.nodes.authority import Authority
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
-from skytether.orchestrator.security import Secrets, new_token
-from skytether.orchestrator.settings import Settings
 
 _OTHERS = ("monitoring.coreos.com", "gateway.networking.k8s.io")
 _GONE = {"v1.20.0": ("policy/v1", "autoscaling/v2"), "v1.37.0": ("policy/v1beta1", "autoscaling/v2beta2")}

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from skytether.api import report_metrics as reported
-from skytether.orchestrator import metrics as exported
 from skytether.orchestrator.runtimes.containers import USER
+from skytether.orchestrator.telemetry import metrics as exported
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())

@@ -31,7 +31,7 @@ from skytether.lab.bench.migrate import Commands, instance_of
 from skytether.lab.demo import WalkerBase
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.orchestrator import db
+from skytether.orchestrator.store import db
 from skytether.robot.agent.agent import Agent, AgentConfig
 from skytether.robot.control.command import Source
 

@@ -19,15 +19,16 @@ from reconcile_bench import Bench
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
-from skytether.orchestrator import app, catalogue, sites
-from skytether.orchestrator.app import create_app
+from skytether.orchestrator.config.settings import Nodes, Settings, Timing
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.pause import Pause
-from skytether.orchestrator.records import Record
-from skytether.orchestrator.server import listening
-from skytether.orchestrator.settings import Nodes, Settings, Timing
-from skytether.orchestrator.sites import load_runtime
-from skytether.orchestrator.store import Store
+from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.http import app
+from skytether.orchestrator.http.app import create_app
+from skytether.orchestrator.http.pause import Pause
+from skytether.orchestrator.http.server import listening
+from skytether.orchestrator.scheduling import catalogue, sites
+from skytether.orchestrator.scheduling.sites import load_runtime
+from skytether.orchestrator.store.store import Store
 from skytether.testing import runtimes
 from skytether.testing.runtimes import FakeRuntime
 

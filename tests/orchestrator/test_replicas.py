@@ -21,12 +21,11 @@ from sqlalchemy.exc import OperationalError
 
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
-from skytether.orchestrator.db import make_engine
-from skytether.orchestrator.errors import QuotaError
-from skytether.orchestrator.postgres import Connection
-from skytether.orchestrator.quotas import Quotas
-from skytether.orchestrator.settings import Quotas as Settings
-from skytether.orchestrator.store import Store
+from skytether.orchestrator.access.quotas import Quotas
+from skytether.orchestrator.config.settings import Quotas as Settings
+from skytether.orchestrator.domain.errors import QuotaError
+from skytether.orchestrator.store.db import make_engine
+from skytether.orchestrator.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]
 
@@ -204,10 +203,9 @@ def watch(program: Replica, instance: str, states: Queue[str | None]) -> None:
 
 
 def test_a_server_that_hangs_is_given_up_and_then_one_at_a_time_waits_for_it(
-    postgres: str, postgres_server: Any, monkeypatch: pytest.MonkeyPatch
+    postgres: str, postgres_server: Any
 ) -> None:
-    monkeypatch.setattr(Connection, "patience_s", 0.5)
-    engine = make_engine(postgres)
+    engine = make_engine(postgres, patience_s=0.5)
     done = threading.Event()
 
     def ask() -> int:

@@ -19,8 +19,8 @@ from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import InstanceCreate, SiteCreate, State
-from skytether.orchestrator import db
-from skytether.orchestrator.settings import Timing
+from skytether.orchestrator.config.settings import Timing
+from skytether.orchestrator.store import db
 
 pytestmark = pytest.mark.slow
 

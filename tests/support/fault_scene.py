@@ -13,7 +13,7 @@ from orchestrator_program import Program, until
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
 from skytether.api.rest import InstanceCreate, State
-from skytether.orchestrator.store import Store
+from skytether.orchestrator.store.store import Store
 
 GRACE = 3.0
 """Seconds that an instance gets to end."""

@@ -11,21 +11,21 @@ from typing import Any
 
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import State
-from skytether.orchestrator.catalogue import Catalogue
-from skytether.orchestrator.demand import Demand
-from skytether.orchestrator.groups import Groups
-from skytether.orchestrator.leader import ALONE, Lead
-from skytether.orchestrator.metrics import Metrics
-from skytether.orchestrator.moves import Moves
+from skytether.orchestrator.config.settings import Limits, Timing, Weights
+from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.security import Secrets
+from skytether.orchestrator.groups.demand import Demand
+from skytether.orchestrator.groups.groups import Groups
+from skytether.orchestrator.groups.scaler import Scaler
 from skytether.orchestrator.providers.base import Invitation, Provider
-from skytether.orchestrator.reconcile import Reconciler
-from skytether.orchestrator.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
-from skytether.orchestrator.scaler import Scaler
-from skytether.orchestrator.security import Secrets
-from skytether.orchestrator.settings import Limits, Timing, Weights
-from skytether.orchestrator.sites import Site, Sites
-from skytether.orchestrator.store import Store
+from skytether.orchestrator.scheduling.catalogue import Catalogue
+from skytether.orchestrator.scheduling.moves import Moves
+from skytether.orchestrator.scheduling.reconcile import Reconciler
+from skytether.orchestrator.scheduling.sites import Site, Sites
+from skytether.orchestrator.store.leader import ALONE, Lead
+from skytether.orchestrator.store.store import Store
+from skytether.orchestrator.telemetry.metrics import Metrics
 from skytether.testing.providers import FakeCloud, FakeProvider
 from skytether.testing.runtimes import FakeRuntime, FakeWorld
 

@@ -14,13 +14,13 @@ from skytether.api.manifest import Manifest
 from skytether.api.rest import InstanceCreate, Session, SiteCreate, State
 from skytether.bridge import Bridge, SessionSpec
 from skytether.messages import Header, JointState, Odometry, Time, Vector3, Wrench, WrenchStamped, encode
-from skytether.orchestrator.access import Principal
+from skytether.orchestrator.access.access import Principal
+from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.records import Record
+from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.runtimes.base import Runtime
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
-from skytether.orchestrator.settings import Settings
-from skytether.orchestrator.sites import load_runtime
+from skytether.orchestrator.scheduling.sites import load_runtime
 from skytether.wire.events import Event, MessageReceived
 from skytether.wire.topic import Role
 

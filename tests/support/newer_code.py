@@ -31,5 +31,7 @@ def newer_code(root: Path, head: str, before: Path | None = None) -> Path:
     """
     copied = shutil.copytree(before / "skytether" if before else Path(skytether.__file__).parent, root / "skytether")
     number = int(head) + 1 if int(head) > 9000 else 9001
-    (copied / f"orchestrator/migrations/versions/{number}_colour.py").write_text(_NEXT.format(head=head, number=number))
+    (copied / f"orchestrator/store/migrations/versions/{number}_colour.py").write_text(
+        _NEXT.format(head=head, number=number)
+    )
     return root

@@ -27,11 +27,11 @@ from skytether.node.join import Joined, JoinOptions, join
 from skytether.node.run import NodeProgram
 from skytether.node.store import NodeStore
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.nodes.serving import serving_nodes
+from skytether.orchestrator.http.node_serving import serving_nodes
+from skytether.orchestrator.http.server import listening
 from skytether.orchestrator.runtimes.base import Capacity, Observation, Runtime
 from skytether.orchestrator.runtimes.docker.engine import Engine
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
-from skytether.orchestrator.server import listening
 from skytether.testing.runtimes import FakeOptions, FakeRuntime, FakeWorld
 
 PATIENCE = 30.0

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from skytether.api.rest import SiteCreate
-from skytether.orchestrator.catalogue import Catalogue
-from skytether.orchestrator.metrics import Metrics
-from skytether.orchestrator.moves import Moves
-from skytether.orchestrator.reconcile import Reconciler
-from skytether.orchestrator.records import Record
-from skytether.orchestrator.security import Secrets
-from skytether.orchestrator.settings import Limits, Timing, Weights
-from skytether.orchestrator.sites import Site
-from skytether.orchestrator.store import Store
-from skytether.orchestrator.strain import Strain
+from skytether.orchestrator.config.settings import Limits, Timing, Weights
+from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.security import Secrets
+from skytether.orchestrator.domain.strain import Strain
+from skytether.orchestrator.scheduling.catalogue import Catalogue
+from skytether.orchestrator.scheduling.moves import Moves
+from skytether.orchestrator.scheduling.reconcile import Reconciler
+from skytether.orchestrator.scheduling.sites import Site
+from skytether.orchestrator.store.store import Store
+from skytether.orchestrator.telemetry.metrics import Metrics
 from skytether.testing.runtimes import FakeOptions, FakeRuntime
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
-from skytether.orchestrator.defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
+from skytether.orchestrator.config.defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
 
 from .output import fail
 

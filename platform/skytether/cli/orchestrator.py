@@ -14,7 +14,7 @@ import typer
 from .output import console, fail
 
 if TYPE_CHECKING:
-    from skytether.orchestrator.store import Store
+    from skytether.orchestrator.store.store import Store
 
 app = typer.Typer(help="Run the orchestrator.", no_args_is_help=True)
 
@@ -73,10 +73,10 @@ def run(
     Every key of the configuration is a variable of the environment too, which goes before the file; options go before
     both. TLS, logs, limits and the reconciler's patience are set there: see `skytether orchestrator config`.
     """
-    from skytether.orchestrator.config import load, seen_by_others
-    from skytether.orchestrator.errors import InvalidError
-    from skytether.orchestrator.server import StartError
-    from skytether.orchestrator.server import run as serve
+    from skytether.orchestrator.config.sources import load, seen_by_others
+    from skytether.orchestrator.domain.errors import InvalidError
+    from skytether.orchestrator.http.server import StartError
+    from skytether.orchestrator.http.server import run as serve
 
     given = {
         "state_dir": state_dir,
@@ -107,7 +107,7 @@ def show_config(
     markdown: Annotated[bool, typer.Option("--markdown", help="As the page of the documentation.")] = False,
 ) -> None:
     """Print a configuration file with every key, its default and what it means."""
-    from skytether.orchestrator.config import example, page
+    from skytether.orchestrator.config.sources import example, page
 
     typer.echo(page() if markdown else example(), nl=False)
 
@@ -130,7 +130,7 @@ def verify_audit(
 
     That its end was cut off shows only by a hash that was noted elsewhere: give it with --last.
     """
-    from skytether.orchestrator.audit import AuditError, verify
+    from skytether.orchestrator.telemetry.audit import AuditError, verify
 
     try:
         checked = verify(file, last)
@@ -168,9 +168,9 @@ def rotate(
     Sessions keep the secret key that they began with; it stays beside the new one, and is deleted when the last of them
     has ended. The old operator's token is worth nothing from then on.
     """
-    from skytether.orchestrator.defaults import default_state_dir
-    from skytether.orchestrator.rotation import rotate_key, rotate_operator
-    from skytether.orchestrator.security import SecretFileError
+    from skytether.orchestrator.access.rotation import rotate_key, rotate_operator
+    from skytether.orchestrator.config.defaults import default_state_dir
+    from skytether.orchestrator.domain.security import SecretFileError
 
     folder = (secrets_dir or state_dir or default_state_dir()).expanduser()
     try:
@@ -203,12 +203,12 @@ def dismantle_sites(
 
     For when their orchestrators are gone for good: whatever runs there ends.
     """
-    from skytether.orchestrator.declared import read_groups, read_sites
-    from skytether.orchestrator.defaults import default_state_dir
-    from skytether.orchestrator.errors import ConflictError, InvalidError
-    from skytether.orchestrator.group_end import end_groups
+    from skytether.orchestrator.config.declared import read_groups, read_sites
+    from skytether.orchestrator.config.defaults import default_state_dir
+    from skytether.orchestrator.domain.errors import ConflictError, InvalidError
+    from skytether.orchestrator.groups.group_end import end_groups
     from skytether.orchestrator.runtimes.base import RuntimeFailure
-    from skytether.orchestrator.sites import dismantle
+    from skytether.orchestrator.scheduling.sites import dismantle
 
     folder = (state_dir or default_state_dir()).expanduser()
     try:
@@ -235,9 +235,9 @@ def _store(address: str) -> Iterator[Store]:
     """The database; one that cannot be used ends the command with one sentence."""
     from sqlalchemy.exc import SQLAlchemyError
 
-    from skytether.orchestrator.db import AddressError
-    from skytether.orchestrator.errors import OutdatedError
-    from skytether.orchestrator.store import Store
+    from skytether.orchestrator.domain.errors import OutdatedError
+    from skytether.orchestrator.store.db import AddressError
+    from skytether.orchestrator.store.store import Store
 
     try:
         store = Store(address)
@@ -257,7 +257,7 @@ def back_up(
 ) -> None:
     """Copy database, secret key and operator's token, while the orchestrator runs. Keep the copy as secret as these."""
     from skytether.orchestrator.backup import BackupError, backup
-    from skytether.orchestrator.defaults import default_state_dir
+    from skytether.orchestrator.config.defaults import default_state_dir
 
     try:
         copied = backup((state_dir or default_state_dir()).expanduser(), to)
@@ -272,7 +272,7 @@ def restore_copy(
 ) -> None:
     """Put a copy into a state folder that holds none, before an orchestrator is started over it."""
     from skytether.orchestrator.backup import BackupError, restore
-    from skytether.orchestrator.defaults import default_state_dir
+    from skytether.orchestrator.config.defaults import default_state_dir
 
     try:
         put = restore(source, (state_dir or default_state_dir()).expanduser())

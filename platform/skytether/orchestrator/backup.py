@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
+from .domain.security import KEY, OLD_KEY, OPERATOR
 from .nodes.authority import KEY as NODES_KEY
-from .security import KEY, OLD_KEY, OPERATOR
 
 DATABASE = "state.db"
 SECRETS = (KEY, OPERATOR)

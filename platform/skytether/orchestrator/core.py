@@ -14,43 +14,43 @@ from skytether.api.report_metrics import Owner
 from skytether.api.rest import GateReport, Report, ScrapeTargets
 from skytether.guard.clock import now as boottime
 
-from .access import Access, Principal
-from .accounts import Account
-from .catalogue import Catalogue
-from .clocks import SharedClock
-from .db import GONE
-from .declared import read_groups, read_sites
-from .demand import Demand
-from .discovery import advertised, named, targets
-from .errors import OutdatedError
-from .events import Broker
-from .exchange import Exchange
-from .gates import Gates
-from .groups import Groups, load_provider
-from .instances import Instances
-from .leader import Leadership
-from .loops import Loop
-from .metrics import GroupGauges, Metrics, Running, SiteGauges
-from .moves import Moves
+from .access.access import Access, Principal
+from .access.quotas import Quotas
+from .access.rotation import Rotation
+from .access.stored import Stored
+from .config.declared import read_groups, read_sites
+from .config.settings import Settings
+from .domain.accounts import Account
+from .domain.clocks import SharedClock
+from .domain.discovery import advertised, named, targets
+from .domain.errors import OutdatedError
+from .domain.security import SecretFileError, Secrets, close_folder
+from .domain.strain import Strain
+from .domain.throttle import Throttle
+from .groups.demand import Demand
+from .groups.groups import Groups, load_provider
+from .groups.scaler import Scaler
 from .nodes.authority import KEY as NODES_KEY
 from .nodes.authority import Authority
 from .nodes.enrolment import Enrolment
 from .nodes.machines import MachineInvites
 from .providers.base import Provider
-from .quotas import Quotas
-from .reconcile import Reconciler
-from .reports import PERIOD, Reports
-from .rotation import Rotation
+from .robots.exchange import Exchange
+from .robots.gates import Gates
+from .robots.stops import Stops
 from .runtimes.base import Runtime
-from .scaler import Scaler
-from .security import SecretFileError, Secrets, close_folder
-from .settings import Settings
-from .sites import Sites, load_runtime
-from .stops import Stops
-from .store import Store
-from .stored import Stored
-from .strain import Strain
-from .throttle import Throttle
+from .scheduling.catalogue import Catalogue
+from .scheduling.events import Broker
+from .scheduling.instances import Instances
+from .scheduling.loops import Loop
+from .scheduling.moves import Moves
+from .scheduling.reconcile import Reconciler
+from .scheduling.sites import Sites, load_runtime
+from .store.db import GONE
+from .store.leader import Leadership
+from .store.store import Store
+from .telemetry.metrics import GroupGauges, Metrics, Running, SiteGauges
+from .telemetry.reports import PERIOD, Reports
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import pytest
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import GateReport, Problem
-from skytether.orchestrator.settings import Timing
+from skytether.orchestrator.config.settings import Timing
 from skytether.robot.agent.gate_report import AGAIN_S, PERIOD_S, SaysGate
 
 CLEAR = GateReport(answers=True, hand="agent", zone="free")

@@ -22,8 +22,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from skytether.api.node import ALPN, SERVER_NAME
 
-from ..errors import Fault, InvalidError
-from ..security import SecretFileError, secret_file
+from ..domain.errors import Fault, InvalidError
+from ..domain.security import SecretFileError, secret_file
 
 KEY = "nodes.key"
 _DAY = 86_400.0

@@ -20,13 +20,13 @@ from cryptography import x509
 from skytether.api.node import Address, Issued, Join, Machine
 from skytether.api.rest import SiteCreate
 
-from ..database import Database
-from ..errors import ConflictError, NotFoundError, UnauthenticatedError, UnknownTokenError
-from ..security import PREFIX_LENGTH, TokenHash, new_token
-from ..sites import NODE, Sites
-from ..throttle import Throttle
+from ..domain.errors import ConflictError, NotFoundError, UnauthenticatedError, UnknownTokenError
+from ..domain.security import PREFIX_LENGTH, TokenHash, new_token
+from ..domain.throttle import Throttle
+from ..scheduling.sites import NODE, Sites
+from ..store.database import Database
+from ..store.node_rows import Invitation, Node
 from .authority import Authority, fingerprint, name_in, pem_of, requested_key, serial_of
-from .rows import Invitation, Node
 
 log = logging.getLogger(__name__)
 

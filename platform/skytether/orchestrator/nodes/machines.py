@@ -8,7 +8,7 @@ from typing import Any
 from skytether.api.groups import GroupCreate
 from skytether.api.rest import SiteCreate
 
-from ..errors import DomainError
+from ..domain.errors import DomainError
 from ..providers.base import Invitation, ProviderFailure
 from .enrolment import RUNTIME, Enrolment
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from skytether.api.node import ANSWER_S, GO, MOST_WAYS, PING_S, SILENT_S, Said, Told, line_of
 from skytether.api.splice import PIECE, Stream, splice
 
+from ..domain.throttle import Throttle
 from ..runtimes.docker.engine import ENGINE_AWAY, ENGINE_SOCKET
-from ..throttle import Throttle
 
 log = logging.getLogger(__name__)
 

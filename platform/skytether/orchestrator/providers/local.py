@@ -17,10 +17,10 @@ from typing_extensions import override
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
-from ..errors import InvalidError
+from ..domain.errors import InvalidError
+from ..domain.validation import parse
 from ..runtimes.base import Capacity, RuntimeFailure
-from ..sites import dismantle, load_runtime
-from ..validation import parse
+from ..scheduling.sites import dismantle, load_runtime
 from .base import Condition, Found, Order, Provider, ProviderFailure, ProviderSilentError, SiteShape
 
 _OURS = ("cpu", "memory_mb", "owner", "folder")

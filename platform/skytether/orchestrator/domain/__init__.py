@@ -1,0 +1,4 @@
+"""The words of the orchestrator: records and their legal changes, errors, secrets, checks of what people wrote.
+
+No database, no socket, no thread, no setting of an operator; time is an argument, or a clock that was passed in.
+"""

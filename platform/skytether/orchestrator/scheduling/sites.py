@@ -1,0 +1,543 @@
+"""The sites: each has a runtime and a thread of its own, so that a slow or silent one holds up no other."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import override
+
+from skytether.api.faults import known
+from skytether.api.manifest import ServiceSpec, Strict
+from skytether.api.rest import SiteCreate
+
+from ..config.declared import stored_as
+from ..config.settings import Timing
+from ..domain.errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
+from ..domain.validation import parse
+from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Runtime, RuntimeFailure
+from ..store.db import GONE
+from ..store.leader import LeadLostError, fence, fenced
+from ..store.store import Store
+from .fitness import Fitness
+from .loops import Loop
+from .placement import NOTHING, Candidate
+
+log = logging.getLogger(__name__)
+
+RUNTIMES = "skytether.runtimes"
+DEFAULT_SITE = SiteCreate(name="local", tier="edge", runtime="process")
+"""Made when there is no site at all. Tier ``edge``: the orchestrator's machine is near the robot, not on it."""
+NODE = "node://"
+"""How the engine of a machine that joined begins."""
+_FIRST_LOOK = 1.0
+"""Seconds a new site gets to answer before it is listed all the same."""
+_CLOSE_TIMEOUT = 5.0
+"""Seconds that a call into a hanging runtime gets at the end."""
+
+Step = Callable[["Site"], float]
+"""One reconcile pass over a site; returns seconds until the next."""
+
+
+def load_runtime(name: str) -> type[Runtime]:
+    """Find a runtime by its entry point.
+
+    Raises:
+        InvalidError: There is none, or it cannot be imported; the cause is told.
+    """
+    found = {point.name: point for point in entry_points(group=RUNTIMES)}
+    if name not in found:
+        there = ", ".join(sorted(found)) or "none"
+        raise InvalidError([Fault("runtime", f"there is no runtime '{name}'; installed are: {there}")])
+    try:
+        loaded = found[name].load()
+    except ImportError as error:
+        raise InvalidError([Fault("runtime", f"runtime '{name}' cannot be used: {error}")]) from error
+    if not (isinstance(loaded, type) and issubclass(loaded, Runtime)):
+        raise InvalidError([Fault("runtime", f"entry point '{name}' is no Runtime")])
+    return loaded
+
+
+class Unusable(Runtime):
+    """Stands in for a runtime that cannot be made (its extra was removed, say): the site is listed, with the reason."""
+
+    Options = Strict
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    @override
+    def refuses(self, spec: ServiceSpec) -> str | None:
+        return self._reason
+
+    def capacity(self) -> Capacity:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def start(self, launch: Launch) -> None:
+        raise RuntimeFailure(self._reason)
+
+    def observe(self) -> Mapping[str, Observation]:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def stop(self, instance: str, *, force: bool) -> None:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def remove(self, instance: str) -> None:
+        raise RuntimeFailure(self._reason)
+
+    @override
+    def logs(self, instance: str, lines: int) -> str:
+        raise RuntimeFailure(self._reason)
+
+
+class Site:
+    """One site: its runtime, and what is known of it now. Read from any thread, written by its own."""
+
+    def __init__(self, asked: SiteCreate, runtime: Runtime, step: Step, timing: Timing) -> None:
+        self.asked = asked
+        self.runtime = runtime
+        self.fitness = Fitness(timing.backoff_max, timing.unfit_max)
+        """What it failed to start: only the orchestrator that leads knows."""
+        self.capacity: Capacity | None = None
+        self.load: float | None = None
+        """Share of its processors that is busy; None: not known."""
+        self.failure = ""
+        """Why the last look failed; empty: it did not."""
+        self.balks = 0
+        """Passes in a row that looked, and were then not answered, or overtaken, when they acted."""
+        self.rests_until = -math.inf
+        """Steady seconds: it answered nothing, and whoever calls meanwhile does not have it asked again."""
+        self.observed: Mapping[str, Observation] = {}
+        self.looked_at = -math.inf
+        """Monotonic seconds of the last look that did not fail."""
+        self.seen_since: tuple[int, float] | None = None
+        """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
+        self.hosted: frozenset[str] | None = None
+        """Robots that have, or had, an instance here, as far as the store knows; None: it was not asked yet."""
+        self.ended: frozenset[str] = frozenset()
+        """Those of the observed that the store knows as ended."""
+        self.leaving: Mapping[str, str] = {}
+        """Of the observed those that the site is about to end, and why."""
+        self.awaited: Collection[str] | None = None
+        """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
+        self.draining = False
+        """It takes no more instances, and is deleted with its last one."""
+        self.group = ""
+        """Whose machine it is, for whoever leads; empty: of no group."""
+        self.evacuating = False
+        """It takes no more instances, and those that are there are moved elsewhere."""
+        self.called = False
+        """Somebody started or ended an instance here since the last pass began."""
+        self.passed_at = -math.inf
+        """Seconds of the reconciler's steady clock: when the last whole pass ended; minus infinity: with something left
+        to do, or not at all."""
+        self.watched_at = -math.inf
+        """The same of the last look at all that is here."""
+        self.pass_took = self.look_took = 0.0
+        """Seconds of a processor that both took."""
+        self.tidied_at = -math.inf
+        self.ender: threading.Thread | None = None
+        """Deletes it, once it is drained."""
+        self.led = 0
+        """Epoch of the leader as whose its runtime was last told to act; 0: nobody's."""
+        self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
+        self._silent_after = timing.site_silent
+
+    @property
+    def name(self) -> str:
+        return self.asked.name
+
+    def wake(self) -> None:
+        """Look at once at what starts or stops here; from any thread."""
+        self.called = True
+        self.loop.wake()
+
+    @property
+    def unreachable(self) -> str:
+        """Why it cannot be used now; empty: it can."""
+        silent = time.monotonic() - self.looked_at
+        if self.failure or silent < self._silent_after:
+            return self.failure
+        return f"it has not answered for {silent:.0f} s" if self.capacity else "it has not answered yet"
+
+    def candidate(
+        self, spec: ServiceSpec, used: Capacity, unstarted: str | None = None, unfit: str | None = None
+    ) -> Candidate:
+        """As placement sees it for one service.
+
+        Args:
+            spec: The service.
+            used: What the instances that are here asked for.
+            unstarted: Why this very instance could not be started here.
+            unfit: Why none of the service is to be, for a while.
+        """
+        return Candidate(
+            name=self.name,
+            tier=self.asked.tier,
+            cannot_run=self.runtime.refuses(spec),
+            draining=self.draining or self.evacuating,
+            unstarted=unstarted,
+            unfit=unfit,
+            unreachable=self.unreachable or None,
+            blocked=self.runtime.blocked() or None,
+            total=self.capacity or NOTHING,
+            used=used,
+            load=self.load or 0.0,
+            speed=self.asked.speed,
+            cost=self.asked.cost,
+            images=self.asked.images,
+            fills=bool(self.group),
+        )
+
+
+class Sites:
+    """All sites, in memory and in the store."""
+
+    def __init__(
+        self, folder: Path, store: Store, step: Step, timing: Timing, find_runtime: Callable[[str], type[Runtime]]
+    ) -> None:
+        """``step`` is what each site's thread does again and again; ``find_runtime`` gives a runtime by its name."""
+        self._find_runtime = find_runtime
+        self._folder = folder
+        self._store = store
+        self._step = step
+        self._timing = timing
+        self._lock = threading.Lock()
+        self._sites: dict[str, Site] = {}
+        self.on_deleted: Callable[[str], object] = lambda _: None
+        """Called with the name of a site when nothing of it is left here."""
+
+    def start(self, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
+        """Open every site of the store, and give them a moment to answer.
+
+        Args:
+            local: Make one, if there is none.
+            declared: Sites that are to be there, and as these.
+
+        Raises:
+            InvalidError: A declared one cannot be.
+        """
+        for asked in declared:
+            self._declare(asked)
+        if local and not self._store.sites():
+            self._store.add_site(DEFAULT_SITE)
+        self.refresh()
+        deadline = time.monotonic() + _FIRST_LOOK
+        for site in self.all():
+            site.loop.wait_first(max(0.0, deadline - time.monotonic()))
+
+    def _declare(self, asked: SiteCreate) -> None:
+        kind = self._find_runtime(asked.runtime)
+        there = next((site for site in self._store.sites() if site.name == asked.name), None)
+        wanted = stored_as(asked, there, kind)
+        if there is None:
+            self._store.add_site(wanted)  # or another orchestrator over this database has just done it
+        elif wanted != there:
+            self._store.change_site(wanted)
+            log.info("site %s is changed to what the sites file says", asked.name)
+
+    def stored(self) -> dict[str, Mapping[str, int]]:
+        """By site, bytes that services have written there by robot, as far as that is known."""
+        return {site.name: site.runtime.stored() for site in self.all()}
+
+    def hosted(self, name: str) -> frozenset[str] | None:
+        """Of a site that is a machine that joined, the robots that had an instance there; None: of no such site."""
+        site = self.find(name)
+        if site is None or not str(site.asked.options.get("engine", "")).startswith(NODE):
+            return None
+        return site.hosted or frozenset()
+
+    def refresh(self) -> None:
+        """Open and close what another orchestrator over the same database added and deleted."""
+        with self._lock:
+            wanted, draining = {site.name: site for site in self._store.sites()}, self._store.draining_sites()
+            evacuating = self._store.evacuating_sites()
+            gone = [site for name, site in self._sites.items() if wanted.get(name) != site.asked]
+            for site in gone:
+                del self._sites[site.name]
+            for one in wanted.values():
+                if one.name not in self._sites:
+                    self._open(one, self._make_usable(one))
+                self._sites[one.name].draining = one.name in draining
+                self._sites[one.name].evacuating = one.name in evacuating
+        for site in gone:
+            self._close(site)
+
+    def stop(self) -> None:
+        """Let go of all sites; what runs there runs on."""
+        all_ = self.all()
+        _end(all_)
+        for site in all_:
+            site.runtime.close()
+
+    def add(self, asked: SiteCreate, *, by_owner: bool = True, put: Callable[[SiteCreate], bool] | None = None) -> Site:
+        """A new site.
+
+        Args:
+            asked: As it was described.
+            by_owner: By the operator of the state folder, who may make one that runs as the orchestrator's user.
+            put: Stores it, and says whether it could, in the place of what does that otherwise.
+
+        Raises:
+            ForbiddenError: Somebody else wants one that does.
+            InvalidError: Runtime or options are wrong.
+            ConflictError: There is one of that name.
+        """
+        with self._lock:
+            kind = self._check(asked, by_owner=by_owner)
+            asked = asked.model_copy(update={"options": kind.completed(asked.options)})
+            self._must_be_unique(asked, kind.unique)
+            runtime = self._make_runtime(asked)
+            if not (put or self._store.add_site)(asked):  # by way of another orchestrator
+                runtime.close()
+                raise ConflictError(
+                    f"there is a site '{asked.name}' already: choose another name, or delete that first"
+                )
+            site = self._open(asked, runtime)
+        site.loop.wait_first(_FIRST_LOOK)
+        return site
+
+    def check(self, asked: SiteCreate, *, by_owner: bool) -> None:
+        """Whether such a site could be added now; raises as ``add``."""
+        with self._lock:
+            kind = self._check(asked, by_owner=by_owner)
+        parse(kind.Options, asked.options, prefix=("options",))
+
+    def _check(self, asked: SiteCreate, *, by_owner: bool) -> type[Runtime]:
+        if asked.name in self._sites:
+            raise ConflictError(f"there is a site '{asked.name}' already: choose another name, or delete that first")
+        kind = self._find_runtime(asked.runtime)
+        if kind.runs_as_us and not by_owner:
+            raise ForbiddenError(
+                f"instances at a site of the runtime '{asked.runtime}' are processes of the orchestrator's own "
+                "user: only the token in its state folder (operator.token) may make one"
+            )
+        given = sorted(kind.owner_options & asked.options.keys())
+        if given and not by_owner:
+            raise ForbiddenError(
+                f"the options {', '.join(given)} may open up the whole machine of the site, or tell its engine "
+                "passwords: only the token in the orchestrator's state folder (operator.token) may give them"
+            )
+        return kind
+
+    def change_options(self, name: str, changes: Mapping[str, Any]) -> None:
+        """Have some options of a site be others, from now on; what runs there runs on.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            InvalidError: They are wrong.
+        """
+        with self._lock:
+            asked = self.get(name).asked
+            changed = asked.model_copy(update={"options": {**asked.options, **changes}})
+            parse(self._find_runtime(asked.runtime).Options, changed.options, prefix=("options",))
+            self._store.change_site(changed)
+        self.refresh()
+
+    def _must_be_unique(self, asked: SiteCreate, key: str) -> None:
+        value = asked.options.get(key)
+        for other in self._sites.values() if value is not None else ():
+            if other.asked.runtime == asked.runtime and other.asked.options.get(key) == value:
+                raise ConflictError(
+                    f"site '{other.name}' has the same option '{key}': each would end the other's instances; "
+                    "give another, or leave it out"
+                )
+
+    def delete(self, name: str, *, force: bool = False) -> None:
+        """Forget a site, with what ended instances left there.
+
+        Args:
+            name: Its name.
+            force: With instances there, too: they count as failed, and their robots ask again.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            ConflictError: Instances are there.
+        """
+        with self._lock:
+            site = self.get(name)
+            held = [record.id for record in self._store.live_at(name)]
+            if held and not force:
+                raise ConflictError(
+                    f"site '{name}' has {len(held)} instances: delete them first ({', '.join(held[:3])}), or drain it: "
+                    "it takes no more, and is deleted with its last one"
+                )
+            self._store.delete_site(name)
+            del self._sites[name]
+        site.loop.stop(timeout=_CLOSE_TIMEOUT)
+        try:
+            try:
+                _empty(site.runtime)
+            except OvertakenError:  # it led here once; a site is deleted by whoever was asked to
+                site.runtime.close()
+                site.runtime = self._make_usable(site.asked)
+                _empty(site.runtime)
+        except RuntimeFailure as error:
+            log.warning("site %s was deleted, but what it left there stays: %s", name, error)
+        site.runtime.close()
+        self.on_deleted(name)
+
+    def drain(self, name: str) -> bool:
+        """Let a site take no more instances, and delete it as soon as none is there; whether it is gone by now.
+
+        Raises:
+            NotFoundError: There is none of that name.
+        """
+        with self._lock:
+            site = self.get(name)
+            self._store.drain_site(name)
+            site.draining = True
+        if self._store.live_at(name):
+            return False
+        self.delete(name)
+        return True
+
+    def evacuate(self, name: str, evacuating: bool = True) -> None:
+        """Let a site take no more instances, and have those that are there moved elsewhere; or not any more.
+
+        Raises:
+            NotFoundError: There is none of that name.
+            ConflictError: It is to be deleted with its last instance, which cannot be taken back.
+        """
+        with self._lock:
+            site = self.get(name)
+            if site.draining and not evacuating:
+                raise ConflictError(f"site '{name}' is to be deleted with its last instance: that cannot be taken back")
+            self._store.evacuate_site(name, evacuating)
+            site.evacuating = evacuating
+        site.wake()
+
+    def end_drained(self, held: Collection[str | None], forget: Callable[[str], object]) -> None:
+        """Delete what was drained; in threads of their own, for a site that does not answer takes its time.
+
+        Args:
+            held: Where instances are.
+            forget: Called with the name of each that is gone.
+        """
+        for site in self.all():
+            if site.draining and site.name not in held and (site.ender is None or not site.ender.is_alive()):
+                site.ender = threading.Thread(
+                    target=self._end_drained,
+                    args=(site.name, forget, fence()),
+                    name=f"drained-{site.name}",
+                    daemon=True,
+                )
+                site.ender.start()
+
+    def _end_drained(self, name: str, forget: Callable[[str], object], epoch: int) -> None:
+        try:
+            with fenced(epoch):
+                self.delete(name)
+        # By somebody else meanwhile; or the next pass tries.
+        except (NotFoundError, ConflictError, LeadLostError, *GONE) as error:
+            log.info("site %s is not deleted yet: %s", name, error)
+            return
+        log.info("site %s held no more instances, and was deleted", name)
+        forget(name)
+
+    def get(self, name: str) -> Site:
+        """One site.
+
+        Raises:
+            NotFoundError: There is none of that name; the text names those there are.
+        """
+        site = self.find(name)
+        if site is None:
+            raise NotFoundError(f"there is no site '{name}'; {known(self._sites, name)}")
+        return site
+
+    def find(self, name: str | None) -> Site | None:
+        return self._sites.get(name) if name else None
+
+    def find_anew(self, name: str | None) -> Site | None:
+        """The same; one that is not known may have been added at another orchestrator a moment ago."""
+        if name and name not in self._sites:
+            self.refresh()
+        return self.find(name)
+
+    def all(self) -> list[Site]:
+        return sorted(self._sites.values(), key=lambda site: site.name)
+
+    def _make_runtime(self, asked: SiteCreate) -> Runtime:
+        kind = self._find_runtime(asked.runtime)
+        options = parse(kind.Options, asked.options, prefix=("options",))
+        folder = self._folder / asked.name
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            return kind(asked.name, folder, options)
+        except RuntimeFailure as error:
+            raise InvalidError([Fault("runtime", str(error))]) from error
+
+    def _make_usable(self, asked: SiteCreate) -> Runtime:
+        try:
+            return self._make_runtime(asked)
+        except InvalidError as error:
+            log.error("site %s cannot be used: %s", asked.name, error)
+            return Unusable(str(error))
+
+    def _open(self, asked: SiteCreate, runtime: Runtime) -> Site:
+        site = Site(asked, runtime, self._step, self._timing)
+        self._sites[asked.name] = site
+        site.loop.start()
+        return site
+
+    def _close(self, site: Site) -> None:
+        site.loop.stop(timeout=_CLOSE_TIMEOUT)
+        site.runtime.close()
+
+
+def dismantle(
+    declared: Iterable[SiteCreate],
+    folder: Path,
+    find_runtime: Callable[[str], type[Runtime]] = load_runtime,
+    *,
+    erase: bool = False,
+) -> None:
+    """End and remove all that is at declared sites, whose orchestrators are gone for good.
+
+    Args:
+        declared: As `declared.read_sites` gives them.
+        folder: Where the runtimes keep what they note.
+        find_runtime: Gives a runtime by its name.
+        erase: And what services wrote there.
+
+    Raises:
+        InvalidError: Runtime or options are wrong.
+        RuntimeFailure: A site does not answer, or refuses.
+    """
+    for asked in declared:
+        kind = find_runtime(asked.runtime)
+        options = parse(kind.Options, asked.options, prefix=(asked.name, "options"))
+        (folder / asked.name).mkdir(mode=0o700, parents=True, exist_ok=True)
+        runtime = kind(asked.name, folder / asked.name, options)
+        try:
+            _empty(runtime)
+            if erase:
+                runtime.erase()
+        finally:
+            runtime.close()
+
+
+def _empty(runtime: Runtime) -> None:
+    """Leave nothing at a site that is no more."""
+    for instance in runtime.observe():
+        runtime.remove(instance)
+    runtime.dismantle()
+
+
+def _end(sites: Collection[Site]) -> None:
+    """End their threads; several that hang take no longer than one."""
+    for site in sites:
+        site.loop.stop(timeout=0)
+    deadline = time.monotonic() + _CLOSE_TIMEOUT
+    for site in sites:
+        site.loop.stop(max(0.0, deadline - time.monotonic()))

@@ -1,0 +1,59 @@
+"""What Prometheus is told to scrape."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from skytether.api.rest import ScrapeTargets, TokenCreate
+from skytether.orchestrator.config.settings import Settings
+from skytether.orchestrator.domain.discovery import MAX_ADDRESS, advertised, named, targets
+from skytether.orchestrator.domain.errors import InvalidError
+from skytether.orchestrator.domain.validation import parse
+
+
+def group(host: str, scheme: str = "http") -> ScrapeTargets:
+    return ScrapeTargets(targets=(host,), labels={"__scheme__": scheme})
+
+
+def test_an_orchestrator_is_where_it_was_asked_unless_it_says_otherwise() -> None:
+    assert targets((), None, "https://cloud:8600") == [group("cloud:8600", "https")]
+    assert targets((), "http://10.0.0.2:8600", "https://balancer") == [group("10.0.0.2:8600")]
+
+
+def test_all_that_are_connected_are_told_once_and_in_order() -> None:
+    names = [named("http://b:8600"), named("http://a:8600"), named(None), named("http://b:8600"), "psql"]
+    found = targets(advertised(names), "http://b:8600", "http://balancer")
+    assert found == [group("a:8600"), group("b:8600")]
+
+
+@pytest.mark.parametrize("name", ["skytether", "skytether x", "skytether http://a b", "other http://a:1", "", "\0"])
+def test_the_names_of_strange_connections_are_no_addresses(name: str) -> None:
+    assert advertised([name]) == set()
+
+
+@pytest.mark.parametrize("asked", ["http://", "http://a/b", 'http://a"', "ftp://a", "http://" + "a" * 300])
+def test_where_it_was_asked_may_be_anything(asked: str) -> None:
+    assert targets((), None, asked) == []
+
+
+def test_an_address_that_the_database_would_cut_off_is_refused() -> None:
+    longest = "https://" + "a" * (MAX_ADDRESS - 8)
+    assert len(named(longest)) <= 63
+    assert advertised([named(longest)]) == {longest}
+    for wrong in (longest + "a", "cloud:8600", "http://a b", "http://a/metrics"):
+        with pytest.raises(InvalidError, match="advertise"):
+            parse(Settings, {"advertise": wrong})
+
+
+def test_prometheus_is_answered_with_a_token_that_may_nothing_else(served: Any) -> None:
+    token = served.client(served.token).create_token(TokenCreate(name="prometheus", scopes=("metrics",))).token
+    headers = {"Authorization": f"Bearer {token}"}
+    with httpx.Client(base_url=served.url, headers=headers, trust_env=False) as http:
+        answer = http.get("/api/v1/prometheus/targets")
+        assert answer.headers["content-type"] == "application/json"
+        assert answer.json() == [{"targets": [served.url.removeprefix("http://")], "labels": {"__scheme__": "http"}}]
+        assert http.get("/api/v1/sites").status_code == 403
+        assert http.get("/api/v1/prometheus/targets", headers={"Host": 'x"y'}).status_code < 500

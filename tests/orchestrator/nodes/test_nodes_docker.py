@@ -1,0 +1,100 @@
+"""A machine that joined, with a real engine: containers are started by way of it, and outlive a pulled cable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from docker.errors import APIError
+from docker_site import DockerSite
+from node_scene import NodeScene, program, until
+
+from skytether.api.client import Client
+from skytether.api.rest import InstanceCreate, Invite, State
+from skytether.node.join import join
+from skytether.orchestrator.config.settings import Nodes, Settings, Timing
+from skytether.orchestrator.core import Orchestrator
+from skytether.orchestrator.http.app import create_app
+from skytether.orchestrator.runtimes.docker.client import Client as Engine
+from skytether.orchestrator.runtimes.docker.objects import holder
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
+
+pytestmark = [pytest.mark.docker, pytest.mark.slow]
+
+ENGINE = "unix:///var/run/docker.sock"
+
+
+@pytest.fixture
+def house(tmp_path: Path, server: Any, docker_site: DockerSite, manifest: Callable[..., Any]) -> Iterator[NodeScene]:
+    settings = Settings(state_dir=tmp_path / "state", nodes=Nodes(port=0), timing=Timing(site_silent=5))
+    core = Orchestrator(settings)
+    core.start()
+    core.sites.delete("local")
+    server.app = create_app(core)
+    server.share_routes()
+    with Client(server.url, (tmp_path / "state/operator.token").read_text().strip()) as operator:
+        operator.put_service("toy", manifest(entrypoint=None, image=docker_site.images.toy))
+        scene = NodeScene(core, operator, tmp_path)
+        yield scene
+        scene.close()
+    core.stop()
+
+
+def test_what_runs_at_a_node_that_is_unplugged_runs_on_and_is_found_again(
+    house: NodeScene, docker_site: DockerSite
+) -> None:
+    options = {key: value for key, value in docker_site.options().items() if key != "engine"}
+    token = house.operator.invite(Invite(name="edge", options=options)).token
+    joined = join(house.options(token, engine=ENGINE))
+    assert joined.stands.state == "ready", joined.stands.reason
+    with program(house.store()) as linked:
+        until(lambda: linked and house.state() == "ready")
+        made = house.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=1000))
+        before = house.operator.wait_running(made.id)
+        assert before.session is not None
+        assert before.session.host == "127.0.0.1"
+        (container,) = docker_site.containers()
+        began = docker_site.docker("inspect", "-f", "{{.State.StartedAt}}", container)
+        assert house.operator.logs(made.id)
+        refuses_to_be_had(house, docker_site, container)
+        house.shut()
+        until(lambda: house.state() == "unreachable")
+        assert docker_site.docker("inspect", "-f", "{{.State.Running}}", container) == "true"
+        house.open()
+        until(lambda: house.state() == "ready")
+        after = house.operator.renew_instance(made.id)
+        assert (after.state, after.restarts) == (State.RUNNING, 0)
+        assert docker_site.docker("inspect", "-f", "{{.State.StartedAt}}", container) == began
+        house.operator.delete_instance(made.id)
+        until(lambda: not house.operator.get_site("edge").instances)
+        # By way of the node what is left there goes with the site.
+        assert house.operator.delete_site("edge")
+        assert docker_site.containers() == docker_site.helpers() == []
+
+
+def refuses_to_be_had(house: NodeScene, docker_site: DockerSite, ours: str) -> None:
+    """Whoever has the orchestrator gets neither the node's files, nor what else runs there, nor a shell in it."""
+    way = f"unix://{house.core.settings.state_dir}/sites/edge/engine.sock"
+    image = docker_site.images.name("base")
+    good = holder(DockerOptions(network=docker_site.network), docker_site.owner, image)
+    stranger = docker_site.docker("create", "--entrypoint", "/bin/sleep", image, "60")
+    client = Engine(way, version="1.41", timeout=30)
+    try:
+        client.remove_container(client.create_container_from_config(good)["Id"])
+        for key, value in (("Binds", ["/:/host"]), ("Privileged", True), ("NetworkMode", "host"), ("PidMode", "host")):
+            with pytest.raises(
+                APIError, match=f"this machine's node refuses it: .*{'host' if key == 'NetworkMode' else key}"
+            ):
+                client.create_container_from_config({**good, "HostConfig": {**good["HostConfig"], key: value}})
+        with pytest.raises(APIError, match="is nothing that a site needs"):
+            client.exec_create(ours, "/bin/true")
+        with pytest.raises(APIError, match="is not of an orchestrator"):
+            client.remove_container(stranger, force=True)
+        with pytest.raises(APIError, match="something else of this machine"):
+            client.create_volume("skytether-x", driver_opts={"type": "none", "o": "bind", "device": "/"})
+        assert docker_site.docker("inspect", "-f", "{{.State.Status}}", stranger) == "created"
+    finally:
+        client.close()
+        docker_site.docker("rm", "-f", stranger)
