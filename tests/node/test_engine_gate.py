@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import socketserver
 import tempfile
@@ -11,6 +12,8 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
@@ -19,7 +22,7 @@ from skytether.node.engine_gate import EngineGate
 
 ID, OTHER = "f" * 64, "e" * 64
 CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
-"CapDrop": ["ALL"], "SecurityOpt": ["no-new-privileges"]}}"""
+"CapDrop": ["ALL"], "SecurityOpt": ["no-new-privileges"], "ReadonlyRootfs": true, "PidsLimit": 9}}"""
 WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
     b'"CapDrop"', b'"Mounts": [{"Type": "volume", "Source": "skytether-main_state", "Target": "/d"}], "CapDrop"'
 )
@@ -33,6 +36,10 @@ class Engine:
         self.asked: list[tuple[str, dict[str, str], bytes]] = []
         self.ended = False
         """It takes connections, and answers nobody."""
+        self.container: dict[str, Any] = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": []}
+        self.links: set[str] = set()
+        """In its images."""
+        self.volumes: list[dict[str, Any]] = []
         engine = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -45,13 +52,19 @@ class Engine:
                     return
                 engine.asked.append((f"{self.command} {self.path}", dict(self.headers), body))
                 labels = {"skytether.io/owner": "edge"} if ID in self.path else {}
-                text = json.dumps({"Id": ID, "Config": {"Labels": labels}, "Labels": labels}).encode()
-                self.send_response(200)
+                said = {"Id": ID, "Config": {"Labels": labels}, "Labels": labels, "Image": "a", **engine.container}
+                if "/system/df" in self.path:
+                    said = {"Containers": [{"Command": "secret"}], "Volumes": engine.volumes}
+                text = json.dumps(said).encode()
+                self.send_response(201 if self.path == "/containers/create" else 200)
+                asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
+                stat = {"mode": 1 << 27 if asked in engine.links else 0}
+                self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
                 self.send_header("Content-Length", str(len(text)))
                 self.end_headers()
-                self.wfile.write(text)
+                self.wfile.write(text if self.command != "HEAD" else b"")
 
-            do_GET = do_POST = do_PUT = do_DELETE = _serve  # noqa: N815 (the library's names)
+            do_HEAD = do_GET = do_POST = do_PUT = do_DELETE = _serve  # noqa: N815 (the library's names)
 
             def log_message(self, *_: Any) -> None:
                 pass
@@ -141,6 +154,116 @@ def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("/containers/prune?filters=%7B%22label%22%3A+%5B%22skytether.io%2Fguard%22%5D%7D", "x-www-form-urlencoded"),
+        ("/images/create?fromImage=a&tag=1", "x-www-form-urlencoded"),
+    ],
+)
+def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: str) -> None:
+    """An engine believes a form before the query, and one is a document of JSON, too."""
+    form = json.dumps("a=b&filters={}&fromImage=&fromSrc=http://example/&repo=debian&z=").encode()
+    said = say(engine, request(f"POST {path}", form, f"Content-Type: application/{kind}"))
+    assert b"the call has a body" in said
+    assert b"200 OK" in say(engine, request(f"POST {path}", b"null", f"Content-Type: application/{kind}"))
+    ((_, headers, got),) = engine.asked
+    assert not got
+    assert "content-type" not in {name.lower() for name in headers}
+
+
+MOUNTED = [
+    {"Type": "volume", "Name": ID, "Destination": "/run/skytether"},
+    {"Type": "volume", "Name": "skytether-data", "Destination": "/run/skytether/data"},
+]
+
+
+def volume(path: str, name: str = ID) -> dict[str, str]:
+    return {"Type": "volume", "Name": name, "Destination": path}
+
+
+@pytest.mark.parametrize(
+    ("mounts", "changes", "links", "says"),
+    [
+        (MOUNTED, {}, set(), b""),
+        ([*MOUNTED, volume("/data"), volume("/var/lib/a")], {}, {"/lib"}, b""),
+        (MOUNTED, {"HostConfig": {"ReadonlyRootfs": False}}, set(), b"it may change its own files"),
+        (MOUNTED, {"HostConfig": None}, set(), b"it may change its own files"),
+        ([volume("/w"), volume("/w/a/b")], {}, set(), b"/w/a/b is in /w, where things can be moved"),
+        ([volume("/w", "skytether-w"), volume("/w/a")], {}, set(), b"/w/a is in /w, where things can be moved"),
+        ([volume("/etc", "skytether-w")], {}, set(), b"/etc/hosts is in /etc, where things can be moved"),
+        (MOUNTED, {}, {"/etc"}, b"/etc is a link in its image"),
+        (MOUNTED, {}, {"/run/skytether"}, b"/run/skytether is a link in its image"),
+        ([*MOUNTED, volume("/var/lib/a")], {}, {"/var/lib"}, b"/var/lib is a link in its image"),
+    ],
+)
+def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
+    engine: Engine, mounts: list[Any], changes: dict[str, Any], links: set[str], says: bytes
+) -> None:
+    engine.container, engine.links = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": mounts, **changes}, links
+    sent = request(f"GET /containers/{ID}/archive?path=/run")
+    got = say(engine, sent + sent)
+    if not says:
+        assert got.count(b"200 OK") == 2
+        assert engine.lines.count("POST /containers/create") == 1  # looked at once
+        assert f"DELETE /containers/{ID}?force=1&v=1" in engine.lines
+    else:
+        assert says in got
+        assert sent.split(b" HTTP")[0].decode() not in engine.lines
+
+
+def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> None:
+    ours = {"Name": "skytether-a", "Labels": {"skytether.io/owner": "edge"}, "UsageData": {"Size": 7}}
+    engine.volumes = [ours, {"Name": "database", "Options": {"o": "password=secret"}, "Labels": None}]
+    got = say(engine, request("GET /v1.41/system/df?type=volume&verbose=1"))
+    assert json.loads(got.partition(b"\r\n\r\n")[2]) == {"Volumes": [ours]}
+
+
+def test_a_refusal_takes_one_line_of_the_log_and_many_take_few(
+    engine: Engine, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def refuse() -> None:
+        gate = EngineGate(engine.path, ())
+        for number in range(100):
+            reader = asyncio.StreamReader()
+            reader.feed_data(request(f"GET /a{number}%0A%1b[31mfalse"))
+            nobody = AsyncMock(asyncio.StreamWriter, write=Mock())
+            await gate.pass_requests((reader, nobody), (reader, nobody))
+
+    asyncio.run(refuse())
+    assert 1 < len(caplog.messages) < 50
+    assert not any(line != line.strip() or "\n" in line or "\x1b" in line for line in caplog.messages)
+
+
+def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) -> None:
+    """Of a few only is a large body read; whoever wants little is served meanwhile."""
+
+    async def run() -> int:
+        gate, taken = EngineGate(engine.path, ()), 0
+        readers = [asyncio.StreamReader() for _ in range(100)]
+        nobody = AsyncMock(asyncio.StreamWriter, write=Mock())
+        head = b"POST /containers/create HTTP/1.1\r\nContent-Length: 1000000\r\n\r\n"
+        for reader in readers:
+            reader.feed_data(head + b" " * 60_000)
+        ways = [asyncio.create_task(gate.pass_requests((reader, nobody), (reader, nobody))) for reader in readers]
+        small = asyncio.StreamReader()
+        small.feed_data(request("GET /info"))
+        small.feed_eof()
+        await gate.pass_requests((small, nobody), (small, nobody))
+        written = b"".join(call.args[0] for call in nobody.write.call_args_list)
+        assert written.startswith(b"GET /info")
+        for reader in readers:
+            before = len(reader._buffer)  # type: ignore[attr-defined]
+            reader.feed_data(b" " * 10)
+            taken += before < 60_000 or reader._waiter is not None  # type: ignore[attr-defined]
+        for way in ways:
+            way.cancel()
+        await asyncio.gather(*ways, return_exceptions=True)
+        return taken
+
+    assert asyncio.run(run()) <= 16
+
+
+@pytest.mark.parametrize(
     ("sent", "says"),
     [
         (request(f"DELETE /containers/{OTHER}"), b"is not of an orchestrator"),
@@ -157,6 +280,8 @@ def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
         (request("POST /containers/database%2Fexec", b"{}"), b"nothing that a site needs"),
         (request("POST /containers/create", b'{"HostConfig": {"Binds": ["/:/host"]}}'), b"'Binds'"),
         (request("GET /info", b"POST /build HTTP/1.1\r\n\r\n"), b"its body is no JSON"),
+        (request("GET /networks/bridge"), b"bridge is not of an orchestrator"),
+        (request(f"POST /v1.23/containers/{ID}/start", b'{"Binds": ["/:/host"]}'), b"nothing that a site needs"),
         (request("GET /info", b"", "Content-Length: 5"), b"no plain request"),
         (request("GET /info", b"", "Transfer-Encoding: chunked"), b"no plain request"),
         (request("GET /info", b"", " folded: 1"), b"no plain request"),

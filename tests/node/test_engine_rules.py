@@ -64,10 +64,7 @@ def test_what_the_runtime_makes_is_passed_on(body: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("method", "path"),
     [
-        *(
-            ("GET", f"/v1.41/{path}")
-            for path in ("version", "info", "events", "system/df", "containers/json", "volumes")
-        ),
+        *(("GET", f"/v1.41/{path}") for path in ("version", "info", "system/df")),
         *(("GET", f"/v1.41/containers/{ID}/{what}") for what in ("json", "logs", "stats", "archive")),
         *(("POST", f"/v1.41/containers/{ID}/{what}") for what in ("start", "kill", "wait")),
         ("HEAD", f"/v1.41/containers/{ID}/archive"),
@@ -82,8 +79,22 @@ def test_what_the_runtime_makes_is_passed_on(body: dict[str, Any]) -> None:
 def test_what_the_runtime_asks_of_them_is_passed_on(method: str, path: str) -> None:
     refused, subjects = judge(Call(method, path, {}, None))
     assert refused is None
-    about = path.partition("containers/")[2] or (path if method == "DELETE" else "")
-    assert bool(subjects) == (bool(about) and about != "json")
+    assert bool(subjects) == any(kind in path for kind in ("containers", "networks", "volumes"))
+
+
+@pytest.mark.parametrize("path", ["events", "containers/json", "volumes"])
+def test_of_lists_only_what_orchestrators_made_is_passed_on(path: str) -> None:
+    def listed(filters: str) -> str | None:
+        return asked("GET", f"/v1.41/{path}", filters=filters)
+
+    assert listed('{"label": ["skytether.io/owner=edge", "a"]}') is None
+    assert listed('{"label": ["skytether.io/owner"], "type": ["container"]}') is None
+    for odd in (
+        *("", "{}", "[]", '{"label": []}', '{"label": ["skytether.io/owners"]}', '{"label": ["a=skytether.io/owner"]}'),
+        '{"label!": ["skytether.io/owner"]}',
+        '{"label": ["skytether.io/owner"], "label": []}',
+    ):
+        assert "only what has the label" in str(listed(odd)), odd
 
 
 def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for_them() -> None:
@@ -107,7 +118,13 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
     )
 
 
-HOST = {"NetworkMode": "skytether", "CapDrop": ["ALL"], "SecurityOpt": SECURITY}
+HOST: dict[str, Any] = {
+    "NetworkMode": "skytether",
+    "CapDrop": ["ALL"],
+    "SecurityOpt": SECURITY,
+    "ReadonlyRootfs": True,
+    "PidsLimit": 64,
+}
 
 
 @pytest.mark.parametrize(
@@ -146,6 +163,13 @@ HOST = {"NetworkMode": "skytether", "CapDrop": ["ALL"], "SecurityOpt": SECURITY}
         ({"Devices": [{"PathOnHost": "/dev/video0", "pathonhost": "/dev/sda"}]}, "a device has 'pathonhost'"),
         ({"DeviceRequests": [{"Driver": "cdi", "DeviceIDs": ["vendor.com/all=all"]}]}, "odd devices"),
         ({"LogConfig": {"Type": "syslog"}}, "its log goes elsewhere"),
+        ({"NetworkMode": None}, "its network is ''"),  # and not the network of that name
+        ({"ReadonlyRootfs": False}, "it may change its own files"),
+        ({"ReadonlyRootfs": None}, "it may change its own files"),
+        ({"PidsLimit": None}, "its PidsLimit is None"),
+        ({"PidsLimit": -1}, "its PidsLimit is -1"),
+        ({"PidsLimit": True}, "its PidsLimit is True"),
+        ({"PortBindings": {"7600/udp": [{"HostPort": "1"}, {"HostPort": "2"}]}}, "it publishes too many ports"),
     ],
 )
 def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any], says: str) -> None:
@@ -189,6 +213,16 @@ def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any]
             {},
         ),
         ("POST", "/networks/n/connect", {"Container": ID, "EndpointConfig": {"Aliases": ["database"]}}, {}),
+        ("GET", "/networks/0123456789ab", None, {}),  # the beginning of an id
+        # Of 1.23 a start takes what a container is made of.
+        ("POST", f"/v1.23/containers/{ID}/start", None, {}),
+        ("POST", f"/v1.40/containers/{ID}/start", None, {}),
+        ("POST", f"/v1.41/containers/{ID}/start", {"Binds": ["/:/host"]}, {}),
+        ("POST", f"/containers/{ID}/start", None, {"checkpoint": "a", "checkpoint-dir": "/tmp"}),
+        # A form, where an engine reads one: a document of JSON, too.
+        ("POST", "/containers/prune", "a&filters={}&", {"filters": '{"label": ["skytether.io/guard"]}'}),
+        ("POST", "/containers/prune", None, {"filters": '{"label": ["skytether.io/guard"], "label": ["a"]}'}),
+        ("POST", "/images/create", "a&fromImage=&fromSrc=http://a/b&repo=debian&", {"fromImage": "a"}),
         ("GET", "/plugins", None, {}),
         ("POST", "/swarm/init", {}, {}),
         ("POST", "/session", None, {}),
@@ -210,6 +244,20 @@ def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are()
     assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
     assert judge(Call("DELETE", "/networks/n", {}, None)) == (None, (("networks", "n"),))
     assert judge(Call("PUT", f"/containers/{ID}/archive", {}, None)) == (None, (("containers", ID),))
+
+
+@pytest.mark.parametrize("name", ["database", "0123456789ab", ID, "skytether", ""])
+def test_nothing_is_made_by_a_name_that_somebody_else_has_or_looks_for(name: str) -> None:
+    """A container's name goes before the beginning of another's id; a network's is looked up where one starts."""
+    made = {"Image": "a", "Labels": OWNER, "HostConfig": HOST}
+    assert "it is named" in str(asked("POST", "/containers/create", made, name=name))
+    bridge = {"com.docker.network.bridge.name": "skt-0123456789"}
+    network = {"CheckDuplicate": True, "Driver": "bridge", "Options": bridge, "Labels": {"skytether.io/network": ""}}
+    refused = asked("POST", "/networks/create", {**network, "Name": name})
+    assert refused is None if name == "skytether" else "the name of a network" in str(refused)
+    for odd in ("skt-", "skt-+", "skt-a/b", "skt-0123456789ab", "br0", None):
+        changed = {**network, "Name": "skytether", "Options": {"com.docker.network.bridge.name": odd}}
+        assert "a bridge of its own" in str(asked("POST", "/networks/create", changed))
 
 
 @pytest.mark.parametrize("name", ["abc", "0123456789ab", ID[:63], "skytether-a"])

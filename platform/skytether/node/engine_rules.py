@@ -11,40 +11,56 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
-from .seccomp_rules import holds
+from .seccomp_rules import holds, once
 
 OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
 """Labels of what orchestrators made."""
 OPEN = "skytether.io/open"
 """Label of a network that the machine's owner made, and that containers of sites may be in."""
+WEIGHED = "/system/df"
+"""Says of all that an engine has what it is and how large: of the answer what is ours is passed on only."""
 _CONTAINER_ID = "[0-9a-f]{64}"
 """Whole: an engine takes names and beginnings of ids, too, and what these mean may change between two calls."""
 _ID = r"([A-Za-z0-9][A-Za-z0-9_.-]*)"
-_BEFORE = re.compile(r"^/v1\.\d{1,3}(?=/)")
+_BEFORE = re.compile(r"^/v1\.(?:4[1-9]|[5-9]\d|[1-9]\d\d)(?=/)")
+"""Versions of the engine's interface, from the oldest that a site uses on: ``start`` of 1.23 takes a ``HostConfig``."""
 _CALLS = tuple(
-    (methods.split(), re.compile(pattern.replace("CID", f"({_CONTAINER_ID})").replace("ID", _ID)), kind)
-    for methods, pattern, kind in (
-        ("GET HEAD", r"/_ping|/version|/info|/events|/system/df|/containers/json|/volumes", ""),
-        ("POST", r"/containers/create", "create"),
-        ("POST", r"/containers/prune", "prune"),
-        ("GET", r"/containers/CID/(?:json|logs|stats)", "container"),
-        ("GET", r"/containers/(skytether-[A-Za-z0-9_.-]+)/json", "container"),
-        ("GET HEAD PUT", r"/containers/CID/archive", "container"),
-        ("POST", r"/containers/CID/(?:start|kill|wait)", "container"),
-        ("POST", r"/containers/CID/update", "update"),
-        ("DELETE", r"/containers/CID", "container"),
-        ("GET", r"/images/[A-Za-z0-9](?:[A-Za-z0-9_:@-]|[./](?![./]))*/json", ""),
-        ("POST", r"/images/create", "pull"),
-        ("GET", r"/networks/ID", ""),
-        ("POST", r"/networks/create", "network made"),
-        ("POST", r"/networks/ID/(?:connect|disconnect)", "joined"),
-        ("DELETE", r"/networks/ID", "network"),
-        ("POST", r"/volumes/create", "volume made"),
-        ("DELETE", r"/volumes/ID", "volume"),
+    (
+        methods.split(),
+        re.compile(pattern.replace("CID", f"({_CONTAINER_ID})").replace("ID", _ID)),
+        kind,
+        frozenset(asks.split()),
+    )
+    for methods, pattern, kind, asks in (
+        ("GET HEAD", r"/_ping|/version|/info", "", ""),
+        ("GET", r"/events", "listed", "since until filters"),
+        ("GET", r"/containers/json", "listed", "all limit size trunc_cmd filters"),
+        ("GET", r"/volumes", "listed", "filters"),
+        ("GET", WEIGHED, "", "type verbose"),
+        ("POST", r"/containers/create", "create", "name"),
+        ("POST", r"/containers/prune", "prune", "filters"),
+        ("GET", r"/containers/CID/json", "container", ""),
+        ("GET", r"/containers/CID/logs", "container", "stdout stderr timestamps follow tail since until"),
+        ("GET", r"/containers/CID/stats", "container", "stream one-shot"),
+        ("GET", r"/containers/(skytether-[A-Za-z0-9_.-]+)/json", "container", ""),
+        ("GET HEAD PUT", r"/containers/CID/archive", "container", "path"),
+        ("POST", r"/containers/CID/start", "container", ""),
+        ("POST", r"/containers/CID/kill", "container", "signal"),
+        ("POST", r"/containers/CID/wait", "container", "condition"),
+        ("POST", r"/containers/CID/update", "update", ""),
+        ("DELETE", r"/containers/CID", "container", "v link force"),
+        ("GET", r"/images/[A-Za-z0-9](?:[A-Za-z0-9_:@-]|[./](?![./]))*/json", "", ""),
+        ("POST", r"/images/create", "pull", "fromImage tag"),
+        ("GET", r"/networks/ID", "network seen", ""),
+        ("POST", r"/networks/create", "network made", ""),
+        ("POST", r"/networks/ID/(?:connect|disconnect)", "joined", ""),
+        ("DELETE", r"/networks/ID", "network", ""),
+        ("POST", r"/volumes/create", "volume made", ""),
+        ("DELETE", r"/volumes/ID", "volume", "force"),
     )
 )
 _LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
@@ -56,8 +72,15 @@ _HOST = _LIMITS | {
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
 _PORTS = {"7600/udp"}
 """Inside: where a service's end of the bridge is."""
-_BRIDGES, _VOLUMES = "skt-", "skytether-"
-"""What names of ours begin with: of interfaces, and of volumes that outlive their containers."""
+_OURS = "skytether-"
+"""What names of ours begin with: of containers, of networks but for one, and of volumes that outlive their containers.
+By any other name, somebody else on this machine could have ours for his own: it is looked for before the beginnings of
+ids, and by name where a container starts."""
+_NETWORK, _BRIDGE = r"skytether(?:-[A-Za-z0-9_.-]+)?", "skt-[0-9A-Za-z]{1,11}"
+_MOST_PIDS = 1 << 15
+"""Of a container's processes and threads."""
+_MOST_PORTS = 1
+"""Published: each costs the machine a process of root or two."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +96,8 @@ class Call:
 
 
 Subject = tuple[str, str]
-"""Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all; and ``joined
-networks``, which must be there, and be ours or open to us."""
+"""Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all; of networks
+that must be ours or open to us, ``seen networks``, if they are there, and ``joined networks``, which must be."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -84,34 +107,44 @@ def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Su
         call: What is asked.
         devices: Files of devices that containers may have.
     """
-    path = _BEFORE.sub("", call.path)
-    for methods, pattern, kind in _CALLS:
+    path = plain(call.path)
+    for methods, pattern, kind, asks in _CALLS:
         if call.method in methods and (found := pattern.fullmatch(path)):
             name = found[1] if found.groups() else ""
-            return _judge(kind, name, call, devices)
+            refused, subjects = _judge(kind, name, call, devices)
+            return refused or _only(call.query, asks, "the call"), subjects
     return f"{call.method} {path[:100]} is nothing that a site needs", ()
+
+
+def plain(path: str) -> str:
+    """A path without the version of the interface that is meant."""
+    return _BEFORE.sub("", path)
 
 
 def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[str | None, tuple[Subject, ...]]:
     body, expects = call.body, kind in ("create", "update", "network made", "joined", "volume made")
     if expects and not isinstance(body, dict):
         return "the call wants an object", ()
+    if body is not None and not expects:
+        return "the call has a body", ()
     match kind:
         case "create":
             host = _at(body, "HostConfig")
-            network = str(host.get("NetworkMode", ""))
+            network = _text(host, "NetworkMode")
             within = network.partition("container:")[2]
             volumes = [one.get("Source") for one in _list(host, "Mounts") if isinstance(one, dict)]
-            return _container(body, set(devices)), (
+            name = call.query.get("name", _OURS)
+            odd = None if name.startswith(_OURS) else f"it is named '{name[:80]}', and ours begin with {_OURS}"
+            return odd or _container(body, set(devices)), (
                 ("containers", within) if within else ("joined networks", network),
-                *(("volumes", str(name)) for name in volumes if name),
+                *(("volumes", str(volume)) for volume in volumes if volume),
             )
         case "update":
             return _only(body, _LIMITS, "limits"), (("containers", name),)
         case "joined":
             settings = {key: one for key, one in _at(body, "EndpointConfig").items() if one}
             refused = _only(body, {"Container", "EndpointConfig", "Force"}, "the call") or _only(settings, set(), "it")
-            container = str(body.get("Container", ""))
+            container = _text(body, "Container")
             if not re.fullmatch(_CONTAINER_ID, container):
                 return "a container is named by its whole id", ()
             return refused or _network_name(name), (("containers", container), ("joined networks", name))
@@ -123,8 +156,13 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             filters = _json(call.query.get("filters", ""))
             ours = isinstance(filters, dict) and filters.get("label") in ([OLD_GUARD], {OLD_GUARD: True})
             return None if ours else "only what earlier releases left is pruned", ()
-        case "pull":
-            return _only(call.query, {"fromImage", "tag"}, "a pull"), ()
+        case "listed":
+            filters = _json(call.query.get("filters", ""))
+            labels = filters.get("label") if isinstance(filters, dict) else None
+            ours = isinstance(labels, list) and any(str(one).partition("=")[0] == OWNER for one in labels)
+            return None if ours else f"only what has the label {OWNER} is listed", ()
+        case "network seen":
+            return _network_name(name), (("seen networks", name),)
         case "network":
             return _network_name(name), (("networks", name),)
         case "container" | "volume":
@@ -134,7 +172,8 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
 
 def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
     host = _at(body, "HostConfig")
-    mode = str(host.get("NetworkMode", ""))
+    mode = _text(host, "NetworkMode")
+    pids, ports = host.get("PidsLimit"), _at(host, "PortBindings").values()
     checks = (
         _only(body, _CONTAINER, "a container"),
         _only(host, _HOST, "a container"),
@@ -143,6 +182,9 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         None if mode.startswith("container:") else _network_name(mode),
         _only(_at(body, "ExposedPorts"), _PORTS, "a container"),
         _only(_at(host, "PortBindings"), _PORTS, "a container"),
+        None if all(len(bound or ()) <= _MOST_PORTS for bound in ports) else "it publishes too many ports",
+        None if host.get("ReadonlyRootfs") is True else "it may change its own files",
+        None if type(pids) is int and 0 < pids <= _MOST_PIDS else f"its PidsLimit is {str(pids)[:80]}",
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
         _rights(host.get("CapAdd") or [], mode),
         _security(host.get("SecurityOpt")),
@@ -179,8 +221,8 @@ def _network_name(name: str) -> str | None:
 def _mount(mount: Any) -> str | None:
     if not isinstance(mount, dict) or mount.get("Type") != "volume":
         return "it mounts something of this machine"
-    name = mount.get("Source") or _VOLUMES
-    if not str(name).startswith(_VOLUMES):
+    name = mount.get("Source") or _OURS
+    if not str(name).startswith(_OURS):
         return f"it mounts the volume '{str(name)[:80]}', which is not ours"
     labels_only = _only(_at(mount, "VolumeOptions"), {"Labels"}, "a volume")
     return labels_only or _only(mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount")
@@ -201,8 +243,10 @@ def _gpu(request: Any) -> str | None:
 def _network(body: Mapping[str, Any]) -> str | None:
     options = _at(body, "Options")
     ours = NETWORK in _at(body, "Labels") and body.get("Driver") == "bridge" and not body.get("IPAM")
-    if not ours or not str(options.get("com.docker.network.bridge.name", "")).startswith(_BRIDGES):
+    if not ours or not re.fullmatch(_BRIDGE, _text(options, "com.docker.network.bridge.name")):
         return "it is no network of ours, which is a bridge of its own"
+    if not re.fullmatch(_NETWORK, str(body.get("Name"))):
+        return f"the name of a network of ours begins with {_OURS}"
     if body.get("CheckDuplicate") is not True:
         return "another network may have that name: a site asks for CheckDuplicate"
     known = {"Name", "CheckDuplicate", "Driver", "Options", "IPAM", "Labels"}
@@ -212,12 +256,12 @@ def _network(body: Mapping[str, Any]) -> str | None:
 def _volume(body: Mapping[str, Any]) -> str | None:
     if body.get("DriverOpts") or body.get("Driver") not in (None, "", "local"):
         return "the volume is something else of this machine"
-    if not str(body.get("Name", "")).startswith(_VOLUMES) or OWNER not in _at(body, "Labels"):
+    if not str(body.get("Name", "")).startswith(_OURS) or OWNER not in _at(body, "Labels"):
         return "it is no volume of ours"
     return _only(body, {"Name", "Driver", "DriverOpts", "Labels"}, "a volume")
 
 
-def _only(given: Mapping[str, Any], known: set[str], what: str) -> str | None:
+def _only(given: Mapping[str, Any], known: Set[str], what: str) -> str | None:
     """Exact keys: an engine takes them in any case, and so knows more spellings than are asked for."""
     odd = sorted(key for key in given if key not in known)
     return f"{what} has '{odd[0][:40]}', which no site asks for" if odd else None
@@ -228,6 +272,12 @@ def _at(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {"": found}
 
 
+def _text(given: Mapping[str, Any], key: str) -> str:
+    """Empty where it is none: an engine takes ``null`` for nothing, and not for a word."""
+    found = given.get(key)
+    return found if isinstance(found, str) else ""
+
+
 def _list(given: Mapping[str, Any], key: str) -> list[Any]:
     found = given.get(key) or []
     return found if isinstance(found, list) else [found]
@@ -235,6 +285,6 @@ def _list(given: Mapping[str, Any], key: str) -> list[Any]:
 
 def _json(text: str) -> Any:
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=once)
     except (ValueError, RecursionError):
         return None

@@ -9,6 +9,7 @@ import os
 import platform
 import shutil
 import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,15 +41,25 @@ class EngineInfo:
     """Where it keeps what it has."""
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What an engine said."""
+
+    status: int
+    headers: Mapping[str, str]
+    """Names in lower case."""
+    content: bytes
+
+
 class _Connection(http.client.HTTPConnection):
-    def __init__(self, path: str) -> None:
-        super().__init__("engine", timeout=_ENGINE_S)
+    def __init__(self, path: str, patience: float) -> None:
+        super().__init__("engine", timeout=patience)
         self._path = path
 
     @override
     def connect(self) -> None:
         self.sock = socket.socket(socket.AF_UNIX)
-        self.sock.settimeout(_ENGINE_S)
+        self.sock.settimeout(self.timeout)
         self.sock.connect(self._path)
 
 
@@ -87,11 +98,33 @@ def ask_json(path: str, what: str) -> tuple[int, Any]:
         OSError: It does not answer.
         ValueError: It answers something else.
     """
-    connection = _Connection(path)
+    answer = ask(path, what)
+    return answer.status, json.loads(answer.content)
+
+
+def ask(
+    path: str, what: str, *, method: str = "GET", body: Any = None, patience: float = _ENGINE_S, most: int = _MOST
+) -> Answer:
+    """One call.
+
+    Args:
+        path: Of the engine's socket.
+        what: Path and query.
+        method: As HTTP names it.
+        body: Sent as JSON, unless it is None.
+        patience: Seconds for each step of it.
+        most: Bytes of the answer, which is cut off there.
+
+    Raises:
+        OSError: It does not answer.
+        ValueError: It answers something else.
+    """
+    connection = _Connection(path, patience)
     try:
-        connection.request("GET", what)
+        text = None if body is None else json.dumps(body)
+        connection.request(method, what, text, {"Content-Type": "application/json"} if text else {})
         answer = connection.getresponse()
-        return answer.status, json.loads(answer.read(_MOST))
+        return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
     finally:

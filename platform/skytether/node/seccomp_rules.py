@@ -42,7 +42,7 @@ _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", 
 def holds(text: str) -> bool:
     """Whether a profile (JSON, as Docker takes it) lets nothing of that through."""
     try:
-        profile = json.loads(text, object_pairs_hook=_once)
+        profile = json.loads(text, object_pairs_hook=once)
     except (ValueError, RecursionError):
         return False
     if not isinstance(profile, dict) or profile.keys() - _PROFILE or profile.get("defaultAction") not in _REFUSES:
@@ -51,7 +51,8 @@ def holds(text: str) -> bool:
     return isinstance(entries, list) and all(isinstance(one, dict) and _closed(one) for one in entries)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """For `json.loads`: raises ``ValueError`` where a key stands twice."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError

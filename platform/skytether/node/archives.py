@@ -1,0 +1,100 @@
+"""Whether an engine may look into a container's files while that runs.
+
+For that, engines mount its volumes at the paths of its files, from the outside: look whether there is a link on the
+way, then mount. Whoever can move a folder on that way in between has his volume mounted anywhere on the machine. So
+all of the way must be such that nobody moves it: files that do not change, and no link to where they do.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import posixpath
+import re
+from collections.abc import Iterable, Mapping
+from http import HTTPStatus
+from pathlib import PurePosixPath
+from typing import Any
+
+from .engine_rules import OLD_GUARD
+from .machine import ask
+
+_FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
+"""That an engine mounts in each container."""
+_ANONYMOUS = "[0-9a-f]{64}"
+_STAT = "x-docker-container-path-stat"
+_LINK = 1 << 27
+"""Go's bit in a file's mode."""
+_KNOWN = 4096
+
+
+def moved(inspected: Mapping[str, Any]) -> str | None:
+    """Why the way to something in a container could be moved by what runs there or beside it; None: by nobody.
+
+    A mount right below a volume that is this container's alone is held by the kernel: nobody in there moves it.
+    """
+    if (inspected.get("HostConfig") or {}).get("ReadonlyRootfs") is not True:
+        return "it may change its own files"
+    mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
+    for path in (*mounts, *_FILES):
+        for above, mount in mounts.items():
+            below = path.startswith(f"{above.rstrip('/')}/")
+            own = mount.get("Type") == "volume" and re.fullmatch(_ANONYMOUS, str(mount.get("Name")))
+            if below and not (own and posixpath.dirname(path) == above):
+                return f"{path} is in {above}, where things can be moved"
+    return None
+
+
+def ways(inspected: Mapping[str, Any]) -> set[str]:
+    """All folders and files that must be no links, in the image of a container."""
+    ends = [PurePosixPath(path) for path in (*(str(one["Destination"]) for one in inspected["Mounts"]), *_FILES)]
+    return {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
+
+
+class Images:
+    """Knows of images which paths in there are no links. Asks one thing at a time, and waits for it."""
+
+    def __init__(self, engine: str) -> None:
+        """``engine``: path of its socket."""
+        self._engine = engine
+        self._known: dict[tuple[str, str], bool] = {}
+
+    def link(self, image: str, paths: Iterable[str]) -> str | None:
+        """One of these paths that is a link in an image; None: none is.
+
+        A container is made of it, and never started: nothing moves there.
+
+        Raises:
+            OSError: The engine does not answer.
+            ValueError: It does not say.
+        """
+        wanted = sorted(paths)
+        if new := [path for path in wanted if (image, path) not in self._known]:
+            found = self._look(image, new)
+            self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
+            return next((path for path in new if found[image, path]), None) or self.link(image, set(wanted) - set(new))
+        return next((path for path in wanted if self._known[image, path]), None)
+
+    def _look(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
+        body = {
+            "Image": image,
+            "Entrypoint": ["/never-started"],
+            "Labels": {OLD_GUARD: ""},  # so that orchestrators prune it, should this end before it removes it
+            "HostConfig": {"NetworkMode": "none", "ReadonlyRootfs": True},
+        }
+        made = ask(self._engine, "/containers/create", method="POST", body=body)
+        if made.status != HTTPStatus.CREATED:
+            raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
+        container = json.loads(made.content)["Id"]
+        try:
+            return {(image, path): self._is_link(container, path) for path in paths}
+        finally:
+            ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE")
+
+    def _is_link(self, container: str, path: str) -> bool:
+        answer = ask(self._engine, f"/containers/{container}/archive?path={path}", method="HEAD")
+        if answer.status == HTTPStatus.NOT_FOUND:
+            return False
+        if answer.status != HTTPStatus.OK:
+            raise ValueError(f"its engine says {answer.status} to {path}")
+        return bool(json.loads(base64.b64decode(answer.headers[_STAT]))["mode"] & _LINK)
