@@ -19,7 +19,7 @@ import yaml
 
 from skytether.api.manifest import Manifest
 from skytether.api.rest import SiteCreate
-from skytether.cli.relay_config import RelayConfig
+from skytether.bridge.relay_config import RelayConfig
 from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions

@@ -16,7 +16,7 @@ from helm_chart import ABSENT, CHART, NEWEST, OLDEST, ROOT, Object, at, faults, 
 from value_sets import CASES, SETS, UPSTREAM
 
 from skytether.api.rest import SiteCreate
-from skytether.cli.relay_config import RelayConfig
+from skytether.bridge.relay_config import RelayConfig
 from skytether.orchestrator.config.declared import read_sites, stored_as
 from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.config.sources import load

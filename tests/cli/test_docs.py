@@ -13,14 +13,14 @@ import pytest
 import typer.main
 import yaml
 
+from skytether.api.config_file import check_config
 from skytether.api.manifest import Manifest
+from skytether.bridge.relay_config import RelayConfig
 from skytether.cli.app import app
-from skytether.cli.bridge_config import BridgeConfig
-from skytether.cli.config_file import check_config
-from skytether.cli.gate_config import inherit
-from skytether.cli.relay_config import RelayConfig
-from skytether.cli.robot_config import RobotConfig
+from skytether.cli.commands.bridge.config import BridgeConfig
 from skytether.orchestrator.runtimes.base import Runtime
+from skytether.robot.config.gate_config import inherit
+from skytether.robot.config.robot_config import RobotConfig
 from skytether_services.navigation.status import Code
 
 ROOT = Path(__file__).parents[2]

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from skytether.cli import main as entry
 from skytether.cli.app import app
-from skytether.cli.demo import _told
+from skytether.cli.commands.demo import _told
+from skytether.cli.commands.robot.check import Finding, show
 from skytether.cli.output import SafeConsole, log_to_console, print_foreign, print_table
-from skytether.cli.robot_check import Finding, show
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import Transition

@@ -8,25 +8,24 @@ import typer
 
 from skytether import __version__
 
-from . import (
+from .commands import (
     apply,
-    bridge,
-    commission,
     demo,
     doctor,
     echo,
-    gate,
-    groups,
-    lab,
+    group,
+    instance,
     orchestrator,
     relay,
     replay,
-    resources,
-    robot_run,
-    robot_status,
+    service,
+    site,
     site_nodes,
-    tokens,
+    token,
 )
+from .commands.bridge import bridge
+from .commands.lab import lab
+from .commands.robot import commission, gate, registry, run, status
 from .output import log_to_console
 
 app = typer.Typer(
@@ -42,24 +41,24 @@ app.command()(relay.relay)
 app.command()(echo.echo)
 app.command()(doctor.doctor)
 app.command()(apply.apply)
-resources.robot_app.command("status")(robot_status.status)
+registry.app.command("status")(status.status)
 app.add_typer(orchestrator.app, name="orchestrator")
-app.add_typer(resources.service_app, name="service")
-site_nodes.add_to(resources.site_app)
-app.add_typer(resources.site_app, name="site")
-app.add_typer(groups.app, name="group")
-app.add_typer(resources.instance_app, name="instance")
-resources.robot_app.command("run")(robot_run.run)
-app.add_typer(resources.robot_app, name="robot")
-app.add_typer(tokens.app, name="token")
-resources.robot_app.command("gate")(gate.gate)
-resources.robot_app.command("mode")(gate.mode)
-resources.robot_app.command("gate-status")(gate.gate_status)
-resources.robot_app.command("safety-log")(gate.safety_log)
-resources.robot_app.command("stop")(gate.stop)
-resources.robot_app.command("reset")(gate.reset)
-resources.robot_app.command("start")(gate.start)
-resources.robot_app.command("commission")(commission.commission)
+app.add_typer(service.app, name="service")
+site_nodes.add_to(site.app)
+app.add_typer(site.app, name="site")
+app.add_typer(group.app, name="group")
+app.add_typer(instance.app, name="instance")
+registry.app.command("run")(run.run)
+app.add_typer(registry.app, name="robot")
+app.add_typer(token.app, name="token")
+registry.app.command("gate")(gate.gate)
+registry.app.command("mode")(gate.mode)
+registry.app.command("gate-status")(gate.gate_status)
+registry.app.command("safety-log")(gate.safety_log)
+registry.app.command("stop")(gate.stop)
+registry.app.command("reset")(gate.reset)
+registry.app.command("start")(gate.start)
+registry.app.command("commission")(commission.commission)
 app.add_typer(lab.app, name="lab")
 
 

@@ -1,4 +1,4 @@
-"""Names that a shell completes: asked of the orchestrator, quickly or not at all."""
+"""Names of services, sites, instances: completed by a shell, quickly or not at all, and looked for when mistyped."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from typer import Context
+
+from .output import fail
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
@@ -56,3 +59,26 @@ def scopes(incomplete: str) -> list[str]:
     from skytether.api.rest import SCOPES
 
     return [scope for scope in SCOPES if scope.startswith(incomplete)]
+
+
+ServiceName = Annotated[str, typer.Argument(help="Its name.", autocompletion=services)]
+SiteName = Annotated[str, typer.Argument(help="Its name.", autocompletion=sites)]
+InstanceId = Annotated[str, typer.Argument(help="Its id.", autocompletion=instances)]
+
+
+def need(kind: str, name: str, there: Callable[[], list[str]]) -> None:
+    """End with the name that was meant where there is none of this one: a slip must not look like something done.
+
+    ``there`` asks for those there are; a token that may not see them does without.
+    """
+    from skytether.api.client import ApiError
+    from skytether.api.faults import known
+
+    try:
+        found = there()
+    except ApiError as error:
+        if error.problem.status != 403:
+            raise
+        return
+    if name not in found:
+        fail(f"there is no {kind} '{name}'; {known(found, name)}")

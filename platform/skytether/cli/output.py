@@ -143,3 +143,13 @@ class _ConsoleHandler(logging.Handler):
             console.print(f"[yellow]{record.levelname.lower()}:[/] {escape(text)}", soft_wrap=True)
         except Exception:
             self.handleError(record)
+
+
+def show(model: BaseModel, json: bool) -> None:
+    """All of one thing, as YAML or JSON on standard output."""
+    import yaml
+
+    if json:
+        print_json(plain(model))
+    else:
+        typer.echo(yaml.safe_dump(plain(model), sort_keys=False), nl=False)

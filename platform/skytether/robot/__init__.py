@@ -3,7 +3,7 @@
 Everything here runs on the robot and works with the cable pulled. No simulation, no service, no server code belongs
 here. Rooms import from those below only (contract "Rooms of the robot")::
 
-    replay                        recordings sent as a robot would
+    config | replay               robot.yaml | recordings sent as a robot would
     agent | diagnosis             the program on the robot | what the doctor looks at
     safety                        the gate: the last thing before the wheels
     graphs                        ROS 1, ROS 2

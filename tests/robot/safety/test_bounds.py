@@ -10,8 +10,8 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from skytether.cli.config_file import ConfigError
-from skytether.cli.gate_config import load_safety
+from skytether.api.config_file import ConfigError
+from skytether.robot.config.gate_config import load_safety
 from skytether.robot.safety import bounds
 from skytether.robot.safety.bounds import BOUNDS, bound_of
 from skytether.robot.safety.config import SafetyConfig

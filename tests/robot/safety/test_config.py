@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skytether.cli.config_file import ConfigError
-from skytether.cli.gate_config import load_safety
+from skytether.api.config_file import ConfigError
 from skytether.messages import Joy, LaserScan, PointCloud2, Range
+from skytether.robot.config.gate_config import load_safety
 from skytether.robot.safety.address import address
 from skytether.robot.safety.clouds import CloudMount
 from skytether.robot.safety.config import SafetyConfig, default_folder, default_record

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from skytether.cli.config_file import ConfigError
-from skytether.cli.gate_config import load_safety
+from skytether.api.config_file import ConfigError
 from skytether.messages import LaserScan, String
+from skytether.robot.config.gate_config import load_safety
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.modes import Envelope, ModeRules, Modes

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from skytether.cli.config_file import ConfigError
-from skytether.cli.gate_config import load_safety
+from skytether.api.config_file import ConfigError
 from skytether.messages import MarkerArray, type_hash
+from skytether.robot.config.gate_config import load_safety
 
 SAFETY = {"footprint": {"radius": 0.3}, "sensors": {"/scan": {"max_age_s": 1.0}}, "display": {"rate_hz": 10}}
 

@@ -1,0 +1,1 @@
+"""``skytether bridge``: its configuration file, and the ends that it makes."""

@@ -1,0 +1,151 @@
+"""``skytether robot run`` for a robot that is a ROS 2 graph: how it is joined, and what ``--check`` looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.messages import hash_of
+from skytether.robot.config.robot_config import RobotConfig, Ros2Config
+from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.session.topic_table import spoken
+from skytether.ros.names import Names
+from skytether.ros.ros2.config import join_graph
+from skytether.ros.ros2.dialect import Endpoint, Kind
+from skytether.ros.ros2.graph import mismatches
+from skytether.ros.ros2.node import Ros2Node
+from skytether.ros.ros2.qos import row_settings
+
+from .check import (
+    Finding,
+    forbidden,
+    look_at_gate,
+    look_at_orchestrator,
+    look_at_record,
+    other_publishers,
+    plausible,
+    show,
+    unknown,
+)
+
+_JOIN_S = 5.0
+"""For the router to answer, and to tell of the graph."""
+
+
+def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
+    """What the graph needs of the configuration."""
+    return Ros2RobotConfig(
+        robot=settings.robot,
+        service=settings.service,
+        namespace=ros2.namespace,
+        remap=ros2.remap,
+        cmd_vel=ros2.cmd_vel if settings.safety is None else None,
+        cmd_vel_type=ros2.cmd_vel_type,
+        frame=ros2.frame,
+        idle_s=ros2.idle_s,
+        readings=ros2.readings,
+        topics=ros2.topics,
+        allowed=settings.allowed,
+        protected=settings.protected,
+        wheels=settings.wheels,
+        drivers=settings.drivers,
+    )
+
+
+@contextmanager
+def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator[Ros2Robot]:
+    """The robot as a graph, for as long as the context lasts.
+
+    Raises:
+        ConfigError: The extra is missing, or Zenoh does not take a setting.
+    """
+    config = ros2_config(settings, ros2)
+    with join_graph(ros2, folder, config.home) as node:
+        robot = Ros2Robot(config, node)
+        try:
+            yield robot
+        finally:
+            robot.close()
+
+
+def check_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str) -> bool:
+    """Look whether everything is there that a run will need, and print a table. True if nothing is wrong.
+
+    Raises:
+        ConfigError: The extra is missing, or Zenoh does not take a setting.
+    """
+    return show(look_ros2(settings, ros2, folder, token))
+
+
+def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str) -> list[Finding]:
+    """Everything that a run will need, one by one.
+
+    Raises:
+        ConfigError: The extra is missing, or Zenoh does not take a setting.
+    """
+    config = ros2_config(settings, ros2)
+    manifest, findings = look_at_orchestrator(settings, token)
+    with join_graph(ros2, folder, config.home) as node:
+        joined = node.wait_until_joined(_JOIN_S)
+        router = ros2.router or "as configured"
+        if not joined:
+            says = "does not answer; is it running? (ros2 run rmw_zenoh_cpp rmw_zenohd)"
+            findings.append(Finding("ROS 2 router", router, "", says, good=False))
+        else:
+            says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
+            findings.append(Finding("ROS 2 router", router, "", says))
+        if manifest is not None and joined:
+            specs = spoken(manifest.spec.robot_topics, "ros2_action")
+            names = config.names(specs)
+            findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
+            rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
+            findings += [_row(settings, part, names, node) for part in rows]
+            findings += forbidden(config.permissions(), specs, names, settings.command_topic)
+            if config.cmd_vel is not None:
+                findings.append(_wheels(config, config.cmd_vel, node))
+            found = [endpoint.node for endpoint in node.endpoints(config.wheels, Kind.PUBLISHER)]
+            findings += other_publishers(config.wheels, found, config.drivers)
+    return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
+
+
+def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) -> Finding:
+    if row.kind == "topic" and row.direction == "out" and row.name == settings.command_topic:
+        return Finding(row.name, "", row.type, "drives, past the supervisor")
+    if row.kind == "call":
+        name = names.of(f"{row.name}/request").removesuffix("/request")
+        kind, verb, waits = (
+            (Kind.SERVER, "will be offered", "") if row.direction == "in" else (Kind.CLIENT, "is offered", "offers")
+        )
+    else:
+        name = names.of(row.name)
+        kind, verb, waits = (
+            (Kind.SUBSCRIPTION, "from", "publishes")
+            if row.direction == "in"
+            else (Kind.PUBLISHER, "will be published", "")
+        )
+    ours = Endpoint(kind, name, row.type, hash_of(row.type, "cdr"))
+    others = node.endpoints(name, kind.answers)
+    wrong = mismatches(ours, others)
+    if wrong:
+        return Finding(row.name, name, row.type, wrong[0].reason, good=False)
+    if waits and not others:
+        return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for")
+    who = ", ".join(sorted({o.node for o in others if o.node}))
+    says = f"{verb} {who}".strip() if waits else verb
+    if kind is Kind.SUBSCRIPTION and not row.latched and any(row_settings(o.qos)["latched"] for o in others):
+        says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
+    return Finding(row.name, name, row.type, says)
+
+
+def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: Ros2Node) -> Finding:
+    name = config.names(()).own(cmd_vel)
+    ours = Endpoint(Kind.PUBLISHER, name, config.cmd_vel_type, hash_of(config.cmd_vel_type, "cdr"))
+    others = node.endpoints(name, Kind.SUBSCRIPTION)
+    wrong = mismatches(ours, others)
+    if wrong:
+        hint = "" if wrong[0].endpoint.type == ours.type else "; set ros2.cmd_vel_type"
+        return Finding("wheels", name, ours.type, wrong[0].reason + hint, good=False)
+    says = "is listened to" if others else "nobody listens to it yet; is cmd_vel right?"
+    return Finding("wheels", name, ours.type, says)

@@ -1,0 +1,86 @@
+"""The part of robot.yaml that the gate reads: a mistake in any other part is not its business, and does not stop it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, field_validator, model_validator
+
+from skytether.api.config_file import read_config
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
+from skytether.ros.names import namespace_of
+from skytether.ros.ros2.config import need_extra
+
+
+class _GateFile(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    safety: SafetyConfig
+
+    @field_validator("safety", mode="before")
+    @classmethod
+    def _is_wanted(cls, section: Any) -> Any:
+        if section == NO_GATE:
+            raise ValueError("is none: this robot is to have no gate; take the key away for a gate without sensors")
+        return section
+
+    @field_validator("safety")
+    @classmethod
+    def _has_a_graph_for_its_topics(cls, safety: SafetyConfig) -> SafetyConfig:
+        if safety.display is not None and not (safety.ros1 or safety.ros2):
+            raise ValueError(
+                "display needs ros1 or ros2; without a graph there is `skytether robot gate-status --json`"
+            )
+        if safety.enable is not None and safety.enable.topic and not (safety.ros1 or safety.ros2):
+            raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
+        return safety
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_from_the_robot(cls, document: Any) -> Any:
+        return inherit(document)
+
+
+def inherit(document: Any) -> Any:
+    """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
+
+    These are ``limits`` with their reasons in ``beyond``, and of ``ros1`` or ``ros2``, unless the wheels are behind
+    ``sockets``, where the graph and its wheels are. A robot that is a graph and has no such section gets
+    `WITHOUT_SECTION`.
+    """
+    if not isinstance(document, dict):
+        return document
+    if "safety" not in document and any(isinstance(document.get(way), dict) for way in ("ros1", "ros2")):
+        document = document | {"safety": WITHOUT_SECTION}
+    if not isinstance(document.get("safety"), dict):
+        return document
+    safety = dict(document["safety"])
+    if isinstance(document.get("limits"), dict) and "limits" not in safety:
+        safety["limits"] = document["limits"]
+        reasons, own = document.get("beyond"), safety.get("beyond", {})
+        if isinstance(reasons, dict) and isinstance(own, dict):
+            safety["beyond"] = reasons | own
+    for way, model in (("ros1", Ros1Way), ("ros2", Ros2Way)):
+        graph, own = document.get(way), safety.get(way) or {}
+        if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:
+            robot = {key: graph[key] for key in model.model_fields if graph.get(key) is not None}
+            if "namespace" not in robot and isinstance(document.get("robot"), str):
+                robot["namespace"] = namespace_of(document["robot"])
+            safety[way] = robot | own
+    return document | {"safety": safety}
+
+
+def load_safety(path: Path) -> SafetyConfig:
+    """Read and check the section ``safety``.
+
+    Raises:
+        ConfigError: It cannot be read, is no YAML, or a key of the section is wrong or missing.
+    """
+    safety = read_config(path, _GateFile).safety
+    if safety.ros2 is None:
+        return safety
+    need_extra()
+    if safety.ros2.zenoh_config is None:
+        return safety
+    there = safety.ros2.model_copy(update={"zenoh_config": path.absolute().parent / safety.ros2.zenoh_config})
+    return safety.model_copy(update={"ros2": there})

@@ -1,0 +1,423 @@
+"""The configuration of ``skytether robot run``: what people write in robot.yaml."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from skytether.api.config_file import ConfigError, Endpoint, read_config
+from skytether.api.manifest import Name, Strict
+from skytether.api.plain import oddity
+from skytether.api.plain_http import is_readable_on_the_way
+from skytether.bridge.local_network import LocalNetwork
+from skytether.messages import type_of
+from skytether.robot.agent.status import DEFAULT_PORT
+from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.supervisor import Limits
+from skytether.robot.graphs.graph_base import protected_names as graph_names
+from skytether.robot.offload.task_manager import Mode, Policy
+from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
+from skytether.robot.safety.config_base import no_switches
+from skytether.robot.safety.protected import protected_names as safety_names
+from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
+from skytether.ros.permissions import Access, Allowed, Permissions
+from skytether.ros.ros2.config import Ros2Graph
+
+DEFAULT_MASTER = "http://localhost:11311"
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    fault = oddity(values)
+    if fault is not None:
+        raise ValueError(str(fault))
+    return values
+
+
+PlainValues = Annotated[dict[str, Any], AfterValidator(_plain)]
+Weight = Annotated[float, Field(ge=0, le=1e6)]
+_POLICY = Policy()
+
+
+class FallbackConfig(Strict):
+    """The robot's own controller."""
+
+    name: Annotated[str, Field(min_length=1)] = "stop"
+    """Entry point of the group ``skytether.fallbacks``."""
+    options: PlainValues = {}
+
+
+class GraphConfig(Strict):
+    """What a robot's graph has in either generation of ROS. Names: absolute, or in ``namespace``."""
+
+    namespace: str | None = None
+    """Where the robot's topics are; null: under the robot's name."""
+    remap: dict[str, str] = {}
+    """The graph's names of the service's topics, calls and actions, of ``cmd_vel`` and of the readings."""
+    cmd_vel: Annotated[str, Field(min_length=1)] = "cmd_vel"
+    """What the wheels listen to."""
+    idle_s: Annotated[float, Field(gt=0)] | None = 1.0
+    """Seconds that a standstill is told before ``cmd_vel`` is left to others; null: for ever."""
+    readings: dict[str, str] = {}
+    """What the robot's own control reads, name to type: ``{force: geometry_msgs/msg/WrenchStamped}``."""
+    topics: tuple[str, ...] = ()
+    """What is sent to a service that takes any topic, such as the recorder."""
+
+    @field_validator("readings")
+    @classmethod
+    def _known_types(cls, readings: dict[str, str]) -> dict[str, str]:
+        for name, kind in readings.items():
+            try:
+                type_of(kind)
+            except KeyError as error:
+                raise ValueError(f"{name}: {error.args[0]}") from None
+        return readings
+
+    def check_names(self, ros: Generation) -> None:
+        """Refuse what this generation refuses.
+
+        Raises:
+            ValueError: The text names the key.
+        """
+        named = {"namespace": self.namespace, "cmd_vel": self.cmd_vel}
+        named.update({f"remap.{key}": value for key, value in self.remap.items()})
+        named.update({f"topics.{i}": value for i, value in enumerate(self.topics)})
+        for key, value in named.items():
+            try:
+                if value is not None:
+                    check_name(value, ros)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from None
+
+
+class Ros1Config(GraphConfig):
+    """A ROS 1 graph."""
+
+    master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
+    """Address of the master; without it ``ROS_MASTER_URI``, or this machine's."""
+    host: str | None = None
+    """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
+    node: Annotated[str, Field(min_length=1)] = "skytether"
+    """Name of the node in the graph."""
+    params: tuple[str, ...] = ()
+    """Parameters that the service's graph gets, by name or namespace: ``/robot_description``."""
+    use_sim_time: bool | None = None
+    """Whether /clock tells the time; null: as the master's parameter /use_sim_time says."""
+
+    @field_validator("master")
+    @classmethod
+    def _an_address(cls, uri: str) -> str:
+        if not uri.startswith("http://"):
+            raise ValueError(f"must be an address such as {DEFAULT_MASTER}, not '{uri}'")
+        return uri
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros1Config:
+        self.check_names(1)
+        for i, name in enumerate(self.params):
+            try:
+                check_name(name)
+            except ValueError as error:
+                raise ValueError(f"params.{i}: {error}") from None
+        return self
+
+
+class Ros2Config(GraphConfig, Ros2Graph):
+    """A ROS 2 graph."""
+
+    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
+    """What the wheels take; nav2 and ros2_control have stamped velocities from Jazzy on."""
+    frame: str = "base_link"
+    """Coordinate frame of stamped velocities."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros2Config:
+        self.check_names(2)
+        return self
+
+
+class LinkNeeds(Strict):
+    """What the link must be like while the service drives; a service's manifest only tightens it."""
+
+    max_rtt_ms: Annotated[float, Field(gt=0, le=5000)] = 1000.0
+    """Round trip. What drives the robot was made from information that is at most so old, and ``limits.max_gap_s``."""
+    max_loss: Annotated[float, Field(ge=0, le=0.95)] = 0.5
+    """Share of a topic's messages that may be lost."""
+    max_late: Annotated[float, Field(ge=0, le=0.95)] = 0.5
+    """Share of a topic's messages that may come too late to be used."""
+
+    def needs(self) -> Needs:
+        """For the source choice."""
+        return Needs(max_rtt_s=self.max_rtt_ms / 1000, max_loss=self.max_loss, max_late=self.max_late)
+
+
+class CloudConfig(Strict):
+    """What the service may do in the robot's graph, beyond names below its own namespace.
+
+    Names are absolute, or in the robot's namespace; each includes all below it. What safety reads, what the robot's own
+    controller reads, ``/clock`` and what the wheels listen to is never the cloud's, and cannot be listed.
+    """
+
+    publish: tuple[str, ...] = ()
+    """Topics, and actions of ROS 1 whose goals the service sends: ``[/tf, /move_base]``."""
+    call: tuple[str, ...] = ()
+    """Services of the robot's nodes that it may call, and actions of ROS 2 whose goals it sends. Services that change a
+    node (``set_parameters`` and the like) must be listed in full."""
+    offer: tuple[str, ...] = ()
+    """Services that the robot's nodes may call at it."""
+
+
+class TaskConfig(Strict):
+    """Local or offloaded, and to which site: weights and hysteresis of `offload.task_manager.Policy`."""
+
+    mode: Literal["auto", "offload", "local"] = "auto"
+    """``offload``: the service is asked for, always; ``local``: never; ``auto``: the costs decide."""
+    echoes: dict[Name, Annotated[str, Field(pattern=r"^.+:\d{1,5}$", description="HOST:PORT")]] = {}
+    """``skytether echo`` of sites, by site; the others are probed through the orchestrator."""
+    probe_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0
+    """Between two probes of each site."""
+    delay: Weight = _POLICY.delay
+    loss: Weight = _POLICY.loss
+    energy: Weight = _POLICY.energy
+    processor: Weight = _POLICY.processor
+    service: Weight = _POLICY.service
+    radio: Weight = _POLICY.radio
+    local_cpu: Weight = _POLICY.local_cpu
+    margin: Weight = _POLICY.margin
+    hold_s: Weight = _POLICY.hold_s
+    bad_s: Weight = _POLICY.bad_s
+
+    @property
+    def addresses(self) -> dict[str, tuple[str, int]]:
+        """The echoes, taken apart."""
+        parted = ((site, echo.rpartition(":")) for site, echo in self.echoes.items())
+        return {site: (host.strip("[]"), int(port)) for site, (host, _, port) in parted}
+
+    def policy(self) -> Policy:
+        """For the task manager."""
+        return Policy(**{**self.model_dump(exclude={"echoes", "probe_s"}), "mode": Mode(self.mode)})
+
+
+class RobotConfig(Strict):
+    """The whole file."""
+
+    robot: Name
+    """As it is registered: ``skytether robot add NAME``."""
+    orchestrator: Annotated[str, Field(pattern=r"^https?://", description="https://HOST:PORT; several with commas")]
+    insecure_http: bool = False
+    """``http://`` beyond this machine too: whoever is on the way reads token and keys of sessions."""
+    token_file: Path
+    """Holds the token that the registration printed; relative to this file's folder."""
+    service: Name
+    params: PlainValues = {}
+    """The service's."""
+    command_topic: Annotated[str, Field(min_length=1)] = "cmd_vel"
+    """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
+    fallback: FallbackConfig = FallbackConfig()
+    limits: dict[str, float] = {}
+    beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
+    """Limits that are meant to be beyond what is plausible: ``limits.NAME`` to reason."""
+    """What the wheels may do: fields of ``skytether.robot.control.supervisor.Limits``."""
+    needs: LinkNeeds = LinkNeeds()
+    """What the link must be like at least."""
+    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Of the robot's control loop."""
+    bind: Endpoint = Endpoint(host="0.0.0.0")  # noqa: S104 - a robot has one network or several
+    paths: Literal["auto"] | tuple[LocalNetwork, ...] = ()
+    """Networks that the bridge uses side by side; ``auto``: all that lead out of this machine. Empty: ``bind``."""
+    ca_file: Path | None = None
+    """PEM file of the certificate's authority; in the file, relative to its folder; null: the system's."""
+    task: TaskConfig = TaskConfig()
+    status_port: Annotated[int, Field(ge=0, le=65_535)] | None = DEFAULT_PORT
+    """Of ``/status`` and ``/metrics`` on loopback, the next if it is taken; 0: any free one; null: there are none."""
+    safety: SafetyConfig | None = Field(default_factory=lambda: SafetyConfig.model_validate(WITHOUT_SECTION))
+    """The gate's part (``skytether robot gate``): velocities go to the gate and not to the wheels.
+
+    Without the key, a gate that knows limits and silence only; ``none``: no gate."""
+    ros1: Ros1Config | None = None
+    ros2: Ros2Config | None = None
+    """The robot's graph: one of the two."""
+    cloud: CloudConfig = CloudConfig()
+    """What the service may publish, call and offer in it."""
+
+    @field_validator("fallback", mode="before")
+    @classmethod
+    def _name_alone(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("safety", mode="before")
+    @classmethod
+    def _section_or_none(cls, value: Any) -> Any:
+        if value is None:
+            raise ValueError("is empty: write the gate's section, or none for no gate, or leave the key away")
+        return None if value == NO_GATE else value
+
+    @property
+    def gate_is_assumed(self) -> bool:
+        """Whether there is to be a gate that nobody has configured."""
+        return "safety" not in self.model_fields_set
+
+    @field_validator("limits", mode="before")
+    @classmethod
+    def _are_numbers(cls, limits: Any) -> Any:
+        return no_switches(limits)
+
+    @field_validator("limits")
+    @classmethod
+    def _they_limit(cls, limits: dict[str, float]) -> dict[str, float]:
+        known = [f.name for f in fields(Limits)]
+        for name in limits:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                guess = f", did you mean {near[0]!r}?" if near else ""
+                raise ValueError(f"{name}: unknown key{guess}; allowed are {', '.join(known)}")
+        try:
+            Limits(**limits)
+        except ValueError as error:
+            raise ValueError(str(error).removeprefix("limits: ")) from None
+        return limits
+
+    @model_validator(mode="after")
+    def _is_plausible(self) -> RobotConfig:
+        self.notes()
+        return self
+
+    def notes(self) -> tuple[str, ...]:
+        """A sentence for each of the limits that is beyond its bounds."""
+        return check_plausible({"limits": self.limits}, self.beyond, "beyond")
+
+    @model_validator(mode="after")
+    def _token_stays_secret(self) -> RobotConfig:
+        readable = [url for url in self.orchestrator.split(",") if is_readable_on_the_way(url)]
+        if readable and not self.insecure_http:
+            raise ValueError(
+                f"orchestrator: {readable[0].strip()} is plain http, and the token could be read on the way: write "
+                "https://; inside a network that is all yours, such as a VPN, add insecure_http: true"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_graph(self) -> RobotConfig:
+        if (self.ros1 is None) == (self.ros2 is None):
+            found = "is missing" if self.ros1 is None else "stands beside ros2"
+            raise ValueError(
+                f"ros1: {found}; it, or ros2, says which graph the robot is (an empty one is written: ros1: {{}})"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _the_cloud_has_no_way_past_safety(self) -> RobotConfig:
+        ros: Generation = 1 if self.ros1 is not None else 2
+        permissions = Permissions(self.home, namespace_of(self.service), Allowed(), self.protected)
+        for access in Access:
+            for i, given in enumerate(getattr(self.cloud, access)):
+                key = f"cloud.{access}.{i}"
+                try:
+                    name = check_name(resolve(check_name(given, ros), self.home), ros)
+                except ValueError as error:
+                    raise ValueError(f"{key}: {error}") from None
+                why = permissions.protected(name)
+                if why:
+                    raise ValueError(f"{key}: {name} is never the cloud's: {why}; take it out of the list")
+        return self
+
+    @property
+    def home(self) -> str:
+        """The namespace of the robot's topics."""
+        graph = self.ros1 or self.ros2
+        given = graph.namespace if graph is not None else None
+        return namespace_of(self.robot) if given is None else resolve(given, "/")
+
+    @property
+    def wheels(self) -> str | None:
+        """Absolute name of what the wheels listen to; None: it is no topic of the robot's graph."""
+        graph, way = self.ros1 or self.ros2, self._way
+        if graph is None or (self.safety is not None and self.safety.sockets is not None):
+            return None
+        namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
+        own = way.cmd_vel if way is not None and "cmd_vel" in way.model_fields_set else graph.cmd_vel
+        if self.safety is None and self.ros2 is not None:
+            return Names((), self.home, "/", graph.remap, ros=2).own(own)
+        return resolve(own, namespace)
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """Names of the gate's nodes that publish it; empty: there is no gate."""
+        graph, way = self.ros1 or self.ros2, self._way
+        if graph is None or self.safety is None:
+            return ()
+        node = way.node if way is not None and "node" in way.model_fields_set else graph.node
+        namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
+        where = "/" if self.ros1 is not None else namespace
+        return tuple(resolve(f"{node}_{role}", where) for role in ("guard", "gate"))
+
+    @property
+    def _way(self) -> Ros1Way | Ros2Way | None:
+        if self.safety is None:
+            return None
+        return self.safety.ros1 if self.ros1 is not None else self.safety.ros2
+
+    @property
+    def allowed(self) -> Allowed:
+        """What is listed for the service, by absolute names."""
+        lists = ([resolve(name, self.home) for name in getattr(self.cloud, access)] for access in Access)
+        return Allowed(*lists)
+
+    @property
+    def protected(self) -> dict[str, str]:
+        """What is never the service's: why, by absolute name."""
+        graph = self.ros1 or self.ros2
+        if graph is None:
+            return {}
+        names = Names((), self.home, "/", graph.remap, ros=1 if self.ros1 is not None else 2)
+        found = graph_names(names, self.home, [graph.cmd_vel], graph.readings)
+        if self.safety is None:
+            return found
+        prefix = self.ros2.bridge_namespace if self.ros2 is not None and self.ros2.dialect == "ros2dds" else "/"
+        return found | safety_names(self.safety, self.home, prefix)
+
+
+def load_config(path: Path) -> RobotConfig:
+    """Read and check a robot.yaml.
+
+    Raises:
+        ConfigError: It cannot be read, is no YAML, or a key is wrong.
+    """
+    settings = read_config(path, RobotConfig)
+    if settings.ca_file is None:
+        return settings
+    return settings.model_copy(update={"ca_file": path.parent / settings.ca_file})
+
+
+def load_token(settings: RobotConfig, folder: Path) -> str:
+    """Read the robot's token.
+
+    Args:
+        settings: Name the file.
+        folder: That its path is relative to.
+
+    Raises:
+        ConfigError: It is missing, empty, open to others, or no text.
+    """
+    path = folder / settings.token_file
+    try:
+        with path.open("rb") as file:
+            others = os.fstat(file.fileno()).st_mode & 0o077
+            token = file.read(4096).decode("ascii").strip()
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read token_file {path}: {error.strerror}; register the robot with: skytether robot add "
+            f"{settings.robot} > {path}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"token_file {path} holds no token but other bytes") from error
+    if others:
+        raise ConfigError(f"token_file {path} is open to other users; close it with: chmod 600 {path}")
+    if not token:
+        raise ConfigError(f"token_file {path} is empty; it must hold the token that 'skytether robot add' printed")
+    return token
