@@ -28,7 +28,7 @@ from orchestrator_program import Program, until
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import Instance, Invite, RobotCreate, State
 from skytether.lab.bench.migrate import Commands, instance_of
-from skytether.lab.demo import WalkerBase
+from skytether.lab.demo import WalkerHardware
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.orchestrator.store import db
@@ -185,7 +185,7 @@ def walker(stack: ExitStack, url: str, operator: Client, name: str) -> tuple[Age
     token = operator.create_robot(RobotCreate(name=name, services=(SERVICE,))).token
     config = AgentConfig(name, url, SERVICE, token, bind=("127.0.0.1", 0), renew_s=0.5)
     seen = Commands()
-    agent = stack.enter_context(Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen))
+    agent = stack.enter_context(Agent(config, WalkerHardware(World(Trail(), seed=1)), observer=seen))
     return agent, seen
 
 

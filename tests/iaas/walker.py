@@ -10,7 +10,7 @@ import sys
 import time
 from itertools import groupby
 
-from skytether.lab.demo import WalkerBase
+from skytether.lab.demo import WalkerHardware
 from skytether.lab.trail import Trail
 from skytether.lab.walk import STEP, World
 from skytether.robot.agent.agent import Agent, AgentConfig
@@ -19,7 +19,7 @@ from skytether.robot.control.command import Source
 
 def main(url: str, token: str, patience_s: float) -> None:
     """Drive until the input is closed."""
-    base = WalkerBase(World(Trail(), seed=1))
+    base = WalkerHardware(World(Trail(), seed=1))
     config = AgentConfig(
         robot="walker", url=url, token=token, service="virtual-trail", fallback="admittance", insecure_http=True
     )

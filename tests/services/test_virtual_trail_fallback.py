@@ -4,14 +4,14 @@ from itertools import count, pairwise
 
 import pytest
 
-from skytether.lab.demo import WalkerBase
+from skytether.lab.demo import WalkerHardware
 from skytether.lab.measures import measure
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.messages import Twist, Vector3, encode
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.command import Source
-from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, Disconnected, MessageReceived
@@ -24,9 +24,9 @@ class Walk:
     """The walker's control loop, tick by tick."""
 
     def __init__(self, **options):
-        self.base = WalkerBase(World(Trail(), seed=1))
+        self.base = WalkerHardware(World(Trail(), seed=1))
         self.base.walking.set()
-        self.driver = Driver(self.base, HoldTrail(**options), Limits(), Needs(), 100.0)
+        self.driver = ControlLoop(self.base, HoldTrail(**options), Limits(), Needs(), 100.0)
         self.base.source = lambda: self.driver.source
         self.ticks = count(1)
         self.told = []

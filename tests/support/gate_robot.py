@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from skytether.guard.latch import lasting_file
+from skytether.guard.estop import lasting_file
 from skytether.robot.safety.client import GateError, ask
 from skytether.robot.safety.protocol import default_record
 

@@ -15,7 +15,7 @@ from two_halls import DOOR, HALLS, NEEDY, SCOUT
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.lab.world.agent import Clockwork, WorldBase, WorldGraph
+from skytether.lab.world.agent import Clockwork, WorldGraph, WorldHardware
 from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import Header, OccupancyGrid, Path, Point, PoseStamped, String, decode
@@ -105,7 +105,7 @@ def share(set_up: Callable[[Client], object] = lambda _: None, look: Callable[[]
                 },
                 bind=("127.0.0.1", 0),
             )
-            base = WorldBase(clockwork, index, graph=robot.graph)
+            base = WorldHardware(clockwork, index, graph=robot.graph)
             stack.enter_context(Agent(config, base, graph=robot.graph))
         until(lambda: all(robot.status.get("localised") and robot.costmap for robot in robots), robots)
         until(lambda: any(scout.cost(crate[0] + dx, crate[1]) == 100 for dx in (-0.05, 0.0, 0.05)), robots)

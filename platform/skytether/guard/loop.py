@@ -19,7 +19,7 @@ from .claim import Claim, ClaimError
 from .clock import now as boottime
 from .descriptors import receive
 from .enable import Enable, Power, WriterLine, open_line
-from .latch import LATCH_FILE, Keeper, Latch, boot_id, clean, lasting_file
+from .estop import LATCH_FILE, EstopFile, KeptEstop, boot_id, clean, lasting_file
 from .log import Log
 from .mailbox import bind
 from .onlooker import Onlooker
@@ -82,8 +82,8 @@ class Guard:
         boot = boot_id()
         self._record = Record(settings.record, boot)
         latch = os.path.join(settings.folder, LATCH_FILE)
-        keeper = Keeper(latch, boot, self._not_kept, lasting_file(settings.folder, settings.record))
-        self._latch = Latch(keeper)
+        keeper = EstopFile(latch, boot, self._not_kept, lasting_file(settings.folder, settings.record))
+        self._latch = KeptEstop(keeper)
         keeper.start()
         try:
             self._requests = Requests(os.path.join(settings.folder, STOP_SOCKET), self._answer)

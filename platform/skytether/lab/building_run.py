@@ -26,7 +26,7 @@ from skytether.robot.agent.agent import Agent, AgentConfig
 from .embedded import EmbeddedOrchestrator
 from .nine_goals import LIMITS, ROBOT, SERVICE
 from .trial.rig import TrialError
-from .world.agent import Clockwork, WorldBase, WorldGraph
+from .world.agent import Clockwork, WorldGraph, WorldHardware
 from .world.contacts import Contact
 from .world.guide import Guide
 from .world.picture import draw_run, frame
@@ -132,7 +132,7 @@ class Driven:
         }
 
 
-class _Base(WorldBase):
+class _Base(WorldHardware):
     """Obeys the agent; or, as soon as it is asked to, the guide, whatever the agent says."""
 
     def __init__(self, world: Simulation, graph: WorldGraph) -> None:

@@ -136,7 +136,7 @@ class DemoResult:
         }
 
 
-class WalkerBase:
+class WalkerHardware:
     """The simulated walker as the agent's hardware. The person begins to walk when the service drives."""
 
     topics: Mapping[str, type[Message]] = {"force": WrenchStamped, "wheels": JointState, "odom": Odometry}
@@ -192,7 +192,7 @@ class Demo:
     trail: Trail = field(default_factory=Trail)
     orchestrator: EmbeddedOrchestrator = field(init=False)
     network: LinkEmulator = field(init=False)
-    base: WalkerBase = field(init=False)
+    base: WalkerHardware = field(init=False)
     agent: Agent = field(init=False)
     _stack: ExitStack = field(default_factory=ExitStack)
 
@@ -205,7 +205,7 @@ class Demo:
             self.network = stack.enter_context(
                 LinkEmulator(("127.0.0.1", 9), up=settings.link(0), down=settings.link(1))
             )
-            self.base = WalkerBase(World(self.trail, seed=settings.seed))
+            self.base = WalkerHardware(World(self.trail, seed=settings.seed))
             config = AgentConfig(
                 robot=ROBOT,
                 url=self.orchestrator.url,

@@ -9,7 +9,7 @@ _MOST = 64
 """Kinds of trouble that are told apart; kinds are bounded, this is for the day that one is not."""
 
 
-class Notices:
+class LogThrottle:
     """Logs each kind of trouble when it begins, and again only when it comes back after having been gone.
 
     Args:

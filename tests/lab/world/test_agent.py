@@ -3,12 +3,12 @@ from collections import Counter
 import pytest
 
 from skytether.api.manifest import TopicSpec
-from skytether.lab.world.agent import CATCH_UP, Clockwork, WorldBase, WorldGraph
+from skytether.lab.world.agent import CATCH_UP, Clockwork, WorldGraph, WorldHardware
 from skytether.lab.world.plan import building
 from skytether.lab.world.simulation import TICK, Simulation
 from skytether.messages import LaserScan, String, Twist, Vector3, decode, encode
 from skytether.robot.control.arbiter import Needs
-from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Stop
 from skytether.robot.control.supervisor import Limits
 from skytether.wire.events import MessageReceived
@@ -18,7 +18,7 @@ MOVE = Twist(Vector3(x=0.4))
 
 def test_a_base_moves_the_world_by_the_robots_clock() -> None:
     world = Simulation(building(), seed=1)
-    base = WorldBase(Clockwork(world), names={"scan": "RosAria/laserscan"})
+    base = WorldHardware(Clockwork(world), names={"scan": "RosAria/laserscan"})
     assert base.topics["RosAria/laserscan"] is LaserScan
     found = Counter()
     for tick in range(120):
@@ -35,7 +35,7 @@ def test_a_base_moves_the_world_by_the_robots_clock() -> None:
 def test_two_robots_share_one_world() -> None:
     world = Simulation(building(), seed=1, robots=2)
     clockwork = Clockwork(world)
-    bases = [WorldBase(clockwork, index) for index in (0, 1)]
+    bases = [WorldHardware(clockwork, index) for index in (0, 1)]
     found = [Counter(), Counter()]
     for tick in range(100):
         for count, base in zip(found, bases, strict=True):
@@ -47,12 +47,12 @@ def test_two_robots_share_one_world() -> None:
 
 def test_an_unknown_topic_name_is_refused() -> None:
     with pytest.raises(ValueError, match="has no topic camera; it has tf, odom, scan"):
-        WorldBase(Clockwork(Simulation(building(), seed=1)), names={"camera": "camera"})
+        WorldHardware(Clockwork(Simulation(building(), seed=1)), names={"camera": "camera"})
 
 
 def test_the_robots_control_loop_runs_on_it() -> None:
-    base = WorldBase(Clockwork(Simulation(building(), seed=1)))
-    driver = Driver(base, Stop(), Limits(), Needs(), 0.0)
+    base = WorldHardware(Clockwork(Simulation(building(), seed=1)))
+    driver = ControlLoop(base, Stop(), Limits(), Needs(), 0.0)
     for tick in range(24):
         driver.tick(tick * TICK)
     status = driver.status()
@@ -63,7 +63,7 @@ def test_the_robots_control_loop_runs_on_it() -> None:
 def test_a_graph_carries_readings_out_and_what_a_service_publishes_in() -> None:
     graph = WorldGraph()
     world = Simulation(building(), seed=1)
-    base = WorldBase(Clockwork(world), graph=graph)
+    base = WorldHardware(Clockwork(world), graph=graph)
     specs = [
         TopicSpec(name="scan", type="sensor_msgs/msg/LaserScan", direction="in", priority=10),
         TopicSpec(name="goal", type="std_msgs/msg/String", direction="in", priority=10),

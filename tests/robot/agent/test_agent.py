@@ -56,8 +56,8 @@ class Rig:
 
     def ask(self):
         """One exchange, and what the control loop and the watch do of it."""
-        self.agent._asker.step()
-        self.agent._driver._change_over()
+        self.agent._lease_client.step()
+        self.agent._control_loop._change_over()
         self.agent._settle()
 
     @property
@@ -120,7 +120,7 @@ def test_an_experiment_may_put_a_link_in_between(base, orchestrator, make_bridge
 
 def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     rig.ask()
-    old = rig.agent._driver.session
+    old = rig.agent._control_loop.session
     make_cloud(old)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
     rig.agent.watch(rig.now)
@@ -130,7 +130,7 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
     assert not rig.agent.status().connected
     assert isnan(rig.agent.status().rtt), "of the session before"
-    cloud = make_cloud(rig.agent._driver.session)
+    cloud = make_cloud(rig.agent._control_loop.session)
     assert rig.agent.status().connected
     cloud.send(rig.now)
     rig.agent.tick(rig.now)
@@ -139,14 +139,14 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
 
 def test_while_the_cloud_drives_another_session_takes_over_with_its_first_command(rig, orchestrator, make_cloud):
     rig.ask()
-    old = rig.agent._driver.session
+    old = rig.agent._control_loop.session
     before = make_cloud(old)
     while rig.agent.source is not Source.CLOUD:
         before.send(rig.now)
         rig.tick()
     orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
     rig.ask()
-    assert rig.agent._driver.session is old
+    assert rig.agent._control_loop.session is old
     for _ in range(20):  # the other one is joined, and has not commanded yet
         before.send(rig.now)
         rig.tick()
@@ -157,7 +157,7 @@ def test_while_the_cloud_drives_another_session_takes_over_with_its_first_comman
     after = make_cloud(sessions["00000000000000cd"].session)
     after.send(rig.now)
     rig.tick()
-    assert rig.agent._driver.session is not old
+    assert rig.agent._control_loop.session is not old
     assert rig.agent.source is Source.CLOUD
     rig.agent.watch(rig.now)
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
@@ -188,7 +188,7 @@ class OneAtATime:
 
 def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orchestrator, make_cloud):
     def drive():
-        cloud = make_cloud(rig.agent._driver.session)
+        cloud = make_cloud(rig.agent._control_loop.session)
         for _ in range(500):
             cloud.send(rig.now)
             rig.tick()
@@ -196,7 +196,7 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orche
 
     rig.agent._graph = graph = OneAtATime()
     rig.ask()
-    kept, old = rig.agent.status().instance, rig.agent._driver.session
+    kept, old = rig.agent.status().instance, rig.agent._control_loop.session
     drive()
     orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
     rig.ask()
@@ -206,7 +206,7 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orche
     assert rig.agent.source is Source.FALLBACK
     orchestrator.session = SESSION
     rig.ask()
-    assert (rig.agent._driver.session.id, graph.opened) == (old.id, 3)
+    assert (rig.agent._control_loop.session.id, graph.opened) == (old.id, 3)
     assert rig.bridges[-1].running
     drive()
 
@@ -256,7 +256,7 @@ def test_the_bridges_counters_feed_choice_and_report(rig):
 
 def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
     rig.ask()
-    cloud = make_cloud(rig.agent._driver.session)
+    cloud = make_cloud(rig.agent._control_loop.session)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
     for _ in range(200):
         rig.now += 0.01
@@ -276,7 +276,7 @@ def test_an_answer_of_the_orchestrator_widens_no_limit_of_the_robot(rig, orchest
     needs = SESSION.needs.model_copy(update={"max_rtt_ms": 1e9, "max_loss": 1.0})
     orchestrator.session = SESSION.model_copy(update={"needs": needs})
     rig.ask()
-    cloud = make_cloud(rig.agent._driver.session)
+    cloud = make_cloud(rig.agent._control_loop.session)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=1.2),))
     for _ in range(200):
         rig.now += 0.01
@@ -298,7 +298,7 @@ def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_fo
     rows = [t.model_copy(update={"period_ms": 10}) if t.name == "cmd_vel" else t for t in SESSION.topics]
     orchestrator.session = SESSION.model_copy(update={"topics": tuple(rows)})
     rig.ask()
-    cloud, sent = make_cloud(rig.agent._driver.session), 0
+    cloud, sent = make_cloud(rig.agent._control_loop.session), 0
     for _ in range(500):
         rig.now += 0.01
         for i in range(10):
@@ -316,9 +316,9 @@ def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_fo
 
 def test_a_session_that_the_service_refuses_is_told(rig):
     rig.ask()
-    rig.agent._driver.session.notify(Refused("topic force: types differ"))
+    rig.agent._control_loop.session.notify(Refused("topic force: types differ"))
     assert rig.agent.status().trouble == "the service refused the session: topic force: types differ"
-    rig.agent._driver.session.notify(Connected(()))
+    rig.agent._control_loop.session.notify(Connected(()))
     assert rig.agent.status().trouble == ""
 
 

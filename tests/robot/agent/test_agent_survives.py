@@ -6,7 +6,7 @@ import pytest
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
-from skytether.lab.demo import WalkerBase
+from skytether.lab.demo import WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.link import LinkEmulator
 from skytether.lab.trail import Trail
@@ -27,7 +27,7 @@ def wait_for(condition, what):
 
 def test_a_robot_stays_usable_whatever_comes_and_goes(tmp_path):
     (tmp_path / "state").mkdir()
-    base = WalkerBase(World(Trail(), seed=1))
+    base = WalkerHardware(World(Trail(), seed=1))
     base.walking.set()
     with EmbeddedOrchestrator(tmp_path / "state") as orchestrator, LinkEmulator(("127.0.0.1", 9)) as link:
         tokens = [register(orchestrator)]

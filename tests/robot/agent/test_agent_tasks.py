@@ -17,16 +17,16 @@ def make(base, orchestrator, **changes):
 
 def test_the_preferred_site_is_asked_for(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig())
-    agent._tasks._decision = replace(agent._tasks.decision, site="edge")
+    agent._site_prober._decision = replace(agent._site_prober.decision, site="edge")
     request = agent._wanted()
     assert request.measurements["edge"].preferred
-    agent._asker.step()
+    agent._lease_client.step()
     assert agent.status().decision.site == "edge"
 
 
 def test_mode_local_asks_for_nothing(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig(Policy(mode=Mode.LOCAL)))
-    assert agent._asker.step() > 0
+    assert agent._lease_client.step() > 0
     assert orchestrator.calls == []
     agent.tick(50.01)
     assert agent.status().driver.source == "fallback"
@@ -34,19 +34,19 @@ def test_mode_local_asks_for_nothing(base, orchestrator):
 
 def test_a_decision_for_local_lets_the_instance_and_its_session_go(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig())
-    agent._asker.step()
-    agent._tasks._decision = replace(agent._tasks.decision, offload=False)
-    agent._asker.step()
+    agent._lease_client.step()
+    agent._site_prober._decision = replace(agent._site_prober.decision, offload=False)
+    agent._lease_client.step()
     assert orchestrator.calls[-1] == ("delete", "i1")
     assert agent.status().instance is None
 
 
 def test_an_instance_elsewhere_is_wanted_when_it_was_so_decided(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig())
-    agent._asker.step()
+    agent._lease_client.step()
     instance = agent._instance.model_copy(update={"placement": Placement(site="cloud")})
     assert not agent._elsewhere(instance)
-    agent._tasks._decision = replace(agent._tasks.decision, site="edge")
+    agent._site_prober._decision = replace(agent._site_prober.decision, site="edge")
     assert agent._elsewhere(instance)
 
 
@@ -60,9 +60,9 @@ def test_a_refused_token_is_read_again_from_where_it_came(base, monkeypatch):
         raise ApiError(Problem(title="no", status=401, detail="the token has expired"))
 
     monkeypatch.setattr(agent._own_client._http, "send", refuse)
-    assert agent._asker.step() == 10.0, "the file holds the same"
-    assert agent._asker.step() < 1.0
+    assert agent._lease_client.step() == 10.0, "the file holds the same"
+    assert agent._lease_client.step() < 1.0
     monkeypatch.setattr(agent, "_config", replace(CONFIG, fresh_token=lambda: "new"))
-    assert agent._asker.step() == 10.0
+    assert agent._lease_client.step() == 10.0
     assert sent == ["Bearer old", "Bearer old", "Bearer new"]
     agent.close()

@@ -9,7 +9,7 @@ import pytest
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import GateReport, Problem
 from skytether.orchestrator.config.settings import Timing
-from skytether.robot.agent.gate_report import AGAIN_S, PERIOD_S, SaysGate
+from skytether.robot.agent.gate_report import AGAIN_S, PERIOD_S, GateReporter
 
 CLEAR = GateReport(answers=True, hand="agent", zone="free")
 STOPPED = GateReport(answers=True, stopped="somebody fell", hand="nobody", zone="free")
@@ -24,7 +24,7 @@ class Robot:
         self.told: list[tuple[float, GateReport]] = []
         self.error: Exception | None = None
         self.refused = 0
-        self.says = SaysGate(self, "walker", lambda: self.gate, on_refused=self._refused, clock=lambda: self.now)
+        self.says = GateReporter(self, "walker", lambda: self.gate, on_refused=self._refused, clock=lambda: self.now)
 
     def report_gate(self, name: str, report: GateReport) -> None:
         if self.error is not None:

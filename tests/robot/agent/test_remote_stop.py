@@ -8,7 +8,7 @@ import pytest
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import Problem, StopOrder
 from skytether.robot.agent.gate_watch import GateWatch
-from skytether.robot.agent.remote_stop import FILE, StopFromAfar
+from skytether.robot.agent.remote_stop import FILE, RemoteStop
 from skytether.robot.safety.client import GateError
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -71,7 +71,7 @@ def gate():
 @pytest.fixture
 def agent(orchestrator, gate, tmp_path):
     """Makes an agent, as after each of its starts."""
-    return lambda: StopFromAfar(orchestrator, "walker", tmp_path, stop=gate.stop, status=gate.status, clock=lambda: 1.0)
+    return lambda: RemoteStop(orchestrator, "walker", tmp_path, stop=gate.stop, status=gate.status, clock=lambda: 1.0)
 
 
 def test_an_order_is_obeyed_and_acknowledged_once(agent, orchestrator, gate):

@@ -32,13 +32,13 @@ def agent(base, orchestrator):
 @pytest.fixture
 def busy(agent):
     """After a while: an instance, a session, a decision."""
-    agent._asker.step()
+    agent._lease_client.step()
     agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
     topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
     agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
-    agent._tally.take(agent, agent._stats)
+    agent._totals.take(agent, agent._stats)
     options = (Option("edge", {"delay": 0.3, "loss": 0.1}), Option("cloud", refused="answers no probe"))
-    agent._tasks._decision = replace(agent._tasks.decision, options=options, challenger=(options[0], 45.0))
+    agent._site_prober._decision = replace(agent._site_prober.decision, options=options, challenger=(options[0], 45.0))
     return agent
 
 
@@ -195,7 +195,7 @@ def test_no_free_port_keeps_no_robot_from_driving(served, base, orchestrator, ca
 
 def test_in_a_pipe_no_row_is_broken_and_a_site_called_local_is_listed_once(served):
     options = (Option("local", {"delay": 0.3}), Option(None, refused="the fallback only stops, " * 6))
-    served._tasks._decision = replace(served._tasks.decision, options=options)
+    served._site_prober._decision = replace(served._site_prober.decision, options=options)
     result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
     first = [line.split("│")[1].strip() for line in result.stdout.splitlines() if line.count("│") == 4]
     assert first.count("local") == 1

@@ -12,11 +12,11 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
 from skytether.robot.control.arbiter import Needs, Reason
 from skytether.robot.control.command import Source
-from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance, Stop
 from skytether.robot.control.service_manager import Terms, terms
 from skytether.robot.control.supervisor import Limits
-from skytether.robot.control.wheels_feedback import Told
+from skytether.robot.control.wheels_feedback import WheelsFeedback
 from skytether.robot.session.link_quality import Quality
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, Disconnected, MessageReceived
@@ -37,7 +37,7 @@ class Rig:
     def __init__(self, base, cloud, fallback=None, observer=None, limits=None):
         self.base = base
         self.now = 100.0
-        self.driver = Driver(base, fallback or Admittance(), limits or Limits(), Needs(), self.now, observer)
+        self.driver = ControlLoop(base, fallback or Admittance(), limits or Limits(), Needs(), self.now, observer)
         self._make_cloud = cloud
         self._epochs = count(1)
         self.cloud = None
@@ -172,7 +172,7 @@ class Gate:
 
     def _told(self, now):
         moves = self._base.written and self.hand != "nobody"
-        return Told(
+        return WheelsFeedback(
             Velocity(*self._base.written[-1]) if moves else STANDSTILL, 0.0, self.stopped, self.hand, self.started
         )
 

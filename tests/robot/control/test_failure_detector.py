@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.robot.control.failure_detector import LEAST_PERIODS, Accrual, least_s
+from skytether.robot.control.failure_detector import LEAST_PERIODS, AccrualDetector, least_s
 
 FIRST_S = 0.15
 LATENESS = [
@@ -53,7 +53,7 @@ def most(rate):
 
 @pytest.mark.parametrize("rate", [5, 10, 20, 50, 100, 200])
 def test_who_is_as_regular_as_a_clock_is_missed_after_two_and_a_half_periods(rate):
-    detector = Accrual(1 / rate, most(rate), FIRST_S)
+    detector = AccrualDetector(1 / rate, most(rate), FIRST_S)
     assert detector.limit_s == max(FIRST_S, LEAST_PERIODS / rate)
     alarms, _ = hear(detector, arrivals(rate, 20, scale=0.0))
     assert alarms == []
@@ -65,7 +65,7 @@ def test_who_is_as_regular_as_a_clock_is_missed_after_two_and_a_half_periods(rat
 @pytest.mark.parametrize("rate", [5, 10, 20, 50, 100, 200])
 def test_an_hour_on_a_busy_machine(rate, loss):
     """The first pauses of their kind may surprise it, in the first minutes; from then on nothing does."""
-    detector = Accrual(1 / rate, most(rate), FIRST_S)
+    detector = AccrualDetector(1 / rate, most(rate), FIRST_S)
     alarms, longest = hear(detector, arrivals(rate, 3600, loss=loss))
     assert len(alarms) <= 5
     assert [at for at in alarms if at >= 300] == []
@@ -76,14 +76,14 @@ def test_an_hour_on_a_busy_machine(rate, loss):
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [10, 20, 50, 100, 200])
 def test_an_hour_over_a_link_that_loses(rate):
-    detector = Accrual(1 / rate, most(rate), FIRST_S)
+    detector = AccrualDetector(1 / rate, most(rate), FIRST_S)
     alarms, longest = hear(detector, arrivals(rate, 3600, scale=0.05, loss=0.05))
     assert [at for at in alarms if at >= 60 and longest <= most(rate)] == []
     assert detector.limit_s <= min(3 / rate + 1.5 * longest, most(rate))
 
 
 def test_a_busy_time_is_forgotten_and_an_outage_says_nothing():
-    detector = Accrual(0.01, 0.4, FIRST_S)
+    detector = AccrualDetector(0.01, 0.4, FIRST_S)
     hear(detector, arrivals(100, 60))
     busy = detector.limit_s
     assert busy > 0.1
@@ -100,21 +100,21 @@ def test_a_busy_time_is_forgotten_and_an_outage_says_nothing():
 
 
 def test_a_sender_that_does_not_say_how_often_is_learned_too():
-    detector = Accrual(None, 0.4, FIRST_S)
+    detector = AccrualDetector(None, 0.4, FIRST_S)
     assert detector.limit_s == FIRST_S
     hear(detector, arrivals(50, 20, scale=0.0))
     assert detector.limit_s == pytest.approx(0.07)
 
 
 def test_a_claimed_period_widens_nothing_beyond_the_most():
-    assert Accrual(1000.0, 0.4, FIRST_S).limit_s == 0.4
-    detector = Accrual(1000.0, 0.4, FIRST_S)
+    assert AccrualDetector(1000.0, 0.4, FIRST_S).limit_s == 0.4
+    detector = AccrualDetector(1000.0, 0.4, FIRST_S)
     hear(detector, arrivals(100, 20, scale=0.0))
     assert detector.limit_s == pytest.approx(0.05), "what is seen counts, not what was claimed"
 
 
 def test_times_that_go_back_or_stand_still_are_left_out():
-    detector = Accrual(0.01, 0.4, FIRST_S)
+    detector = AccrualDetector(0.01, 0.4, FIRST_S)
     for at in (5.0, 5.0, 4.0, float("nan"), 4.01, float("inf"), 4.02):
         detector.arrived(at)
     hear(detector, (100 + at for at in arrivals(100, 20, scale=0.0)))

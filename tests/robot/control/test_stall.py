@@ -8,7 +8,7 @@ import pytest
 from skytether.robot.control import stall
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.command import Source
-from skytether.robot.control.control_loop import Driver
+from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance
 from skytether.robot.control.stall import StallWatch
 from skytether.robot.control.supervisor import Limits
@@ -25,7 +25,7 @@ class Robot:
     def __init__(self, base, bridge, make_cloud):
         self.base = base
         self.now, self.boot = 100.0, 5000.0
-        self.driver = Driver(base, Admittance(), LIMITS, Needs(), self.now, None, lambda: (self.now, self.boot))
+        self.driver = ControlLoop(base, Admittance(), LIMITS, Needs(), self.now, None, lambda: (self.now, self.boot))
         session = LiveSession("1", frozenset({"force"}), "cmd_vel", count(1))
         session.open(lambda port: bridge, ("127.0.0.1", 1))
         self.bridge = bridge

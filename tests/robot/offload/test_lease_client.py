@@ -5,7 +5,7 @@ import pytest
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import InstanceCreate, Problem, Report, Session, State
-from skytether.robot.offload.lease_client import Asker
+from skytether.robot.offload.lease_client import LeaseClient
 
 REQUEST = InstanceCreate(robot="walker", service="virtual-trail")
 
@@ -23,9 +23,9 @@ class Turns:
 
 @pytest.fixture
 def asked(orchestrator):
-    """An asker and what it told about the instance."""
+    """A lease client and what it told about the instance."""
     told = []
-    asker = Asker(
+    client = LeaseClient(
         orchestrator,
         REQUEST,
         on_instance=told.append,
@@ -33,91 +33,93 @@ def asked(orchestrator):
         healthy=lambda: orchestrator.healthy,
         random=Random(1),
     )
-    return asker, told
+    return client, told
 
 
 def test_it_asks_once_looks_until_it_runs_then_renews_with_a_report(orchestrator, asked):
-    asker, told = asked
+    client, told = asked
     orchestrator.states = [State.PENDING, State.STARTING, State.RUNNING]
-    assert [asker.step() for _ in range(4)] == [0.03, 0.03, 2.0, 2.0]
+    assert [client.step() for _ in range(4)] == [0.03, 0.03, 2.0, 2.0]
     assert [name for name, _ in orchestrator.calls] == ["create", "get", "get", "renew"]
     assert [instance.state for instance in told] == ["pending", "starting", "running", "running"]
     assert orchestrator.calls[-1][1].report == Report(rtt_s=0.1)
-    assert asker.trouble == ""
+    assert client.trouble == ""
 
 
 def test_while_a_start_takes_long_its_lease_is_kept(orchestrator):
     now = 10.0
-    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, renew_s=2.0, random=Random(1))
+    client = LeaseClient(
+        orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, renew_s=2.0, random=Random(1)
+    )
     orchestrator.states = [State.STARTING]
     while now < 15.0:
-        now += asker.step()
+        now += client.step()
     names = [name for name, _ in orchestrator.calls]
     assert (names.count("create"), names.count("renew")) == (1, 2)
     assert len(names) < 70, "every 30 ms at first, and less and less often"
     now += 60
-    assert asker.step() == 0.25
+    assert client.step() == 0.25
     assert orchestrator.calls[names.index("renew")][1].report is None
 
 
 def test_a_restart_is_waited_for_like_a_start_however_long_it_ran(orchestrator):
     now = 10.0
-    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, random=Random(1))
+    client = LeaseClient(orchestrator, REQUEST, on_instance=lambda _: None, clock=lambda: now, random=Random(1))
     orchestrator.states = [State.RUNNING]
     for _ in range(3):
-        asker.step()
+        client.step()
         now += 3600
     orchestrator.states = [State.STARTING]
-    assert asker.step() == 0.03
+    assert client.step() == 0.03
 
 
 def test_when_the_link_goes_bad_it_looks_sooner(orchestrator, asked):
-    asker, _ = asked
+    client, _ = asked
     orchestrator.healthy = False
-    looks = [asker.step() for _ in range(6)]
+    looks = [client.step() for _ in range(6)]
     assert looks[0] <= 0.2
     assert 1.0 <= looks[-1] <= 2.0
     orchestrator.healthy = True
-    assert asker.step() == 2.0
+    assert client.step() == 2.0
     orchestrator.healthy = False
-    assert asker.step() <= 0.2
+    assert client.step() <= 0.2
 
 
 def test_an_orchestrator_that_is_away_is_tried_again_with_back_off_and_the_same_key(orchestrator, asked, caplog):
-    asker, told = asked
+    client, told = asked
     orchestrator.fail = Unreachable("nobody answers")
-    delays = [asker.step() for _ in range(8)]
+    delays = [client.step() for _ in range(8)]
     assert delays[0] <= 0.2 < 1.6 <= max(delays) <= 5.0
-    assert (asker.trouble, told, caplog.messages) == ("nobody answers", [], [])
-    asker.run(Turns(3))
+    assert (client.trouble, told, caplog.messages) == ("nobody answers", [], [])
+    client.run(Turns(3))
     assert caplog.messages == ["nobody answers"], "said once, by the loop: who makes steps looks at trouble"
     orchestrator.fail = None
-    asker.step()
-    assert asker.trouble == ""
+    client.step()
+    assert client.trouble == ""
     assert len({key for name, key in orchestrator.calls if name == "create"}) == 1
     orchestrator.fail = Unreachable("nobody answers")
-    assert asker.step() <= 0.2, "the back-off starts anew"
+    assert client.step() <= 0.2, "the back-off starts anew"
 
 
 def test_an_orchestrator_that_goes_away_later_does_not_lose_the_instance(orchestrator, asked):
-    asker, told = asked
-    asker.step()
+    client, told = asked
+    client.step()
     orchestrator.fail = Unreachable("nobody answers")
     for _ in range(3):
-        asker.step()
+        client.step()
     orchestrator.fail = None
-    asker.step()
+    client.step()
     assert {instance.id for instance in told} == {"i1"}
     assert [name for name, _ in orchestrator.calls].count("create") == 1
 
 
 def test_an_instance_that_is_gone_is_asked_for_again_under_a_new_key(orchestrator, asked, caplog):
-    asker, told = asked
-    asker.step()
+    client, told = asked
+    client.step()
     orchestrator.fail = problem(404, "no such instance")
-    asker.run(Turns(1))
+    client.run(Turns(1))
     orchestrator.fail = None
-    asker.run(Turns(1))
+    client.run(Turns(1))
     assert [instance.id for instance in told] == ["i1", "i2"]
     keys = [key for name, key in orchestrator.calls if name == "create"]
     assert len(set(keys)) == 2
@@ -126,21 +128,21 @@ def test_an_instance_that_is_gone_is_asked_for_again_under_a_new_key(orchestrato
 
 @pytest.mark.parametrize("state", [State.FAILED, State.STOPPED, State.STOPPING])
 def test_an_instance_that_ended_is_asked_for_again(orchestrator, asked, state):
-    asker, told = asked
+    client, told = asked
     orchestrator.states = [State.RUNNING, state, State.RUNNING]
     orchestrator.reason = "it crashed 5 times"
-    asker.step()
-    asker.step()
-    assert asker.trouble == f"instance i1 is {state}: it crashed 5 times"
-    asker.step()
+    client.step()
+    client.step()
+    assert client.trouble == f"instance i1 is {state}: it crashed 5 times"
+    client.step()
     assert [instance.id for instance in told] == ["i1", "i2"]
 
 
 def test_a_token_that_is_refused_is_said_once_and_tried_slowly(orchestrator, asked, caplog):
-    asker, _ = asked
+    client, _ = asked
     orchestrator.fail = problem(401, "the token is not known")
-    assert asker.step() == 10.0
-    asker.run(Turns(3))
+    assert client.step() == 10.0
+    client.run(Turns(3))
     assert caplog.messages == ["the token is not known"]
 
 
@@ -151,25 +153,25 @@ def test_an_unknown_service_is_said_and_tried_again(orchestrator, asked):
 
 
 def test_release_lets_the_instance_go(orchestrator, asked):
-    asker, _ = asked
-    assert asker.release() is None
-    asker.step()
-    assert asker.release() == "i1"
+    client, _ = asked
+    assert client.release() is None
+    client.step()
+    assert client.release() == "i1"
     assert [name for name, _ in orchestrator.calls[-2:]] == ["renew", "delete"], "what was counted last is told"
     assert orchestrator.calls[-2][1].report == Report(rtt_s=0.1)
-    assert asker.release() is None
+    assert client.release() is None
 
 
 def test_release_does_not_fail_when_nobody_answers(orchestrator, asked, caplog):
-    asker, _ = asked
-    asker.step()
+    client, _ = asked
+    client.step()
     orchestrator.fail = Unreachable("nobody answers")
-    assert asker.release() is None
+    assert client.release() is None
     assert "its lease will end it" in caplog.text
 
 
 def test_run_goes_on_after_what_nobody_expected_and_ends_when_told(orchestrator, asked, monkeypatch):
-    asker, told = asked
+    client, told = asked
     stop = threading.Event()
     answers = iter([ZeroDivisionError("strange"), None])
 
@@ -178,31 +180,31 @@ def test_run_goes_on_after_what_nobody_expected_and_ends_when_told(orchestrator,
         return bool(told)
 
     monkeypatch.setattr(stop, "wait", wait)
-    asker.run(stop)
+    client.run(stop)
     assert [name for name, _ in orchestrator.calls] == ["create", "create"]
-    assert asker.trouble == ""
+    assert client.trouble == ""
 
 
 def test_a_service_that_is_not_wanted_any_more_is_let_go_and_asked_for_later(orchestrator):
     wanted = [REQUEST]
-    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, wanted=lambda: wanted[0])
-    asker.step()
+    client = LeaseClient(orchestrator, REQUEST, on_instance=lambda _: None, wanted=lambda: wanted[0])
+    client.step()
     wanted[0] = None
-    assert asker.step() == 0.5
-    assert asker.step() == 0.5
+    assert client.step() == 0.5
+    assert client.step() == 0.5
     assert [name for name, _ in orchestrator.calls] == ["create", "delete"]
     wanted[0] = REQUEST
-    asker.step()
+    client.step()
     keys = [key for name, key in orchestrator.calls if name == "create"]
     assert len(set(keys)) == 2
 
 
 class Mover:
-    """An asker that wants to be elsewhere once, and what it was told."""
+    """A lease client that wants to be elsewhere once, and what it was told."""
 
     def __init__(self, orchestrator):
         self.now, self.elsewhere, self.told, self.stayed = 0.0, False, [], []
-        self.asker = Asker(
+        self.client = LeaseClient(
             orchestrator,
             REQUEST,
             on_instance=lambda instance: self.told.append(instance.id),
@@ -210,79 +212,79 @@ class Mover:
             on_stayed=lambda instance, why: self.stayed.append((instance.id, why)),
             clock=lambda: self.now,
         )
-        self.asker.step()
+        self.client.step()
         self.elsewhere = True
 
 
 def test_it_moves_to_an_instance_elsewhere_once_that_runs_and_lets_the_first_go(orchestrator):
     mover = Mover(orchestrator)
     orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.STARTING, State.RUNNING]
-    mover.asker.step()  # renews, asks elsewhere
+    mover.client.step()  # renews, asks elsewhere
     mover.elsewhere = False
-    mover.asker.step()  # renews, looks: starting
+    mover.client.step()  # renews, looks: starting
     assert "delete" not in [name for name, _ in orchestrator.calls]
-    mover.asker.step()
+    mover.client.step()
     assert [call for call in orchestrator.calls if call[0] == "delete"] == [("delete", "i1")]
     assert mover.told[-1] == "i2"
     assert mover.stayed == []
-    assert mover.asker.release() == "i2"
+    assert mover.client.release() == "i2"
 
 
 def test_an_instance_elsewhere_that_fails_or_dawdles_is_given_up_and_the_first_kept(orchestrator):
     mover = Mover(orchestrator)
     orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.FAILED, State.RUNNING]
     orchestrator.reason = "no such image"
-    mover.asker.step()
-    mover.asker.step()
+    mover.client.step()
+    mover.client.step()
     assert mover.stayed == [("i1", "no such image")]
     orchestrator.states = [State.RUNNING, State.PENDING, State.RUNNING, State.STARTING, State.RUNNING]
-    mover.asker.step()
+    mover.client.step()
     mover.now = 21.0
-    mover.asker.step()
+    mover.client.step()
     assert len(mover.stayed) == 2
-    assert mover.asker.trouble == ""
+    assert mover.client.trouble == ""
 
 
 def test_a_successor_is_followed_and_the_first_let_go_when_it_serves(orchestrator):
     serves = []
     told = []
-    asker = Asker(
+    client = LeaseClient(
         orchestrator,
         REQUEST,
         on_instance=lambda instance: told.append(instance.id),
         taken_over=lambda instance: instance.id in serves,
     )
-    asker.step()
+    client.step()
     orchestrator.successor = "i7"
-    asker.step()  # renews, learns of it
+    client.step()  # renews, learns of it
     orchestrator.successor = None
-    asker.step()
-    asker.step()
+    client.step()
+    client.step()
     assert told[-1] == "i7"
     assert "delete" not in [name for name, _ in orchestrator.calls], "the first drives until the other one does"
     serves.append("i7")
-    asker.step()
+    client.step()
     assert [call for call in orchestrator.calls if call[0] == "delete"] == [("delete", "i1")]
-    assert asker.release() == "i7"
+    assert client.release() == "i7"
 
 
 def test_when_the_first_ends_while_another_is_coming_that_one_is_kept(orchestrator):
-    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, taken_over=lambda _: False)
-    asker.step()
+    client = LeaseClient(orchestrator, REQUEST, on_instance=lambda _: None, taken_over=lambda _: False)
+    client.step()
     orchestrator.successor = "i7"
-    asker.step()
+    client.step()
     orchestrator.successor = None
     orchestrator.states = [State.FAILED, State.RUNNING]
-    asker.step()
-    assert asker.release() == "i7"
+    client.step()
+    assert client.release() == "i7"
 
 
 def test_a_refused_token_is_looked_for_again_and_a_new_one_tried_soon(orchestrator):
     fresh = [True, False]
-    asker = Asker(orchestrator, REQUEST, on_instance=lambda _: None, on_refused=lambda: fresh.pop(0))
+    client = LeaseClient(orchestrator, REQUEST, on_instance=lambda _: None, on_refused=lambda: fresh.pop(0))
     orchestrator.fail = problem(401, "the token has expired")
-    assert asker.step() <= 0.2
-    assert asker.step() == 10.0
+    assert client.step() <= 0.2
+    assert client.step() == 10.0
 
 
 def problem(status: int, detail: str) -> ApiError:
@@ -292,9 +294,9 @@ def problem(status: int, detail: str) -> ApiError:
 def test_a_key_is_claimed_once_and_given_to_who_opens_the_session(orchestrator):
     told = []
     orchestrator.session = Session(id="ab" * 8, host="127.0.0.1", port=4711)
-    asker = Asker(orchestrator, REQUEST, on_instance=told.append)
+    client = LeaseClient(orchestrator, REQUEST, on_instance=told.append)
     for _ in range(3):
-        asker.step()
+        client.step()
     assert [call for call in orchestrator.calls if call[0] == "claim"] == [("claim", "i1")]
     assert [instance.session.key for instance in told] == [orchestrator.KEY] * 3
 
@@ -303,11 +305,11 @@ def test_a_key_that_somebody_else_has_is_said_and_another_instance_asked_for(orc
     told = []
     orchestrator.session = Session(id="ab" * 8, host="127.0.0.1", port=4711)
     orchestrator.key_taken = True
-    asker = Asker(orchestrator, REQUEST, on_instance=told.append)
-    asker.step()
-    assert asker.trouble == "was handed out already"
+    client = LeaseClient(orchestrator, REQUEST, on_instance=told.append)
+    client.step()
+    assert client.trouble == "was handed out already"
     orchestrator.key_taken = False
-    asker.step()
+    client.step()
     assert [name for name, _ in orchestrator.calls] == ["create", "claim", "delete", "create", "claim"]
     keys = [what for name, what in orchestrator.calls if name == "create"]
     assert keys[0] != keys[1]

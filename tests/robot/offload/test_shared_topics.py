@@ -9,7 +9,7 @@ from skytether.api.client import ApiError, Unreachable
 from skytether.api.manifest import TopicSpec
 from skytether.api.rest import MOST_NEIGHBOURS, MOST_SHARED, Neighbours, Problem, Share, Shared
 from skytether.messages import String, decode, encode
-from skytether.robot.offload.shared_topics import Serving, SharedTopics, Sharing
+from skytether.robot.offload.shared_topics import Serving, SharedTopics, SharedTopicsExchange
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
 from skytether_services.navigation.shared_word import read_said
@@ -37,7 +37,9 @@ class Scene:
         self.exchange = Exchange()
         self.refused = 0
         self.serving = self.session_of(topics, id_)
-        self.sharing = Sharing(self.exchange, lambda: self.serving, on_refused=self.on_refused, clock=lambda: self.now)
+        self.sharing = SharedTopicsExchange(
+            self.exchange, lambda: self.serving, on_refused=self.on_refused, clock=lambda: self.now
+        )
 
     def on_refused(self):
         self.refused += 1

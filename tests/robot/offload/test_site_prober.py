@@ -6,7 +6,7 @@ from skytether.api.client import ApiError, Unreachable
 from skytether.api.manifest import Manifest
 from skytether.api.rest import Placement, Problem, Refusal, Site
 from skytether.bridge.echo import EchoServer
-from skytether.robot.offload.site_prober import TaskConfig, Tasks, system_battery
+from skytether.robot.offload.site_prober import SiteProber, TaskConfig, system_battery
 from skytether.robot.offload.task_manager import PathQuality
 
 MANIFEST = Manifest.model_validate(
@@ -49,7 +49,7 @@ class Rig:
         self.now = 100.0
         self.sites = sites
         task = TaskConfig(**{"battery": lambda: (0.5, False), **config})
-        self.tasks = Tasks(task, sites, "guide", drives=True, clock=lambda: self.now, load=lambda: 0.3)
+        self.tasks = SiteProber(task, sites, "guide", drives=True, clock=lambda: self.now, load=lambda: 0.3)
 
     def look(self, times=1):
         for _ in range(times):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from skytether.messages import Vector3, Wrench, WrenchStamped
 from skytether.robot.agent.agent import Agent, AgentConfig
-from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.safety.client import GateLink
 
 
@@ -25,6 +25,6 @@ class Pushed:
 config = AgentConfig(
     robot="walker", url="http://127.0.0.1:9", token="none", service="virtual-trail", fallback="admittance"
 )
-with Agent(config, GatedBase(Pushed(), GateLink(Path(sys.argv[1])))):
+with Agent(config, GatedHardware(Pushed(), GateLink(Path(sys.argv[1])))):
     while True:
         time.sleep(1)

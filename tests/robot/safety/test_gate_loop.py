@@ -14,7 +14,7 @@ import pytest
 from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
 from skytether.guard.claim import LOCK_FILE, Claim
-from skytether.guard.latch import FIRST_ACT, Keeper, boot_id
+from skytether.guard.estop import FIRST_ACT, EstopFile, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, LaserScan, Message, encode
@@ -311,7 +311,7 @@ def test_a_stop_is_kept_by_the_gate_where_the_guard_does_not_answer(bench):
     bench.answers = False
     stopped = bench.ask(do="stop", reason="released")
     assert (stopped["stopped"], stopped.get("note")) == ("released", None)
-    assert "released (before" in Keeper(str(bench.folder / "latch"), boot_id(), print).before()
+    assert "released (before" in EstopFile(str(bench.folder / "latch"), boot_id(), print).before()
 
 
 def test_a_stop_that_nobody_could_keep_is_in_effect_and_says_so(bench):

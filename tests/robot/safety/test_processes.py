@@ -24,7 +24,7 @@ from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, Wrench, WrenchStamped, decode, encode
 from skytether.robot.agent import remote_stop
 from skytether.robot.agent.agent import Agent, AgentConfig
-from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.safety.client import GateError, GateLink, ask
 
 pytestmark = pytest.mark.slow
@@ -492,7 +492,7 @@ def test_a_robot_without_an_instance_is_stopped_from_afar_once(robot, tmp_path):
         )
         with (
             closing(GateLink(robot.folder)) as link,
-            Agent(config, GatedBase(Pushed(), link)) as agent,
+            Agent(config, GatedHardware(Pushed(), link)) as agent,
             Client(orchestrator.url, orchestrator.operator_token) as operator,
         ):
             robot.drives()

@@ -14,11 +14,11 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Time, Twist
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.control.supervisor import Limits, Objection
-from skytether.robot.log_throttle import Notices
+from skytether.robot.log_throttle import LogThrottle
 from skytether.robot.safety.coverage import Action
+from skytether.robot.safety.estop import ButtonParams
 from skytether.robot.safety.footprint import Points, polygon
 from skytether.robot.safety.joystick import JoystickParams
-from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.ranges import Mount
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sensing import RangeSensor
@@ -338,7 +338,7 @@ def test_a_clock_that_jumps_stops_the_robot_and_it_recovers(jump):
 
 
 def test_each_trouble_is_named_once(caplog):
-    bench, notices = Bench(), Notices(logging.getLogger("gate"))
+    bench, notices = Bench(), LogThrottle(logging.getLogger("gate"))
     bench.scans = bench.buttons = False
     for _ in range(900):
         bench.send(nan, 0.0)

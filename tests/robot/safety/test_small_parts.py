@@ -9,12 +9,12 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.requests import Requests
 from skytether.messages import Joy, Twist, Vector3
-from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.control.supervisor import Limits
-from skytether.robot.safety import joystick, kinematics, latch
+from skytether.robot.safety import estop, joystick, kinematics
 from skytether.robot.safety.client import GateLink, stop
+from skytether.robot.safety.estop import ButtonParams, Estop
 from skytether.robot.safety.joystick import Grip, Joystick, JoystickParams
-from skytether.robot.safety.latch import ButtonParams, Latch
 
 LIMITS = Limits()  # accelerates 1 m/s^2 and 2 rad/s^2, brakes 2 m/s^2 and 4 rad/s^2
 PAD = JoystickParams(deadman=1, linear_axis=1, angular_axis=0, linear=0.2, angular=0.4, deadzone=0.0, max_age_s=0.3)
@@ -102,44 +102,44 @@ def test_axes_beyond_their_end_are_at_their_end():
 
 
 def test_the_first_reason_of_an_emergency_stop_is_kept_until_reset():
-    state = latch.engage(latch.engage(Latch(), "a person said so"), "another did")
+    state = estop.engage(estop.engage(Estop(), "a person said so"), "another did")
     assert state.reason == "a person said so"
-    assert latch.reset(None, state, 0.0) == (Latch(), "")
+    assert estop.reset(None, state, 0.0) == (Estop(), "")
 
 
 def test_a_pressed_button_latches_and_is_not_reset_while_pressed():
     button = ButtonParams(pressed_is=True, max_age_s=0.5)
-    state = latch.hear(button, Latch(), True, 1.0)
+    state = estop.hear(button, Estop(), True, 1.0)
     assert "button was pressed" in state.reason
-    assert "still pressed" in latch.reset(button, state, 1.1)[1]
-    state = latch.hear(button, state, False, 1.2)
+    assert "still pressed" in estop.reset(button, state, 1.1)[1]
+    state = estop.hear(button, state, False, 1.2)
     assert state.reason  # letting go is not enough
-    assert "not heard" in latch.reset(button, state, 1.8)[1]
-    state, refused = latch.reset(button, state, 1.3)
+    assert "not heard" in estop.reset(button, state, 1.8)[1]
+    state, refused = estop.reset(button, state, 1.3)
     assert (state.reason, refused) == ("", "")
 
 
 def test_a_circuit_that_opens_is_pressed_when_false():
     button = ButtonParams(pressed_is=False)
-    assert latch.hear(button, Latch(), False, 0.0).reason
-    assert not latch.hear(button, Latch(), True, 0.0).reason
+    assert estop.hear(button, Estop(), False, 0.0).reason
+    assert not estop.hear(button, Estop(), True, 0.0).reason
 
 
 @pytest.mark.parametrize(
     ("now", "silent"), [(1.5, False), (1.51, True), (0.97, False), (0.9, True), (nan, True), (inf, True)]
 )
 def test_a_button_is_silent_when_it_is_not_heard(now, silent):
-    assert latch.silent(ButtonParams(max_age_s=0.5), Latch(heard_at=1.0), now) is silent
-    assert latch.silent(ButtonParams(max_age_s=0.5), Latch(), now) is True
+    assert estop.silent(ButtonParams(max_age_s=0.5), Estop(heard_at=1.0), now) is silent
+    assert estop.silent(ButtonParams(max_age_s=0.5), Estop(), now) is True
 
 
 def test_a_button_that_speaks_only_when_it_changes_is_never_silent_once_heard():
-    assert latch.silent(ButtonParams(max_age_s=inf), Latch(heard_at=1.0), 1e6) is False
-    assert latch.silent(ButtonParams(max_age_s=inf), Latch(), 1e6) is True
+    assert estop.silent(ButtonParams(max_age_s=inf), Estop(heard_at=1.0), 1e6) is False
+    assert estop.silent(ButtonParams(max_age_s=inf), Estop(), 1e6) is True
 
 
 def test_the_agents_wheels_are_not_asked_for_what_they_do_not_have(tmp_path):
-    base = GatedBase(SimpleNamespace(topics={}), link := GateLink(tmp_path))
+    base = GatedHardware(SimpleNamespace(topics={}), link := GateLink(tmp_path))
     link.close()
     with pytest.raises(ValueError, match=r"linear\.y, linear\.z, angular\.x, angular\.y cannot be asked"):
         base.write(Twist(linear=Vector3(x=0.1, y=0.1)))

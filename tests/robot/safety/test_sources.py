@@ -17,9 +17,9 @@ from skytether.robot.control.restart_interlock import NEUTRAL_S
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety import joystick
 from skytether.robot.safety.coverage import Action, UnseenParams
+from skytether.robot.safety.estop import ButtonParams
 from skytether.robot.safety.footprint import circle
 from skytether.robot.safety.joystick import RELEASED_S, Grip, Joystick, JoystickParams
-from skytether.robot.safety.latch import ButtonParams
 from skytether.robot.safety.rules import Decision, Gate, Rules
 from skytether.robot.safety.sources import LockParams, OnSilence, SourceParams, SourceRules
 

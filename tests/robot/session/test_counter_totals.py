@@ -2,7 +2,7 @@ from dataclasses import replace
 
 from skytether.api.rest import MOST_COUNTED, MOST_TOPICS
 from skytether.robot.agent.snapshot import report
-from skytether.robot.session.counter_totals import Tally
+from skytether.robot.session.counter_totals import CounterTotals
 from skytether.wire.stats import SessionStats, TopicStats
 
 SCAN = TopicStats("scan", "in", 100, offered=12, sent=10, delivered=7, lost=2, late=1, bytes_sent=900)
@@ -16,13 +16,13 @@ def of(*topics: TopicStats) -> SessionStats:
     return SessionStats(True, topics)
 
 
-def counted(tally: Tally, topic: str = "scan") -> tuple[int, int, int, int]:
+def counted(tally: CounterTotals, topic: str = "scan") -> tuple[int, int, int, int]:
     _, counts = tally.sums()[topic, "in"]
     return counts["sent"], counts["delivered"], counts["lost"], counts["late"]
 
 
 def test_sessions_add_up_also_while_there_are_two():
-    tally, first, second = Tally("a"), Session(), Session()
+    tally, first, second = CounterTotals("a"), Session(), Session()
     tally.take(first, of(SCAN))
     tally.take(second, of(SCAN))
     assert counted(tally) == (20, 14, 6, 2)
@@ -35,7 +35,7 @@ def test_sessions_add_up_also_while_there_are_two():
 
 
 def test_nothing_goes_down():
-    tally, session = Tally("a"), Session()
+    tally, session = CounterTotals("a"), Session()
     tally.take(session, of(SCAN))
     tally.take(session, of(replace(SCAN, lost=1, late=2, delivered=8)))  # a loss was late after all
     assert counted(tally) == (10, 8, 3, 2)
@@ -47,7 +47,7 @@ def test_nothing_goes_down():
 
 
 def test_what_is_under_way_when_a_session_ends_is_unknown():
-    tally, session = Tally("a"), Session()
+    tally, session = CounterTotals("a"), Session()
     tally.take(session, of(replace(SCAN, sent=15)))
     assert tally.sums()["scan", "in"][1]["unknown"] == 0
     tally.take(session, of(replace(SCAN, sent=15)), last=True)
@@ -55,7 +55,7 @@ def test_what_is_under_way_when_a_session_ends_is_unknown():
 
 
 def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one():
-    tally = Tally("a")
+    tally = CounterTotals("a")
     tally.take(Session(), of(SCAN, TopicStats("old", "in", 5, sent=3)), last=True)
     now = of(replace(SCAN, sent=2**60, delay_p50=0.02))
     tally.take(Session(), now)
@@ -66,7 +66,7 @@ def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one
 
 
 def test_a_report_of_more_topics_than_it_may_have_names_those_of_the_present_session():
-    tally, now = Tally("a"), of(SCAN)
+    tally, now = CounterTotals("a"), of(SCAN)
     tally.take(Session(), of(*(TopicStats(str(n), "in", 5) for n in range(MOST_TOPICS))), last=True)
     tally.take(Session(), now)
     told = report(None, tally, now, 0.1).topics

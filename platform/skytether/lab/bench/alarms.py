@@ -19,7 +19,7 @@ import numpy as np
 from skytether.robot.agent.agent import Agent
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Command, Source
-from skytether.robot.control.control_loop import DriverStatus
+from skytether.robot.control.control_loop import ControlStatus
 
 from .failover import LEARN_S, Granted, Wheels, bench_config, start_link, start_service, wait_for
 
@@ -85,7 +85,7 @@ def bench_alarms(
         return [_watch(rate, seconds, busy, on_look) for rate in rates_hz]
 
 
-def _lost(status: DriverStatus) -> int:
+def _lost(status: ControlStatus) -> int:
     """Times that the cloud was left."""
     return sum(n for reason, n in status.transition_counts.items() if reason not in (Reason.START, Reason.RECOVERED))
 

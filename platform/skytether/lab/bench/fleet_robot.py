@@ -15,8 +15,8 @@ from skytether.bridge.spec import SessionSpec
 from skytether.lab.link_model import LinkConditions
 from skytether.lab.lossy_link import LossyLink
 from skytether.robot.agent.snapshot import report
-from skytether.robot.offload.lease_client import Asker
-from skytether.robot.session.counter_totals import COUNTERS, Tally
+from skytether.robot.offload.lease_client import LeaseClient
+from skytether.robot.session.counter_totals import COUNTERS, CounterTotals
 from skytether.wire import Direction, Role, Session
 
 from .requests import sleeper
@@ -74,8 +74,8 @@ class SimulatedRobot:
     def _begin(self) -> None:
         self._links: dict[str, LossyLink] = {}
         self._instance: Instance | None = None
-        self._tally = Tally(uuid.uuid4().hex)
-        self._asker = Asker(
+        self._totals = CounterTotals(uuid.uuid4().hex)
+        self._lease_client = LeaseClient(
             self._client,
             self._request,
             on_instance=self._follow,
@@ -93,7 +93,7 @@ class SimulatedRobot:
     @property
     def trouble(self) -> str:
         """Why it is not served."""
-        return self._asker.trouble
+        return self._lease_client.trouble
 
     @property
     def settled(self) -> bool:
@@ -104,7 +104,7 @@ class SimulatedRobot:
             and one.session is not None
             and one.state is State.RUNNING
             and not one.successor
-            and not self._asker.trouble
+            and not self._lease_client.trouble
             and list(self._links) == [one.session.id]
             and self._links[one.session.id].sessions[Role.ROBOT].stats(self._now).connected
         )
@@ -117,7 +117,7 @@ class SimulatedRobot:
 
     def exchange(self) -> None:
         """One exchange with the orchestrator."""
-        self._asker.step()
+        self._lease_client.step()
 
     def begin_anew(self) -> None:
         """Its program is killed just after a report, and started."""
@@ -137,7 +137,7 @@ class SimulatedRobot:
         """Let the service go."""
         for session in list(self._links):
             self._close(session)
-        self._asker.release()
+        self._lease_client.release()
         self._instance = None
 
     def come_back(self) -> None:
@@ -147,7 +147,7 @@ class SimulatedRobot:
     def counted(self) -> Series:
         """What it counted in all its life, also what an earlier program had told."""
         counted: Series = Counter(self._before)
-        for key, (_, counts) in self._tally.sums().items():
+        for key, (_, counts) in self._totals.sums().items():
             for name in COUNTERS:
                 counted[(self.name, *key, name)] += counts[name]
         return counted
@@ -155,7 +155,7 @@ class SimulatedRobot:
     def unexplained(self) -> int:
         """Messages that were sent and of which nothing is known."""
         total = 0
-        for _, counts in self._tally.sums().values():
+        for _, counts in self._totals.sums().values():
             ended = counts["delivered"] + counts["superseded"] + counts["lost"] - counts["late"] + counts["unknown"]
             total += abs(counts["sent"] - ended)
         return total
@@ -168,8 +168,8 @@ class SimulatedRobot:
 
     def _report(self) -> Report:
         for link in self._links.values():
-            self._tally.take(link, link.sessions[Role.ROBOT].stats(self._now))
-        return report(None, self._tally, None, 0.1)
+            self._totals.take(link, link.sessions[Role.ROBOT].stats(self._now))
+        return report(None, self._totals, None, 0.1)
 
     def _follow(self, instance: Instance) -> None:
         self._instance = instance
@@ -193,7 +193,7 @@ class SimulatedRobot:
         """Hear what was under way, and let the session go."""
         link = self._links.pop(session)
         self._run(link, self._now + _DRAIN_S, traffic=False)
-        self._tally.take(link, link.sessions[Role.ROBOT].stats(link.now), last=True)
+        self._totals.take(link, link.sessions[Role.ROBOT].stats(link.now), last=True)
 
     def _end(self, role: Role, instance: Instance) -> Session:
         session = _session(instance)

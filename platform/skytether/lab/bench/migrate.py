@@ -20,7 +20,7 @@ import numpy as np
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
-from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.demo import ROBOT, SERVICE, WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
@@ -102,7 +102,7 @@ def bench_migrate(n: int, on_move: Callable[[int, float], None] = lambda *_: Non
         bind = ("127.0.0.1", 0)
         config = AgentConfig(robot=ROBOT, url=orchestrator.url, token=token, service=SERVICE, bind=bind, renew_s=0.5)
         seen = Commands()
-        with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
+        with Agent(config, WalkerHardware(World(Trail(), seed=1)), observer=seen) as agent:
             wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             for i in range(n):

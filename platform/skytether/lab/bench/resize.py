@@ -25,7 +25,7 @@ from skytether.api.rest import Resize, RobotCreate, Size
 from skytether.lab.bench.containers import docker, docker_site
 from skytether.lab.bench.migrate import PERIOD_MS, Commands, instance_of, wait_for
 from skytether.lab.bench.pair import BenchError
-from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.demo import ROBOT, SERVICE, WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
@@ -116,7 +116,7 @@ def bench_resize(
             token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
         config = AgentConfig(ROBOT, orchestrator.url, SERVICE, token, bind=("127.0.0.1", 0))
         seen = Commands()
-        with Agent(config, WalkerBase(World(Trail(), seed=1)), observer=seen) as agent:
+        with Agent(config, WalkerHardware(World(Trail(), seed=1)), observer=seen) as agent:
             wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             instance = instance_of(agent)

@@ -9,10 +9,10 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.lab.bench.pair import BenchError
-from skytether.lab.demo import WalkerBase
+from skytether.lab.demo import WalkerHardware
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.lab.world.agent import Clockwork, WorldBase, WorldGraph
+from skytether.lab.world.agent import Clockwork, WorldGraph, WorldHardware
 from skytether.lab.world.model import WorldError
 from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.plan import building
@@ -54,7 +54,7 @@ class Asking:
 
 
 def _walker() -> Asking:
-    return Asking(lambda config, watch: Agent(config, WalkerBase(World(Trail(), seed=1)), observer=watch))
+    return Asking(lambda config, watch: Agent(config, WalkerHardware(World(Trail(), seed=1)), observer=watch))
 
 
 def _wheels() -> Asking:
@@ -75,7 +75,7 @@ def _wheels() -> Asking:
             world = Simulation(plan, seed=1)
         except WorldError as error:
             raise BenchError(str(error)) from error
-        return Agent(config, WorldBase(Clockwork(world), graph=graph), graph=graph, observer=watch)
+        return Agent(config, WorldHardware(Clockwork(world), graph=graph), graph=graph, observer=watch)
 
     params = {
         "start": {"x": start.x, "y": start.y, "yaw": start.heading},

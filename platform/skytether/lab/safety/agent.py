@@ -16,7 +16,7 @@ from pathlib import Path
 from skytether.control.admittance import AdmittanceParams
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped
 from skytether.robot.agent.agent import Agent, AgentConfig
-from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink
 
@@ -53,7 +53,7 @@ def main() -> None:
         fallback_options={"max_linear": abs(linear), "max_angular": max(0.1, abs(angular))},
         limits=Limits(**LIMITS),
     )
-    with Agent(config, GatedBase(_Pushed(linear, angular), GateLink(folder))):
+    with Agent(config, GatedHardware(_Pushed(linear, angular), GateLink(folder))):
         while True:
             time.sleep(1)
 

@@ -21,7 +21,7 @@ from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.lab.bench.failover import Granted
 from skytether.messages import Message, Twist, Vector3, encode
 from skytether.robot.agent.agent import Agent, AgentConfig
-from skytether.robot.agent.gated_hardware import GatedBase
+from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink
 from skytether.wire.topic import Role
@@ -70,7 +70,7 @@ def main() -> None:
     with Bridge(spec, GraphPort(LocalGraph(), spec.topics, Role.SERVICE)) as bridge:
         host, port = bridge.address[:2]
         placed = session.model_copy(update={"host": host, "port": port})
-        with Agent(config, GatedBase(_Nothing(), GateLink(folder)), client=Granted(placed)):
+        with Agent(config, GatedHardware(_Nothing(), GateLink(folder)), client=Granted(placed)):
             for linear, angular in wants(kind):
                 bridge.publish("cmd_vel", encode(Twist(linear=Vector3(x=linear), angular=Vector3(z=angular))))
                 time.sleep(1 / _RATE_HZ)

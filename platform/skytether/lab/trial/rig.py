@@ -23,7 +23,7 @@ from skytether.api.rest import RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.link import LinkEmulator
 from skytether.lab.throttle import Throttle, children_of
-from skytether.lab.world.agent import Clockwork, Observer, WorldBase, WorldGraph
+from skytether.lab.world.agent import Clockwork, Observer, WorldGraph, WorldHardware
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import Message, String, Twist, decode
 from skytether.robot.agent.agent import Agent, AgentConfig
@@ -51,7 +51,7 @@ class Task:
         params: Its parameters.
         robot: Name of the robot.
         limits: What the robot can do.
-        names: Topics of the robot that have other names than the world's, see `WorldBase`.
+        names: Topics of the robot that have other names than the world's, see `WorldHardware`.
     """
 
     service: str
@@ -61,7 +61,7 @@ class Task:
     names: Mapping[str, str] | None = None
 
 
-class TimedBase(WorldBase):
+class TimedBase(WorldHardware):
     """Counts what the simulation costs, which no robot pays."""
 
     def __init__(self, clockwork: Clockwork, graph: WorldGraph, names: Mapping[str, str] | None) -> None:

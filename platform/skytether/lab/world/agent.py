@@ -1,6 +1,6 @@
 """A simulated robot as the robot agent sees one: a base that is read and written, and a graph of topics.
 
-`WorldBase` is for the robot's `Agent` what a base of ROS is: readings in, a velocity out, one tick of the
+`WorldHardware` is for the robot's `Agent` what a base of ROS is: readings in, a velocity out, one tick of the
 control loop after the other. `WorldGraph` is what a graph of ROS is: bytes in and out by topic name, through the same
 `Port`; what a service publishes arrives here, what an experiment publishes (goals) goes to the service. Neither knows
 which service it is.
@@ -69,7 +69,7 @@ class Clockwork:
             self.simulation.robots[index].write(twist)
 
 
-class WorldBase:
+class WorldHardware:
     """A robot of the world as the agent's hardware.
 
     Args:

@@ -1,8 +1,8 @@
 """The program on the robot: asks for a service, runs its end of the bridge, drives (Mello, thesis, figure 18(a)).
 
-Three threads that never wait for each other: the control loop at a fixed rate with absolute deadlines, the asker that
-speaks REST, and a watch on the bridge's counters. The bridge has its own, and so has the log. What is decided is
-decided in `driver`.
+Three threads that never wait for each other: the control loop at a fixed rate with absolute deadlines, the lease client
+that speaks REST, and a watch on the bridge's counters. The bridge has its own, and so has the log. What is decided is
+decided in `control_loop`.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from skytether.wire.topic import Role
 from ..control import fallback, stall
 from ..control.arbiter import Needs
 from ..control.command import Source
-from ..control.control_loop import Base, Clocks, Driver, Observer
+from ..control.control_loop import Clocks, ControlLoop, Observer, RobotHardware
 from ..control.service_manager import ServiceManager, Terms, terms
 from ..control.supervisor import Limits
 from ..graphs.graph_base import Graph
 from ..graphs.wheels_watch import NOBODY, WatchesWheels
-from ..log_throttle import Notices
-from ..offload.lease_client import Asker, Orchestrator
+from ..log_throttle import LogThrottle
+from ..offload.lease_client import LeaseClient, Orchestrator
 from ..offload.resolver import Resolver
-from ..offload.shared_topics import Serving, SharedTopics, Sharing
-from ..offload.site_prober import TaskConfig, Tasks
+from ..offload.shared_topics import Serving, SharedTopics, SharedTopicsExchange
+from ..offload.site_prober import SiteProber, TaskConfig
 from ..offload.task_manager import PathQuality, RobotView
-from ..session.counter_totals import Tally
+from ..session.counter_totals import CounterTotals
 from ..session.link_quality import Quality
 from ..session.session import Endpoint, LiveSession
 from ..session.topic_table import Offer, robot_table, spoken
-from .gate_report import SaysGate
+from .gate_report import GateReporter
 from .gate_watch import GateWatch
 from .log_queue import log_queue
-from .remote_stop import StopFromAfar
+from .remote_stop import RemoteStop
 from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
 
@@ -150,7 +150,7 @@ class Agent:
 
     Args:
         config: What to do.
-        base: The robot's hardware.
+        hardware: The robot's hardware.
         graph: The robot's graph, if it has one: what the service takes in and gives out then goes by it as bytes, all
             but the command topic.
         observer: Told each command from the cloud; must return at once.
@@ -168,7 +168,7 @@ class Agent:
     def __init__(
         self,
         config: AgentConfig,
-        base: Base,
+        hardware: RobotHardware,
         *,
         graph: Graph | None = None,
         observer: Observer | None = None,
@@ -179,7 +179,7 @@ class Agent:
         random: Random | None = None,
     ) -> None:
         self._config = config
-        self._base = base
+        self._hardware = hardware
         self._graph = graph
         self._clock = clock
         self._clocks = clocks or (stall.clocks if clock is time.monotonic else lambda: (self._clock(), None))
@@ -187,7 +187,7 @@ class Agent:
             lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
         )
         local = fallback.load(config.fallback, config.fallback_options)
-        self._driver = Driver(base, local, config.limits, config.needs, clock(), observer, self._clocks)
+        self._control_loop = ControlLoop(hardware, local, config.limits, config.needs, clock(), observer, self._clocks)
         self._own_client = (
             None
             if client
@@ -201,12 +201,12 @@ class Agent:
             )
         )
         speaks: Any = client or self._own_client
-        self._tasks = (
+        self._site_prober = (
             None
             if config.task is None
-            else Tasks(config.task, speaks, config.service, drives=local.drives, clock=clock)
+            else SiteProber(config.task, speaks, config.service, drives=local.drives, clock=clock)
         )
-        self._asker = Asker(
+        self._lease_client = LeaseClient(
             speaks,
             self._request({}),
             wanted=self._wanted,
@@ -217,22 +217,22 @@ class Agent:
             clock=clock,
             on_instance=self._follow,
             report=self.report,
-            healthy=lambda: self._driver.source is Source.CLOUD,
+            healthy=lambda: self._control_loop.source is Source.CLOUD,
             renew_s=config.renew_s,
             random=random,
         )
         self._gate = None if config.gate is None else GateWatch(config.gate)
-        self._says_gate = (
+        self._gate_reporter = (
             None
             if self._gate is None
-            else SaysGate(speaks, config.robot, self._gate.last, on_refused=self._another_token, clock=clock)
+            else GateReporter(speaks, config.robot, self._gate.last, on_refused=self._another_token, clock=clock)
         )
-        self._afar = (
-            StopFromAfar(speaks, config.robot, config.gate, clock=clock)
+        self._remote_stop = (
+            RemoteStop(speaks, config.robot, config.gate, clock=clock)
             if config.gate is not None and config.stop_from_afar
             else None
         )
-        self._sharing = Sharing(speaks, self._shares, on_refused=self._another_token, clock=clock)
+        self._sharing = SharedTopicsExchange(speaks, self._shares, on_refused=self._another_token, clock=clock)
         self._token = config.token
         self._instance: rest.Instance | None = None
         self._epochs = count(1)
@@ -243,10 +243,10 @@ class Agent:
         """The session that the manager watches."""
         self._left = ""
         """The one before; its instance may still be told of."""
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._resolver = Resolver()
         self._stats: SessionStats | None = None
-        self._tally = Tally(uuid.uuid4().hex)
+        self._totals = CounterTotals(uuid.uuid4().hex)
         self._trouble = ""
         self._asked_at: float | None = None
         self._overruns = 0
@@ -260,7 +260,7 @@ class Agent:
         if not self._logs:
             self._logs = True
             log_queue.use()
-        warm([*self._base.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
+        warm([*self._hardware.topics.values(), Twist], self._graph.encoding if self._graph else "cdr")
         self._asked_at = self._clock()
         self._serve()
         targets: dict[str, Callable[[], object]] = {
@@ -268,10 +268,10 @@ class Agent:
             "ask": self._ask,
             "watch": self._watch,
             "share": partial(self._sharing.run, self._stop),
-            **({"decide": partial(self._tasks.run, self._stop)} if self._tasks else {}),
+            **({"decide": partial(self._site_prober.run, self._stop)} if self._site_prober else {}),
             **({"gate": partial(self._gate.run, self._stop)} if self._gate else {}),
-            **({"say_gate": partial(self._says_gate.run, self._stop)} if self._says_gate else {}),
-            **({"afar": partial(self._afar.run, self._stop)} if self._afar else {}),
+            **({"say_gate": partial(self._gate_reporter.run, self._stop)} if self._gate_reporter else {}),
+            **({"afar": partial(self._remote_stop.run, self._stop)} if self._remote_stop else {}),
         }
         for name, target in targets.items():
             thread = threading.Thread(target=target, name=f"agent_{name}", daemon=True)
@@ -286,12 +286,12 @@ class Agent:
             if thread.is_alive():
                 _log.error("thread %s does not end; going on without it", thread.name)
         self._threads.clear()
-        self._driver.halt()
+        self._control_loop.halt()
         if self._server is not None:
             self._server.close()
             self._server = None
         self._drop_sessions()
-        self._asker.release()
+        self._lease_client.release()
         if self._own_client is not None:
             self._own_client.close()
         if self._logs:
@@ -327,43 +327,43 @@ class Agent:
 
     def tick(self, now: float, boot: float | None = None) -> None:
         """One turn of the control loop; called by its thread, or by a test with made-up time."""
-        self._driver.tick(now, boot)
+        self._control_loop.tick(now, boot)
 
     @property
     def source(self) -> Source:
         """Who drives now; from any thread."""
-        return self._driver.source
+        return self._control_loop.source
 
     def status(self) -> AgentStatus:
         """What is known now; from any thread."""
-        session = self._driver.session
+        session = self._control_loop.session
         return AgentStatus(
-            driver=self._driver.status(),
+            driver=self._control_loop.status(),
             instance=self._instance,
-            trouble=self._asker.trouble or self._trouble or (session.refused if session else ""),
+            trouble=self._lease_client.trouble or self._trouble or (session.refused if session else ""),
             asked_at=self._asked_at,
             connected=session is not None and session.connected,
             session=self._stats,
-            rtt=self._driver.quality.rtt,
-            loss=self._driver.quality.loss,
+            rtt=self._control_loop.quality.rtt,
+            loss=self._control_loop.quality.loss,
             overruns=self._overruns,
             log_lines_dropped=log_queue.dropped,
             gate=self._gate.report if self._gate else None,
-            late=self._driver.quality.late,
-            decision=self._tasks.decision if self._tasks else None,
-            load=self._tasks.robot.load if self._tasks else nan,
-            battery=self._tasks.robot.battery if self._tasks else None,
+            late=self._control_loop.quality.late,
+            decision=self._site_prober.decision if self._site_prober else None,
+            load=self._site_prober.robot.load if self._site_prober else nan,
+            battery=self._site_prober.robot.battery if self._site_prober else None,
             others=self._graph.others if isinstance(self._graph, WatchesWheels) else NOBODY,
         )
 
     def report(self) -> rest.Report:
         """What the orchestrator is told with each renewal."""
-        robot = self._tasks.robot if self._tasks else RobotView()
+        robot = self._site_prober.robot if self._site_prober else RobotView()
         return report(
-            self._driver.status(),
-            self._tally,
+            self._control_loop.status(),
+            self._totals,
             self._stats,
-            self._driver.quality.rtt,
+            self._control_loop.quality.rtt,
             load=robot.load,
             battery=robot.battery,
             overruns=self._overruns,
@@ -384,10 +384,10 @@ class Agent:
                     self._overruns += 1
                     deadline += late  # ticks that were missed are not made up for
         finally:
-            self._driver.halt()
+            self._control_loop.halt()
 
     def _ask(self) -> None:
-        self._asker.run(self._stop)
+        self._lease_client.run(self._stop)
 
     def _request(self, measured: Mapping[str, rest.Measurement]) -> rest.InstanceCreate:
         config = self._config
@@ -401,16 +401,16 @@ class Agent:
 
     def _wanted(self) -> rest.InstanceCreate | None:
         """What is asked for now; None: nothing, the robot's own controller drives."""
-        if self._tasks is None:
+        if self._site_prober is None:
             return self._request({})
-        if self._tasks.decision.offload:
-            return self._request(self._tasks.measurements())
+        if self._site_prober.decision.offload:
+            return self._request(self._site_prober.measurements())
         self._drop_sessions()
         self._instance = None
         return None
 
     def _drop_sessions(self) -> None:
-        self._driver.let_go()
+        self._control_loop.let_go()
         opened, self._open_sessions = list(self._open_sessions.values()), {}
         for one in opened:
             self._end(one.session)
@@ -418,30 +418,30 @@ class Agent:
     def _end(self, session: LiveSession) -> None:
         session.close()
         if session.bridge is not None:
-            self._tally.take(session, session.bridge.stats(), last=True)
+            self._totals.take(session, session.bridge.stats(), last=True)
 
     def _taken_over(self, instance: rest.Instance) -> bool:
-        session = self._driver.session
+        session = self._control_loop.session
         return session is not None and instance.session is not None and session.id == instance.session.id
 
     def _stayed(self, instance: rest.Instance, reason: str) -> None:
         """What was to take over does not."""
-        serving = self._driver.session
+        serving = self._control_loop.session
         if self._graph is not None and len(self._open_sessions) > 1:
             # The graph's topics went to the session that is given up: the one that serves is joined anew.
             self._drop_sessions()
             self._served = ""
             serving = None
         if serving is not None:
-            self._driver.let_go()
-            self._driver.session = serving
+            self._control_loop.let_go()
+            self._control_loop.session = serving
         for session_id in [i for i in self._open_sessions if serving is None or i != serving.id]:
             self._end(self._open_sessions.pop(session_id).session)
-        if self._tasks is not None:
-            self._tasks.stayed(instance, reason)
+        if self._site_prober is not None:
+            self._site_prober.stayed(instance, reason)
 
     def _elsewhere(self, instance: rest.Instance) -> bool:
-        wanted = self._tasks.decision.site if self._tasks else None
+        wanted = self._site_prober.decision.site if self._site_prober else None
         return wanted is not None and instance.placement is not None and instance.placement.site != wanted
 
     def _another_token(self) -> bool:
@@ -451,7 +451,7 @@ class Agent:
         try:
             token = self._config.fresh_token()
         except Exception as error:  # a file that is being written, or gone
-            self._notices.say("token", f"no newer token: {error}", self._clock())
+            self._log_throttle.say("token", f"no newer token: {error}", self._clock())
             return False
         known, self._token = self._token, token
         if token != known:
@@ -467,24 +467,24 @@ class Agent:
         self._settle()
         for opened in list(self._open_sessions.values()):
             if opened.session.bridge is not None:
-                self._tally.take(opened.session, opened.session.bridge.stats())
-        session = self._driver.session
+                self._totals.take(opened.session, opened.session.bridge.stats())
+        session = self._control_loop.session
         if session is None or session.bridge is None:
             return
         self._stats = session.bridge.stats()
         if self._manager is not None:
-            self._driver.quality = self._manager.watch(self._stats, now)
-            if self._tasks is not None:
-                found = self._driver.quality
+            self._control_loop.quality = self._manager.watch(self._stats, now)
+            if self._site_prober is not None:
+                found = self._control_loop.quality
                 known = session.connected
-                self._tasks.live(PathQuality(found.rtt, nan, found.loss) if known else PathQuality())
+                self._site_prober.live(PathQuality(found.rtt, nan, found.loss) if known else PathQuality())
             for kind, sentence in self._manager.troubles():
-                self._notices.say(kind, sentence, now)
+                self._log_throttle.say(kind, sentence, now)
 
     def _follow(self, instance: rest.Instance) -> None:
         """The orchestrator said something about an instance: open a session to it, or follow the service's address.
 
-        Another instance comes beside the one that drives, and takes over with its first command (`Driver.offer`).
+        Another instance comes beside the one that drives, and takes over with its first command (`ControlLoop.offer`).
         """
         granted = instance.session
         opened = self._open_sessions.get(granted.id) if granted else None
@@ -514,25 +514,25 @@ class Agent:
         self._trouble = ""
         held_to = terms(granted.needs, granted.topics, self._config.command_topic)
         self._open_sessions[granted.id] = _Opened(session, instance, held_to, SharedTopics.of(granted.topics))
-        self._driver.offer(session)
+        self._control_loop.offer(session)
 
     def _told(self, instance: rest.Instance) -> None:
         self._instance = instance
-        if self._tasks is not None:
-            self._tasks.placed(instance)
+        if self._site_prober is not None:
+            self._site_prober.placed(instance)
 
     def _settle(self) -> None:
         """Hold the service that serves now to its terms, once it has changed, and close what was left."""
-        session = self._driver.session
+        session = self._control_loop.session
         opened = self._open_sessions.get(session.id) if session else None
         if opened is not None and session is not None and session.id != self._served:
             self._left, self._served = self._served, session.id
             self._told(opened.instance)
             self._manager = ServiceManager(opened.terms, self._config.command_topic, self._config.limits.silence_s)
-            self._driver.quality = Quality()
-            self._driver.hold_to(opened.terms)
-        while self._driver.left:
-            left = self._driver.left.popleft()
+            self._control_loop.quality = Quality()
+            self._control_loop.hold_to(opened.terms)
+        while self._control_loop.left:
+            left = self._control_loop.left.popleft()
             self._open_sessions.pop(left.id, None)
             self._end(left)
 
@@ -544,7 +544,7 @@ class Agent:
         command = self._config.command_topic
         shared = SharedTopics.of(granted.topics)
         if self._graph is None:
-            readings = offers({**self._base.topics, **shared.readings})
+            readings = offers({**self._hardware.topics, **shared.readings})
             topics = robot_table(spoken(granted.topics, None), readings)
             names = frozenset(topic.name for topic in topics)
             session = LiveSession(granted.id, names, command, self._epochs, shared_topic=shared.said)
@@ -568,7 +568,7 @@ class Agent:
 
     def _shares(self) -> Serving | None:
         """What serves the robot now, for sharing."""
-        session = self._driver.session
+        session = self._control_loop.session
         opened = self._open_sessions.get(session.id) if session is not None else None
         return None if opened is None else Serving(opened.session, opened.instance.id, opened.shared)
 

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.api.rest import GateReport
-from skytether.robot.log_throttle import Notices
+from skytether.robot.log_throttle import LogThrottle
 
 _log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class Told(Protocol):
         ...
 
 
-class SaysGate:
+class GateReporter:
     """Tells it again and again. For a thread of its own.
 
     Args:
@@ -57,7 +57,7 @@ class SaysGate:
         self._report = report
         self._on_refused = on_refused
         self._clock = clock
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._told: tuple[GateReport, float] | None = None
 
     def step(self) -> None:
@@ -68,7 +68,7 @@ class SaysGate:
         try:
             self._client.report_gate(self._robot, report)
         except (ApiError, Unreachable) as error:
-            self._notices.say("told", f"the orchestrator does not hear how the gate is: {error}", now)
+            self._log_throttle.say("told", f"the orchestrator does not hear how the gate is: {error}", now)
             if isinstance(error, ApiError) and error.problem.status == _REFUSED:
                 self._on_refused()
             return
@@ -80,4 +80,4 @@ class SaysGate:
             try:
                 self.step()
             except Exception as error:  # one strange answer must not be the last word on the gate
-                self._notices.say("strange", f"how the gate is could not be told: {error!r}", self._clock())
+                self._log_throttle.say("strange", f"how the gate is could not be told: {error!r}", self._clock())

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from skytether.control.admittance import Velocity
 from skytether.messages import Message, Twist
 from skytether.robot.control.command import UNUSED_AXES, unused_axes
-from skytether.robot.control.control_loop import Base
-from skytether.robot.control.wheels_feedback import Told
+from skytether.robot.control.control_loop import RobotHardware
+from skytether.robot.control.wheels_feedback import WheelsFeedback
 
 from ..safety.client import GateLink
 
@@ -16,26 +16,26 @@ _FRESH_S = 0.2
 """The gate answers each command, within a turn of its loop: older answers are of a gate that is gone or frozen."""
 
 
-class GatedBase:
-    """A `Base` that reads as another does, and writes to the gate.
+class GatedHardware:
+    """A `RobotHardware` that reads as another does, and writes to the gate.
 
     Args:
-        base: For the readings; its ``write`` is never called.
+        hardware: For the readings; its ``write`` is never called.
         link: To the gate.
     """
 
-    def __init__(self, base: Base, link: GateLink) -> None:
-        self.topics: Mapping[str, type[Message]] = base.topics
-        self._base = base
+    def __init__(self, hardware: RobotHardware, link: GateLink) -> None:
+        self.topics: Mapping[str, type[Message]] = hardware.topics
+        self._hardware = hardware
         self._link = link
         self._decided = True
 
     def read(self, now: float) -> Iterable[tuple[str, Message]]:
-        """Base: the other's readings."""
-        return self._base.read(now)
+        """RobotHardware: the other's readings."""
+        return self._hardware.read(now)
 
     def write(self, twist: Twist) -> None:
-        """Base: ask the gate.
+        """RobotHardware: ask the gate.
 
         Raises:
             OSError: There is no gate; tried again at the next tick.
@@ -51,7 +51,7 @@ class GatedBase:
         """Whether a standstill that is written from now on is what somebody wants."""
         self._decided = decided
 
-    def told(self, _now: float) -> Told | None:
+    def told(self, _now: float) -> WheelsFeedback | None:
         """What the gate told the wheels last, if it has answered lately."""
         state = self._link.state()
         if state is None:
@@ -59,4 +59,4 @@ class GatedBase:
         age = self._link.now() - state.at
         if not 0 <= age <= _FRESH_S:
             return None
-        return Told(state.told, age, state.stopped, state.hand, state.started)
+        return WheelsFeedback(state.told, age, state.stopped, state.hand, state.started)

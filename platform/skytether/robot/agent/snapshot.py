@@ -8,10 +8,10 @@ from math import isfinite, nan
 from skytether.api import rest
 from skytether.wire.stats import SessionStats
 
-from ..control.control_loop import DriverStatus
+from ..control.control_loop import ControlStatus
 from ..graphs.wheels_watch import NOBODY, Others
 from ..offload.task_manager import Decision
-from ..session.counter_totals import COUNTERS, Tally
+from ..session.counter_totals import COUNTERS, CounterTotals
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class AgentStatus:
         gate: What the gate says of itself; None: there is none.
     """
 
-    driver: DriverStatus
+    driver: ControlStatus
     instance: rest.Instance | None
     trouble: str
     asked_at: float | None
@@ -56,8 +56,8 @@ class AgentStatus:
 
 
 def report(
-    driver: DriverStatus | None,
-    tally: Tally,
+    driver: ControlStatus | None,
+    tally: CounterTotals,
     stats: SessionStats | None,
     rtt: float,
     *,

@@ -16,19 +16,19 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import DecodeError, Encoding, Message, Twist, Vector3, decode
 from skytether.wire.events import MessageReceived
 
-from ..log_throttle import Notices
+from ..log_throttle import LogThrottle
 from ..session.link_quality import Quality
 from ..session.session import LiveSession
 from . import arbiter, restart_interlock, service_manager, supervisor
 from .arbiter import Choice, Link, Needs
 from .command import UNUSED_AXES, Command, Source, unused_axes
-from .failure_detector import Accrual
+from .failure_detector import AccrualDetector
 from .fallback import Fallback, Reading, Watching
-from .restart_interlock import Neutral
+from .restart_interlock import RestartInterlock
 from .service_manager import Terms
 from .stall import StallWatch
 from .supervisor import Limits, Objection, Supervised
-from .wheels_feedback import AsksWhy, TellsBack, Told, rebase
+from .wheels_feedback import AsksWhy, TellsBack, WheelsFeedback, rebase
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ _TRANSITIONS_KEPT = 1000
 """The newest; all are counted."""
 
 
-class Base(Protocol):
+class RobotHardware(Protocol):
     """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick.
 
     A call that never returns, or a killed process, ends the control loop: motors must stop by themselves when nothing
@@ -96,7 +96,7 @@ class Transition:
 
 
 @dataclass(frozen=True, slots=True)
-class DriverStatus:
+class ControlStatus:
     """What the control loop knows at one moment. Times are monotonic seconds.
 
     Attributes:
@@ -110,7 +110,7 @@ class DriverStatus:
         errors: Exceptions caught in the loop, by the part that raised them.
         first_command_at: Arrival of the first command from the cloud that was admitted.
         last_command_at: Of the newest.
-        readings: Messages read from the base, by topic.
+        readings: Messages read from the hardware, by topic.
         silence_limit_s: A longer silence of the cloud hands over, as was learned of its commands.
         told: What the gate told the wheels last; None: there is none, or it does not say.
         stalls: Times that the loop stood still for longer than `Limits.watchdog_s`, or the computer slept.
@@ -128,15 +128,15 @@ class DriverStatus:
     last_command_at: float | None
     readings: Mapping[str, int]
     silence_limit_s: float
-    told: Told | None
+    told: WheelsFeedback | None
     stalls: int
 
 
-class Driver:
+class ControlLoop:
     """The robot's control, tick by tick.
 
     Args:
-        base: The hardware.
+        hardware: The robot's.
         fallback: Who drives when the cloud does not.
         limits: The supervisor's.
         needs: The arbiter's, and the robot's own; what a session says about the service only tightens them.
@@ -148,7 +148,7 @@ class Driver:
 
     def __init__(
         self,
-        base: Base,
+        hardware: RobotHardware,
         fallback: Fallback,
         limits: Limits,
         needs: Needs,
@@ -162,14 +162,14 @@ class Driver:
         self._offered: deque[LiveSession] = deque()
         self._coming: LiveSession | None = None
         self.quality = Quality()
-        self._base = base
+        self._hardware = hardware
         self._fallback = fallback
-        self._tells_back = base if isinstance(base, TellsBack) else None
-        self._asks_why = base if isinstance(base, AsksWhy) else None
-        self._told: Told | None = None
+        self._tells_back = hardware if isinstance(hardware, TellsBack) else None
+        self._asks_why = hardware if isinstance(hardware, AsksWhy) else None
+        self._told: WheelsFeedback | None = None
         self._spoke = False
         """A service has sent commands, ever."""
-        self._owed = Neutral()
+        self._owed = RestartInterlock()
         """Whether it must have wanted a standstill before it takes over from the fallback."""
         self._waited = False
         """Nobody was allowed to drive, when the gate told of it last."""
@@ -179,11 +179,11 @@ class Driver:
         self._observer = observer
         self._own_needs = self._needs = replace(needs, local=Source.FALLBACK if fallback.drives else Source.STOP)
         self._command_timeout_s = needs.command_timeout_s
-        self._arrivals = Accrual(None, limits.silence_s, needs.command_timeout_s)
+        self._arrivals = AccrualDetector(None, limits.silence_s, needs.command_timeout_s)
         self._quiet = inf
         self._command_before = (0, 0)
         """Handshake and sequence of the newest that was admitted."""
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._choice: Choice = arbiter.start(self._needs, now)
         self._supervised = Supervised()
         self._why = "no command has come yet"
@@ -210,7 +210,7 @@ class Driver:
 
     def hold_to(self, terms: Terms) -> None:
         """Take over what the service's manifest says of the link and of its commands, where it is stricter."""
-        self._arrivals = Accrual(terms.period_s, self._own_limits.silence_s, self._command_timeout_s)
+        self._arrivals = AccrualDetector(terms.period_s, self._own_limits.silence_s, self._command_timeout_s)
         self._needs = service_manager.tighten(self._own_needs, terms)
 
     def tick(self, now: float, boot: float | None = None) -> None:
@@ -255,10 +255,10 @@ class Driver:
         self._supervised = Supervised()
         self._write(STANDSTILL)
 
-    def status(self) -> DriverStatus:
+    def status(self) -> ControlStatus:
         """A snapshot; from any thread."""
         held = self._supervised.held.get(Source.CLOUD)
-        return DriverStatus(
+        return ControlStatus(
             source=self._choice.source,
             transitions=tuple(self._transitions),
             transition_counts=dict(self._counts),
@@ -290,10 +290,10 @@ class Driver:
         if isfinite(self._quiet):
             self._quiet = 0.0  # whether the cloud is there is found out from now on
         sentence = f"the control loop stood still for {stood:.2f} s; the robot goes on from standstill"
-        self._notices.say("stall", f"control: {sentence}", now)
+        self._log_throttle.say("stall", f"control: {sentence}", now)
 
     def _take_readings(self, now: float) -> None:
-        for topic, message in self._base.read(now):
+        for topic, message in self._hardware.read(now):
             self._read[topic] += 1
             if now < self._believed_from:
                 continue
@@ -321,7 +321,7 @@ class Driver:
         elif self._told.agent:
             served = self._choice.source is Source.CLOUD and now - self._choice.since > _ONE_VOICE_S
             if self._told.started or (self._waited and served):
-                self._owed = Neutral()  # a person let the agent go on, or it was the service that was neutral
+                self._owed = RestartInterlock()  # a person let the agent go on, or it was the service that was neutral
             self._waited = False
 
     def _change_over(self) -> list[LiveSession]:
@@ -400,7 +400,7 @@ class Driver:
             self._why = why
         since = self._choice.good_since
         if link.owes and self._choice.source is not Source.CLOUD and since and now - since > self._needs.good_s:
-            self._notices.say("owes", f"control: {_OWES}", now)
+            self._log_throttle.say("owes", f"control: {_OWES}", now)
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
@@ -440,7 +440,7 @@ class Driver:
         for objection in objections:
             self._objections[objection] += 1
             if objection in _NAMED:
-                self._notices.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
+                self._log_throttle.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
 
     def _max_age(self, source: str) -> float:
         return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)
@@ -468,7 +468,7 @@ class Driver:
         try:
             if self._asks_why is not None:
                 self._asks_why.decided(decided)
-            self._base.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
+            self._hardware.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
             self._written_at = self._now
         except Exception as error:  # tried again at the next tick
             self._caught("write", error)

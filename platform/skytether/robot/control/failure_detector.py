@@ -37,7 +37,7 @@ _BUCKET_S = 60.0
 _BUCKETS = 60
 
 
-class Accrual:
+class AccrualDetector:
     """Learns the arrivals of one sender.
 
     Args:

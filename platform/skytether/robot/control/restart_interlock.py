@@ -24,7 +24,7 @@ _STANDSTILL = Velocity(1e-3, 1e-3)
 
 
 @dataclass(frozen=True, slots=True)
-class Neutral:
+class RestartInterlock:
     """What is remembered of one source.
 
     Attributes:
@@ -38,12 +38,14 @@ class Neutral:
     why: str = ""
 
 
-def require(why: str) -> Neutral:
+def require(why: str) -> RestartInterlock:
     """Let a source wait until it was neutral."""
-    return Neutral(why=why)
+    return RestartInterlock(why=why)
 
 
-def want(before: Neutral, velocity: Velocity, now: float, timeout_s: float, decided: bool = True) -> Neutral:
+def want(
+    before: RestartInterlock, velocity: Velocity, now: float, timeout_s: float, decided: bool = True
+) -> RestartInterlock:
     """The source wants a velocity; it may drive once it was neutral for long enough.
 
     Args:
@@ -59,4 +61,4 @@ def want(before: Neutral, velocity: Velocity, now: float, timeout_s: float, deci
         return require(before.why)
     gap = now - before.heard_at
     said = before.said_s + min(gap, _VOUCHED_S) if 0 <= gap <= timeout_s else 0.0
-    return Neutral() if said >= NEUTRAL_S - _ROUNDING_S else replace(before, said_s=said, heard_at=now)
+    return RestartInterlock() if said >= NEUTRAL_S - _ROUNDING_S else replace(before, said_s=said, heard_at=now)

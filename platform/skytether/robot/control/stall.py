@@ -1,8 +1,9 @@
 """A control loop that stood still: its process was stopped or starved, or the computer slept.
 
-Wheels stop by themselves when they hear nothing (`Base`). Whoever goes on after such a gap with what it knew before
-tells a standing robot to drive. CLOCK_MONOTONIC does not see a suspend, because it stands still itself; CLOCK_BOOTTIME
-goes on, so the difference of the two grows by what was slept. Pure, but for `clocks`: times are arguments.
+Wheels stop by themselves when they hear nothing (`RobotHardware`). Whoever goes on after such a gap with what it knew
+before tells a standing robot to drive. CLOCK_MONOTONIC does not see a suspend, because it stands still itself;
+CLOCK_BOOTTIME goes on, so the difference of the two grows by what was slept. Pure, but for `clocks`: times are
+arguments.
 """
 
 from __future__ import annotations

@@ -16,11 +16,11 @@ from .supervisor import Limits, Supervised
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class WheelsFeedback:
     """What the wheels were told last.
 
     Attributes:
-        velocity: Told.
+        velocity: WheelsFeedback.
         age_s: How long ago that was known [s].
         stopped: Why the robot stands until a person resets it; empty: it does not.
         hand: Who drives, as the gate says.
@@ -46,9 +46,9 @@ class Told:
 
 @runtime_checkable
 class TellsBack(Protocol):
-    """What a `Base` may have besides."""
+    """What a `RobotHardware` may have besides."""
 
-    def told(self, now: float) -> Told | None:
+    def told(self, now: float) -> WheelsFeedback | None:
         """What the wheels were told last; None: not known. Never waits.
 
         Args:
@@ -59,7 +59,7 @@ class TellsBack(Protocol):
 
 @runtime_checkable
 class AsksWhy(Protocol):
-    """What a `Base` may have besides."""
+    """What a `RobotHardware` may have besides."""
 
     def decided(self, decided: bool) -> None:
         """Whether a standstill that is written from now on is what somebody wants.
@@ -70,7 +70,7 @@ class AsksWhy(Protocol):
         ...
 
 
-def rebase(limits: Limits, state: Supervised, told: Told) -> Supervised:
+def rebase(limits: Limits, state: Supervised, told: WheelsFeedback) -> Supervised:
     """Go on from what the wheels were told.
 
     What the agent said in the meantime is under way: its own velocity counts as far as the wheels can have come towards

@@ -47,7 +47,7 @@ class Graph(Protocol):
 
 
 class GraphBase:
-    """A `Base` whose readings are put in by the graph's threads, and whose wheels are a topic.
+    """A `RobotHardware` whose readings are put in by the graph's threads, and whose wheels are a topic.
 
     Args:
         readings: What the robot's own control reads, by name.
@@ -83,7 +83,10 @@ class GraphBase:
             self._waiting[name] = payload
 
     def read(self, now: float) -> Iterable[tuple[str, Message]]:
-        """Base: what came since the last tick. Bytes that are no such message are named once a topic, and left out."""
+        """RobotHardware: what came since the last tick.
+
+        Bytes that are no such message are named once a topic, and left out.
+        """
         self._now = now
         with self._lock:
             waiting, self._waiting = self._waiting, {}
@@ -98,7 +101,7 @@ class GraphBase:
         return found
 
     def write(self, twist: Twist) -> None:
-        """Base: tell the wheels; a standstill that lasts is not told any more."""
+        """RobotHardware: tell the wheels; a standstill that lasts is not told any more."""
         if twist != _STANDSTILL:
             self._stood_since = None
         elif self._stood_since is None:

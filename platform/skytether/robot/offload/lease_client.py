@@ -1,8 +1,8 @@
 """The robot's side of REST: asks for a service, keeps the lease, notices what changed. Never in the way of driving.
 
 The orchestrator may be away, come back, lose the instance, or refuse the token: each is said once, the asking goes on
-with back-off, and a bridge that is up is left alone. `Asker.step` is one exchange and says when the next is due; `run`
-is the loop for a thread.
+with back-off, and a bridge that is up is left alone. `LeaseClient.step` is one exchange and says when the next is due;
+`run` is the loop for a thread.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _MOVE_S = 20.0
 
 
 class Orchestrator(Protocol):
-    """What the asker needs of `skytether.api.client.Client`; every call raises ApiError or Unreachable."""
+    """What the lease client needs of `skytether.api.client.Client`; every call raises ApiError or Unreachable."""
 
     def create_instance(self, request: InstanceCreate, *, idempotency_key: str) -> Instance:
         """Ask for a service; the same key gives the same instance."""
@@ -74,7 +74,7 @@ class _KeyTakenError(Exception):
         super().__init__(text)
 
 
-class Asker:
+class LeaseClient:
     """Wants one instance of a service to run, for as long as it is asked to.
 
     Args:

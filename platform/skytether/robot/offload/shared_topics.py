@@ -19,7 +19,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.api.rest import MOST_NEIGHBOURS, Neighbours, Share, unshareable
 from skytether.messages import DecodeError, Message, String, decode
 
-from ..log_throttle import Notices
+from ..log_throttle import LogThrottle
 from ..session.session import LiveSession
 
 _log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class Serving:
     topics: SharedTopics
 
 
-class Sharing:
+class SharedTopicsExchange:
     """Exchanges again and again. For a thread of its own.
 
     Args:
@@ -94,7 +94,7 @@ class Sharing:
         self._serving = serving
         self._on_refused = on_refused
         self._clock = clock
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._with: str = ""
         """The session that was shared with last."""
         self._due = 0.0
@@ -110,7 +110,7 @@ class Sharing:
         try:
             found = self._client.share(serving.instance, self._said(serving.session, now))
         except (ApiError, Unreachable) as error:
-            self._notices.say("shared", f"nothing is shared with other robots: {error}", now)
+            self._log_throttle.say("shared", f"nothing is shared with other robots: {error}", now)
             if isinstance(error, ApiError) and error.problem.status == _REFUSED:
                 self._on_refused()
             return
@@ -128,7 +128,9 @@ class Sharing:
             try:
                 self.step()
             except Exception as error:  # one strange answer must not be the last one
-                self._notices.say("strange", f"nothing could be shared with other robots: {error!r}", self._clock())
+                self._log_throttle.say(
+                    "strange", f"nothing could be shared with other robots: {error!r}", self._clock()
+                )
 
     def _said(self, session: LiveSession, now: float) -> Share:
         """What the service said since the last time. What is no text, or too long, is named and left out."""
@@ -138,9 +140,9 @@ class Sharing:
         try:
             text = decode(String, message.payload, session.encoding).data
         except DecodeError as error:
-            self._notices.say("decode", f"what the service shares is left out: {error}", now)
+            self._log_throttle.say("decode", f"what the service shares is left out: {error}", now)
             return Share()
         if why := unshareable(text):
-            self._notices.say("unshareable", f"what the service shares is left out: {why}", now)
+            self._log_throttle.say("unshareable", f"what the service shares is left out: {why}", now)
             return Share()
         return Share(text=text, age_s=min(max(0.0, now - message.received_at), 3600.0))

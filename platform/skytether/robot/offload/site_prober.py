@@ -80,7 +80,7 @@ def system_battery() -> tuple[float, bool] | None:
     return None if found is None else (found.percent / 100, bool(found.power_plugged))
 
 
-class Tasks:
+class SiteProber:
     """Decides for one robot and one service; `step` is one look, `run` the loop for a thread.
 
     Args:
@@ -208,7 +208,7 @@ class Tasks:
             self._needs = self._client.get_service(self._service).spec.needs
             self._sites = sorted(self._client.sites(), key=lambda site: site.name)[:_MOST_SITES]
         except (ApiError, Unreachable):
-            return  # asked again at the next look; the asker says what is wrong
+            return  # asked again at the next look; the lease client says what is wrong
         self._listed_at = now
         names = {site.name for site in self._sites}
         self._windows = {name: self._windows.get(name) or Window() for name in names}

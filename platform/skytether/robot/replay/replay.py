@@ -28,8 +28,8 @@ from skytether.wire.topic import Direction, Role, Topic
 
 from ..agent.agent import Address
 from ..agent.snapshot import report
-from ..offload.lease_client import Asker, Orchestrator
-from ..session.counter_totals import Tally
+from ..offload.lease_client import LeaseClient, Orchestrator
+from ..session.counter_totals import CounterTotals
 from ..session.topic_table import robot_table
 from .bag import Bag
 
@@ -194,14 +194,14 @@ class _Replay:
         self._progress = progress
         self._instance: rest.Instance | None = None
         self._ended = ""
-        self._tally = Tally(uuid.uuid4().hex)
+        self._totals = CounterTotals(uuid.uuid4().hex)
         self._bridge: Bridge | None = None
         self._peer: Address | None = None
         self._settled = threading.Event()
         self._refused = ""
         self._stop = threading.Event()
         self._keeper: threading.Thread | None = None
-        self._asker = Asker(client, _request(config), on_instance=self._follow, report=self._report)
+        self._lease_client = LeaseClient(client, _request(config), on_instance=self._follow, report=self._report)
 
     def start(self) -> None:
         """Ask for the service and wait for the session."""
@@ -215,7 +215,9 @@ class _Replay:
             self._bridge.start()
         except BridgeError as error:
             raise ReplayError(str(error)) from error
-        self._keeper = threading.Thread(target=self._asker.run, args=(self._stop,), name="replay-ask", daemon=True)
+        self._keeper = threading.Thread(
+            target=self._lease_client.run, args=(self._stop,), name="replay-ask", daemon=True
+        )
         self._keeper.start()
         if not self._settled.wait(_CONNECT_S):
             raise ReplayError(
@@ -254,7 +256,7 @@ class _Replay:
             self._keeper.join()
         if self._bridge is not None:
             self._bridge.stop()
-        instance = self._asker.release()
+        instance = self._lease_client.release()
         if instance is None:
             return
         deadline = time.monotonic() + _STOP_S
@@ -293,15 +295,15 @@ class _Replay:
         if self._bridge is None:
             return None
         stats = self._bridge.stats()
-        self._tally.take(self._bridge, stats)
-        return report(None, self._tally, stats, min((path.rtt for path in stats.paths), default=nan))
+        self._totals.take(self._bridge, stats)
+        return report(None, self._totals, stats, min((path.rtt for path in stats.paths), default=nan))
 
     def _wait_until_running(self) -> rest.Session:
         deadline = time.monotonic() + _START_S
         while True:
-            delay = self._asker.step()
-            if self._asker.trouble:
-                raise ReplayError(self._asker.trouble)
+            delay = self._lease_client.step()
+            if self._lease_client.trouble:
+                raise ReplayError(self._lease_client.trouble)
             instance = self._instance
             if instance is not None and instance.state is rest.State.RUNNING:
                 if instance.session is None:

@@ -13,7 +13,7 @@ from math import inf, isnan
 
 from skytether.messages import Bool, Message, Range
 
-from .latch import PRESSED_S
+from .estop import PRESSED_S
 
 _TOLERANCE_S = 0.05
 """How far ahead of now something may have been heard."""

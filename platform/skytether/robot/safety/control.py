@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from skytether.guard.latch import FIRST_ACT, Keeper, clean
+from skytether.guard.estop import FIRST_ACT, EstopFile, clean
 from skytether.guard.requests import Reply
 
 from .heartbeat import Heartbeat
@@ -36,7 +36,7 @@ class Control:
         self,
         gate: Gate,
         heartbeat: Heartbeat,
-        keeper: Keeper,
+        keeper: EstopFile,
         status: Callable[[], Reply],
         clock: Callable[[], float],
     ) -> None:

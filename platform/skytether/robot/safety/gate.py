@@ -23,8 +23,8 @@ from skytether.guard import privileges
 from skytether.guard.board import Board
 from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
+from skytether.guard.estop import LATCH_FILE, EstopFile, boot_id, lasting_file
 from skytether.guard.folder import Known
-from skytether.guard.latch import LATCH_FILE, Keeper, boot_id, lasting_file
 from skytether.guard.mailbox import bind
 from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
@@ -32,7 +32,7 @@ from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Twist, warm
 from skytether.robot.graphs.wheels_watch import NOBODY, Others, WatchesWheels
 from skytether.robot.graphs.wheels_watch import sentence as sentence_of_others
-from skytether.robot.log_throttle import Notices
+from skytether.robot.log_throttle import LogThrottle
 
 from ..control.command import Hand
 from .config import SafetyConfig
@@ -41,10 +41,10 @@ from .display.feed import Feed
 from .display.snapshot import snapshot
 from .hardware import Sensors, Wheels, receive_known
 from .heartbeat import Heartbeat
+from .io_factory import open_sensors, open_wheels
 from .process import SWITCH_S, log_without_waiting
 from .protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
 from .rules import Decision, Gate
-from .ways import open_sensors, open_wheels
 
 _log = logging.getLogger("skytether.gate")
 
@@ -93,13 +93,13 @@ class GateLoop:
             guard, wheels, config.bounds(), self._period, config.guard_s, board, self._trouble, clock
         )
         also = lasting_file(str(folder), str(config.record_file()))
-        self._keeper = Keeper(str(folder / LATCH_FILE), boot_id(), _log.error, also)
+        self._keeper = EstopFile(str(folder / LATCH_FILE), boot_id(), _log.error, also)
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
         self._heir = Heir(str(folder), guard)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
         self._commands = bind(str(folder / COMMAND_SOCKET))
         self._known = Known.of(self._commands)
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._feed = None
         if config.display is not None:
             self._feed = Feed(str(folder / DISPLAY_SOCKET), config.display.rate_hz, clock())
@@ -208,7 +208,7 @@ class GateLoop:
         return sentence_of_others(self._config.wheels_at(), names) if names else ""
 
     def _trouble(self, kind: str, sentence: str, now: float) -> None:
-        if self._notices.say(kind, sentence, now):
+        if self._log_throttle.say(kind, sentence, now):
             self._heartbeat.note(sentence)
 
     def _tell_agent(self, agent: Any, decision: Decision, now: float) -> None:
@@ -266,7 +266,7 @@ def main() -> None:
     guard.setblocking(False)
     warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
     refused = privileges.take(privileges.GATE)
-    notices = Notices(_log)
+    notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
     sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)
     loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"), Board(int(sys.argv[3])), refused)

@@ -13,14 +13,14 @@ from typing import IO
 from skytether.guard.claim import LOCK_FILE
 from skytether.guard.clock import now as boottime
 from skytether.guard.enable import Line, open_line
-from skytether.guard.latch import FIRST_ACT, LATCH_FILE, Keeper, boot_id, lasting_file
+from skytether.guard.estop import FIRST_ACT, LATCH_FILE, EstopFile, boot_id, lasting_file
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool
 
 from .commission import CommissionError
 from .config import SafetyConfig
+from .io_factory import open_sensors, open_wheels
 from .motion import twist_of
-from .ways import open_sensors, open_wheels
 
 _READINGS = 20_000
 """Kept; the longest step takes half a minute, at 500 Hz at most."""
@@ -127,7 +127,7 @@ class HardwareRig:
         """An emergency stop holds without a gate, too; that nobody has reset the machine yet is none."""
         folder = str(self._config.place())
         also = lasting_file(folder, str(self._config.record_file()))
-        keeper = Keeper(os.path.join(folder, LATCH_FILE), boot_id(), lambda _: None, also)
+        keeper = EstopFile(os.path.join(folder, LATCH_FILE), boot_id(), lambda _: None, also)
         stopped = keeper.before()
         if stopped and stopped != FIRST_ACT:
             self._lock.close()

@@ -11,8 +11,8 @@ from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 
 from ..control.command import Hand
 from .config_base import Numbers, Topic
+from .estop import ButtonParams
 from .joystick import JoystickParams
-from .latch import ButtonParams
 from .sources import LockParams, OnSilence, SourceParams, SourceRules
 
 Priority = Annotated[int, Field(ge=0, le=255)]

@@ -16,12 +16,12 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 from skytether.robot.control import restart_interlock
 from skytether.robot.control.command import Command, Hand, unused_axes
-from skytether.robot.control.restart_interlock import Neutral
+from skytether.robot.control.restart_interlock import RestartInterlock
 from skytether.robot.control.supervisor import Limits, with_gap
 
-from . import joystick, latch
+from . import estop, joystick
+from .estop import ButtonParams, Estop
 from .joystick import Grip, Joystick, JoystickParams
-from .latch import ButtonParams, Latch
 from .stamps import StampRule, Stamps, date
 
 _STARTED = "the gate was started"
@@ -104,7 +104,7 @@ class _Source:
 
     priority: int
     timeout_s: float
-    neutral: Neutral
+    neutral: RestartInterlock
     started: bool = False
     """A person let it go on since it last had to be neutral."""
     wanted: Velocity = STANDSTILL
@@ -134,7 +134,7 @@ class Sources:
         self._rules = rules
         self._limits = limits
         self._joystick = Joystick()
-        self._latch = Latch(reason=stopped)
+        self._latch = Estop(reason=stopped)
         self._locks: dict[str, tuple[bool, float]] = {}
         wait = restart_interlock.require(_STARTED)
         self._sources: dict[str, _Source] = {Hand.AGENT: _Source(rules.agent_priority, limits.max_gap_s, wait)}
@@ -160,7 +160,7 @@ class Sources:
 
     def engage(self, reason: str) -> None:
         """Emergency stop, until `reset`."""
-        self._latch = latch.engage(self._latch, reason)
+        self._latch = estop.engage(self._latch, reason)
 
     def reset(self, now: float) -> str:
         """End the emergency stop. Nobody drives by that alone: each source must be neutral first.
@@ -168,7 +168,7 @@ class Sources:
         Returns:
             Why it was refused; empty: it was not.
         """
-        self._latch, refused = latch.reset(self._rules.button, self._latch, now)
+        self._latch, refused = estop.reset(self._rules.button, self._latch, now)
         if not refused:
             self._joystick = Joystick()
             self._require(_RESET, inf)
@@ -179,9 +179,9 @@ class Sources:
 
         The age of an agent's command is known, and a joystick is looked after by `joystick.hear`.
         """
-        self._settled_at = now + latch.SETTLES_S
+        self._settled_at = now + estop.SETTLES_S
         if self._rules.button is not None:
-            self._latch = latch.doubt(self._rules.button, self._latch, now)
+            self._latch = estop.doubt(self._rules.button, self._latch, now)
 
     def start(self, now: float) -> tuple[list[str], str]:
         """A person says that those who want to drive now may do so.
@@ -195,12 +195,12 @@ class Sources:
             return [], "the joystick is lost, or its button was not let go; let it go first"
         may = [name for name, source in self._sources.items() if source.speaks(now)]
         for name in may:
-            self._sources[name] = replace(self._sources[name], neutral=Neutral(), started=True)
+            self._sources[name] = replace(self._sources[name], neutral=RestartInterlock(), started=True)
         return may, ""
 
     def refuses_reset(self, now: float) -> str:
         """Why `reset` would be refused now; empty: it would not."""
-        return latch.reset(self._rules.button, self._latch, now)[1]
+        return estop.reset(self._rules.button, self._latch, now)[1]
 
     def expects(self, topic: str, message: Message) -> bool:
         """Whether `hear` is for this message."""
@@ -223,7 +223,7 @@ class Sources:
             if topic in rules.locks:
                 self._locks[topic] = (bool(message.data), now)
             elif rules.button is not None:
-                self._latch = latch.hear(rules.button, self._latch, bool(message.data), now)
+                self._latch = estop.hear(rules.button, self._latch, bool(message.data), now)
         elif isinstance(message, Joy) and rules.joystick is not None:
             return self._hear_joystick(rules.joystick, message, now)
         elif isinstance(message, Twist | TwistStamped) and topic in rules.further:
@@ -286,13 +286,13 @@ class Sources:
     def _stops(self, now: float, troubles: dict[str, str]) -> bool:
         """Whether the emergency stop holds the robot, or its button is not heard."""
         rules = self._rules
-        doubted = rules.button is not None and latch.doubted(self._latch)
+        doubted = rules.button is not None and estop.doubted(self._latch)
         if doubted:
             sentence = (
                 "the emergency stop button was not heard since the gate stood still; the robot stands until it is"
             )
             troubles["button"] = f"{rules.button_topic}: {sentence}"
-        silent = rules.button is not None and latch.silent(rules.button, self._latch, now)
+        silent = rules.button is not None and estop.silent(rules.button, self._latch, now)
         if silent:
             if rules.on_silence is OnSilence.LATCH and isfinite(self._latch.heard_at):
                 self.engage("the emergency stop button fell silent")

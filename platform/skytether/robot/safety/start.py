@@ -11,8 +11,8 @@ from skytether.guard.settings import Settings, dump, freeze
 
 from .address import address
 from .config import SafetyConfig, SocketsConfig
+from .io_factory import estop_address
 from .protocol import WHEELS_SOCKET
-from .ways import estop_address
 
 _PYTHON = (sys.executable, "-P")
 

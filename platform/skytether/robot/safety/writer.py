@@ -27,12 +27,12 @@ from skytether.guard.teller import Teller, repeat_s
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Twist, warm
-from skytether.robot.log_throttle import Notices
+from skytether.robot.log_throttle import LogThrottle
 
 from .config import SafetyConfig
 from .hardware import Wheels
+from .io_factory import open_wheels
 from .process import SWITCH_S, log_without_waiting
-from .ways import open_wheels
 
 _log = logging.getLogger("skytether.writer")
 _LAST_STOPS_S = 0.5
@@ -66,7 +66,7 @@ class Writer:
         self._repeat_s = repeat_s(self._period, config.guard_s)
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
         self._teller = Teller(wheels, self._watch, board, Role.FIRST, self._period, clock)
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._heir = Heir(str(config.place()), guard)
         self._gone = False
         self._wanted_at = nan
@@ -131,7 +131,7 @@ class Writer:
         try:
             self._wheels.enable(level)
         except Exception as error:  # then the signal does not change, and the power goes
-            self._notices.say("enable", f"the enable signal cannot be published: {error}", self._clock())
+            self._log_throttle.say("enable", f"the enable signal cannot be published: {error}", self._clock())
 
     def _tell(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
@@ -139,7 +139,7 @@ class Writer:
         try:
             return self._teller.tell(now)
         except Exception as error:  # tried again in a moment
-            self._notices.say("wheels", f"the wheels cannot be told anything: {error}", now)
+            self._log_throttle.say("wheels", f"the wheels cannot be told anything: {error}", now)
             return True
 
 

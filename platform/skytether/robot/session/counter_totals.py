@@ -25,7 +25,7 @@ _MOST_TOPICS = 4096
 """Of which sums are kept; a robot has some ten, and its services may change while it runs."""
 
 
-class Tally:
+class CounterTotals:
     """Sums over sessions.
 
     Args:

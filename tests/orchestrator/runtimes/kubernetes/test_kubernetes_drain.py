@@ -13,7 +13,7 @@ from kubernetes_site import KubernetesSite
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate, State
-from skytether.lab.demo import ROBOT, SERVICE, WalkerBase
+from skytether.lab.demo import ROBOT, SERVICE, WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
@@ -47,7 +47,7 @@ def test_a_drain_waits_until_the_robot_has_been_handed_over(kubernetes_site: Kub
         def instance() -> Any:
             return agent.status().instance
 
-        with Agent(config, WalkerBase(World(Trail(), seed=1))) as agent:
+        with Agent(config, WalkerHardware(World(Trail(), seed=1))) as agent:
             until(lambda: agent.source is Source.CLOUD)
             (pod,) = kubernetes_site.there("pods")
             node, first = pod["spec"]["nodeName"], instance().id

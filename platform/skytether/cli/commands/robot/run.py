@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skytether.robot.agent.agent import AgentConfig
     from skytether.robot.agent.snapshot import AgentStatus
     from skytether.robot.config.robot_config import RobotConfig, Ros1Config, Ros2Config
-    from skytether.robot.control.control_loop import Base
+    from skytether.robot.control.control_loop import RobotHardware
     from skytether.robot.graphs.ros1 import Ros1RobotConfig
     from skytether.ros.ros1.node import Node
 
@@ -126,14 +126,14 @@ def _run_ros2(
             fail(str(error), 2)
 
 
-def _base(settings: RobotConfig, graph: Base) -> Base:
+def _base(settings: RobotConfig, graph: RobotHardware) -> RobotHardware:
     """The wheels: behind the gate if there is one, else a topic of the graph."""
     if settings.safety is None:
         return graph
-    from skytether.robot.agent.gated_hardware import GatedBase
+    from skytether.robot.agent.gated_hardware import GatedHardware
     from skytether.robot.safety.client import GateLink
 
-    return GatedBase(graph, GateLink(settings.safety.place()))
+    return GatedHardware(graph, GateLink(settings.safety.place()))
 
 
 @contextmanager

@@ -21,15 +21,15 @@ from skytether.guard.folder import Known
 from skytether.guard.mailbox import bind
 from skytether.guard.settings import thaw
 from skytether.messages import MarkerArray, Message, warm
-from skytether.robot.log_throttle import Notices
+from skytether.robot.log_throttle import LogThrottle
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.display_config import DisplayConfig
 from skytether.robot.safety.hardware import receive_known
+from skytether.robot.safety.io_factory import open_display
 from skytether.robot.safety.modes import Envelope, Modes
 from skytether.robot.safety.places import Places
 from skytether.robot.safety.process import log_without_waiting
 from skytether.robot.safety.protocol import DISPLAY_SOCKET
-from skytether.robot.safety.ways import open_display
 
 from .markers import markers, silence
 from .picture import picture
@@ -75,7 +75,7 @@ class Display:
         self._guard = guard
         self._publish = publish
         self._clock = clock
-        self._notices = Notices(_log)
+        self._log_throttle = LogThrottle(_log)
         self._feed = bind(str(config.place() / DISPLAY_SOCKET), 0o600)
         self._senders = Known.of(self._feed)
         self._heard_at = clock()
@@ -116,13 +116,13 @@ class Display:
     def _draw(self, data: bytes, now: float) -> None:
         seen = unpack(data)
         if seen is None:
-            self._notices.say("bytes", "something that is no snapshot comes to the display's socket", now)
+            self._log_throttle.say("bytes", "something that is no snapshot comes to the display's socket", now)
             return
         try:
             drawn = picture(self._places.of(seen.modes & self._known), seen.asked, seen.told)
             self._publish(markers(seen, drawn, self._frame, self._lasts))
         except Exception as error:  # the next one may be drawn
-            self._notices.say("draw", f"cannot draw what the gate says: {type(error).__name__}: {error}", now)
+            self._log_throttle.say("draw", f"cannot draw what the gate says: {type(error).__name__}: {error}", now)
 
 
 def main() -> None:

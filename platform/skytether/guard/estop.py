@@ -107,7 +107,7 @@ class Kept(NamedTuple):
     """Why it could not be kept; empty: it is on disk."""
 
 
-class Keeper:
+class EstopFile:
     """Writes the file in a thread of its own, so that no loop ever waits for a disk.
 
     Args:
@@ -194,14 +194,14 @@ class Keeper:
         return "" if written == SIZE else "the disk is full"
 
 
-class Latch:
+class KeptEstop:
     """The emergency stop.
 
     Args:
         keeper: Of its file.
     """
 
-    def __init__(self, keeper: Keeper) -> None:
+    def __init__(self, keeper: EstopFile) -> None:
         self._keeper = keeper
         self.reason = keeper.before()
         """Why the robot stands until a person resets it; empty: it does not."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.guard.latch import FIRST_ACT, SIZE, Keeper, Latch, clean, decode, encode, lasting_file
+from skytether.guard.estop import FIRST_ACT, SIZE, EstopFile, KeptEstop, clean, decode, encode, lasting_file
 
 BOOT = "7f0c"
 
@@ -63,8 +63,8 @@ def wait(condition):
 def test_a_pipe_in_the_place_of_the_file_holds_up_nothing(tmp_path):
     path = tmp_path / "latch"
     os.mkfifo(path)
-    keeper = Keeper(str(path), BOOT, pytest.fail)
-    latch = Latch(keeper)
+    keeper = EstopFile(str(path), BOOT, pytest.fail)
+    latch = KeptEstop(keeper)
     assert "cannot be read" in latch.reason
     keeper.start()
     wait(lambda: latch.kept)
@@ -73,8 +73,8 @@ def test_a_pipe_in_the_place_of_the_file_holds_up_nothing(tmp_path):
 
 def test_acknowledged_is_kept(tmp_path):
     path = str(tmp_path / "latch")
-    keeper = Keeper(path, BOOT, pytest.fail)
-    latch = Latch(keeper)
+    keeper = EstopFile(path, BOOT, pytest.fail)
+    latch = KeptEstop(keeper)
     assert latch.reason == FIRST_ACT
     assert not latch.stop(FIRST_ACT)
     assert not latch.kept
@@ -83,16 +83,16 @@ def test_acknowledged_is_kept(tmp_path):
     assert not latch.reset(latch.generation - 1)  # somebody who knows another stop
     assert latch.reset(latch.generation)
     wait(lambda: latch.kept)
-    assert Keeper(path, BOOT, pytest.fail).before() == ""
+    assert EstopFile(path, BOOT, pytest.fail).before() == ""
     assert latch.stop("released")
     assert not latch.stop("the first reason is kept")
     wait(lambda: latch.kept)
-    assert Keeper(path, BOOT, pytest.fail).before() == "released (before the guard was started again)"
+    assert EstopFile(path, BOOT, pytest.fail).before() == "released (before the guard was started again)"
 
 
 def test_what_somebody_asks_for_goes_before_the_first_act(tmp_path):
     """Who resets a machine that was just started, `robot run` say, does not reset what a person stopped it for."""
-    latch = Latch(Keeper(str(tmp_path / "latch"), BOOT, pytest.fail))
+    latch = KeptEstop(EstopFile(str(tmp_path / "latch"), BOOT, pytest.fail))
     before = latch.generation
     assert latch.stop("somebody fell")
     assert latch.reason == "somebody fell"
@@ -103,8 +103,8 @@ def test_what_cannot_be_kept_is_said(tmp_path):
     folder = tmp_path / "latch"
     folder.mkdir()
     told = []
-    keeper = Keeper(str(folder), BOOT, told.append)
-    latch = Latch(keeper)
+    keeper = EstopFile(str(folder), BOOT, told.append)
+    latch = KeptEstop(keeper)
     assert "cannot be read" in latch.reason
     keeper.start()
     wait(lambda: bool(told))
@@ -116,8 +116,8 @@ def test_what_cannot_be_kept_is_said(tmp_path):
 def test_what_could_not_be_kept_is_tried_again_when_somebody_asks_again(tmp_path):
     folder = tmp_path / "latch"
     folder.mkdir()
-    keeper = Keeper(str(folder), BOOT, lambda why: None)
-    latch = Latch(keeper)
+    keeper = EstopFile(str(folder), BOOT, lambda why: None)
+    latch = KeptEstop(keeper)
     keeper.start()
     wait(lambda: bool(latch.unkept))
     folder.rmdir()
@@ -129,8 +129,8 @@ def test_what_could_not_be_kept_is_tried_again_when_somebody_asks_again(tmp_path
 def test_where_nothing_can_be_written_a_release_is_taken_away(tmp_path, monkeypatch):
     path = tmp_path / "latch"
     path.write_bytes(encode("", BOOT))
-    keeper = Keeper(str(path), BOOT, lambda why: 1 / 0)  # nothing ends the thread
-    latch = Latch(keeper)
+    keeper = EstopFile(str(path), BOOT, lambda why: 1 / 0)  # nothing ends the thread
+    latch = KeptEstop(keeper)
     assert latch.reason == ""
 
     def full(*_):
@@ -140,12 +140,12 @@ def test_where_nothing_can_be_written_a_release_is_taken_away(tmp_path, monkeypa
     keeper.start()
     latch.stop("somebody fell")
     wait(lambda: latch.kept)
-    assert Keeper(str(path), BOOT, pytest.fail).before() == FIRST_ACT
+    assert EstopFile(str(path), BOOT, pytest.fail).before() == FIRST_ACT
 
 
 def test_a_stop_of_a_robot_that_is_stopped_outlives_a_reset_that_was_asked_for_before(tmp_path):
-    keeper = Keeper(str(tmp_path / "latch"), BOOT, pytest.fail)
-    latch = Latch(keeper)
+    keeper = EstopFile(str(tmp_path / "latch"), BOOT, pytest.fail)
+    latch = KeptEstop(keeper)
     keeper.start()
     latch.stop("somebody fell")
     wait(lambda: latch.kept)
@@ -163,7 +163,7 @@ def test_what_another_user_has_put_there_releases_nothing_and_keeps_nothing(tmp_
     path = tmp_path / "latch"
     path.write_bytes(encode("", BOOT))
     os.chown(path, 54_321, -1)
-    keeper = Keeper(str(path), BOOT, pytest.fail)
+    keeper = EstopFile(str(path), BOOT, pytest.fail)
     assert "no file of this user" in keeper.before()
     keeper.start()
     keeper.keep(1, "somebody fell")
@@ -176,7 +176,7 @@ def test_a_stop_outlives_a_reboot_that_empties_the_folder(tmp_path):
     path.parent.mkdir()
 
     def boot(name):
-        return Latch(Keeper(str(path), name, pytest.fail, lasting))
+        return KeptEstop(EstopFile(str(path), name, pytest.fail, lasting))
 
     def say(latch, act):
         latch._keeper.start()
@@ -210,7 +210,7 @@ def test_the_second_file_is_beside_the_record_and_stops_only(tmp_path):
             path.unlink(missing_ok=True)
             if data is not None:
                 path.write_bytes(data)
-        found = Keeper(str(first), BOOT, pytest.fail, str(second)).before()
+        found = EstopFile(str(first), BOOT, pytest.fail, str(second)).before()
         assert reason in found
         assert bool(reason) is bool(found)
 
@@ -218,7 +218,7 @@ def test_the_second_file_is_beside_the_record_and_stops_only(tmp_path):
 def test_a_stop_that_would_not_outlive_a_reboot_is_not_kept(tmp_path):
     (tmp_path / "file").touch()
     told = []
-    keeper = Keeper(str(tmp_path / "latch"), BOOT, told.append, str(tmp_path / "file" / "record-latch"))
+    keeper = EstopFile(str(tmp_path / "latch"), BOOT, told.append, str(tmp_path / "file" / "record-latch"))
     keeper.start()
     keeper.keep(1, "somebody fell")
     wait(lambda: keeper.kept.done == 1)
@@ -231,7 +231,7 @@ def test_a_link_is_not_followed(tmp_path):
     path, other = tmp_path / "latch", tmp_path / "other"
     other.write_bytes(encode("", BOOT))
     path.symlink_to(other)
-    keeper = Keeper(str(path), BOOT, pytest.fail)
+    keeper = EstopFile(str(path), BOOT, pytest.fail)
     assert keeper.before() != ""
     keeper.start()
     keeper.keep(1, "somebody fell")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import isfinite, isinf, isnan, nan
 
-from skytether.guard.latch import FIRST_ACT
+from skytether.guard.estop import FIRST_ACT
 
 SETTLES_S = 0.1
 """After a time in which the gate stood still, what waited meanwhile comes within this long."""
@@ -33,7 +33,7 @@ class ButtonParams:
 
 
 @dataclass(frozen=True, slots=True)
-class Latch:
+class Estop:
     """What is remembered.
 
     Attributes:
@@ -52,12 +52,12 @@ class Latch:
     pressed_at: float = nan
 
 
-def engage(before: Latch, reason: str) -> Latch:
+def engage(before: Estop, reason: str) -> Estop:
     """Stop until reset. The first reason is kept, but for `FIRST_ACT`: what somebody asks for goes before it."""
     return before if before.reason not in ("", FIRST_ACT) else replace(before, reason=reason)
 
 
-def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:
+def hear(params: ButtonParams, before: Estop, value: bool, now: float) -> Estop:
     """Take in what the button says."""
     pressed = value is params.pressed_is
     doubted_until = before.doubted_until if now < before.doubted_until else nan
@@ -66,7 +66,7 @@ def hear(params: ButtonParams, before: Latch, value: bool, now: float) -> Latch:
     return engage(heard, "the emergency stop button was pressed") if pressed else heard
 
 
-def doubt(params: ButtonParams, before: Latch, now: float) -> Latch:
+def doubt(params: ButtonParams, before: Estop, now: float) -> Estop:
     """The gate stood still, and a driver cannot put more into a socket that is full: the button is to be heard anew.
 
     Its silence counts from now on. One that speaks only when it changes is not waited for.
@@ -77,12 +77,12 @@ def doubt(params: ButtonParams, before: Latch, now: float) -> Latch:
     return replace(before, heard_at=heard_at, doubted_until=now + SETTLES_S)
 
 
-def doubted(latch: Latch) -> bool:
+def doubted(latch: Estop) -> bool:
     """Whether nothing new was heard since the gate stood still."""
     return not isnan(latch.doubted_until)
 
 
-def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch, str]:
+def reset(params: ButtonParams | None, before: Estop, now: float) -> tuple[Estop, str]:
     """Release it.
 
     Returns:
@@ -98,6 +98,6 @@ def reset(params: ButtonParams | None, before: Latch, now: float) -> tuple[Latch
     return replace(before, reason=""), ""
 
 
-def silent(params: ButtonParams, latch: Latch, now: float) -> bool:
+def silent(params: ButtonParams, latch: Estop, now: float) -> bool:
     """Whether the button has not been heard for too long; NaN and a clock that went back are silence."""
     return not -_TOLERANCE_S <= now - latch.heard_at <= params.max_age_s
