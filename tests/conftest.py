@@ -119,6 +119,7 @@ TOGETHER = (
     "ros/ros1/",
     "ros/ros2/test_display.py",
     "ros/ros2/test_gate.py",
+    "ros/ros2/native/",
     "ros/ros2/test_navigation_action.py",
     "ros/ros2/test_node.py",
     "ros/ros2/test_own_gate.py",

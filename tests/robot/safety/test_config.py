@@ -115,7 +115,8 @@ def test_the_robots_graph_is_the_gates_too_unless_it_says_otherwise(load):
 
 
 def test_the_same_holds_for_ros_2(load, tmp_path):
-    graph = {"router": "tcp/robot:7447", "domain": 7, "zenoh_config": "zenoh.json5", "readings": {}, "node": "walker"}
+    graph = {"dialect": "rmw_zenoh", "router": "tcp/robot:7447", "domain": 7, "zenoh_config": "zenoh.json5"}
+    graph |= {"readings": {}, "node": "walker"}
     way = load(LEAST, robot="my-walker", ros2=graph).ros2
     assert (way.router, way.domain, way.namespace, way.node) == ("tcp/robot:7447", 7, "/my_walker", "walker")
     assert way.zenoh_config == tmp_path / "zenoh.json5"

@@ -20,7 +20,7 @@ SAFETY = {"footprint": {"radius": 0.3}, "sensors": {"/scan": {"max_age_s": 1.0}}
 def test_state_and_zones_are_seen_by_a_node_of_the_robot(stage, tmp_path):
     path = tmp_path / "robot.yaml"
     safety = SAFETY | {"guard_s": 0.5, "limits": {"max_gap_s": 0.5}, "folder": str(tmp_path / "gate")}
-    graph = {"router": stage.router.address, "domain": stage.domain, "namespace": "/"}
+    graph = {"dialect": "rmw_zenoh", "router": stage.router.address, "domain": stage.domain, "namespace": "/"}
     path.write_text(yaml.safe_dump({"robot": "walker", "safety": safety, "ros2": graph}))
     kind = "visualization_msgs::msg::dds_::MarkerArray_"
     heard = stage.rmw("viewer").subscribe("/gate_display", kind, type_hash(MarkerArray, "cdr"))

@@ -43,7 +43,13 @@ def running(stage, tmp_path, **more):
         "folder": str(tmp_path / "gate"),
         **more,
     }
-    graph = {"router": stage.router.address, "domain": stage.domain, "namespace": "/", "cmd_vel_type": STAMPED}
+    graph = {
+        "dialect": "rmw_zenoh",
+        "router": stage.router.address,
+        "domain": stage.domain,
+        "namespace": "/",
+        "cmd_vel_type": STAMPED,
+    }
     path.write_text(yaml.safe_dump({"robot": "walker", "safety": safety, "ros2": graph}))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with (tmp_path / "log").open("wb") as log:

@@ -37,6 +37,7 @@ def start(stage, tmp_path, monkeypatch):
             "status_port": None,
             "limits": {"max_gap_s": 0.3, "max_local_age_s": 1.0},
             "ros2": {
+                "dialect": "rmw_zenoh",
                 "router": stage.router.address,
                 "domain": stage.domain,
                 "namespace": "/",

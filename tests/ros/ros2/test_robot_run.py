@@ -51,6 +51,7 @@ def config(stage, orchestrator, tmp_path):
     token.write_text(orchestrator.client.create_robot(RobotCreate(name="walker")).token)
     path = tmp_path / "robot.yaml"
     ros2 = {
+        "dialect": "rmw_zenoh",
         "router": stage.router.address,
         "domain": stage.domain,
         "namespace": "/",

@@ -72,7 +72,7 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     if settings is not None:
         ca_file = ca_file or settings.ca_file
     address = url or (settings.orchestrator if settings else None)
-    yield examine.extras(["ros2"] if settings and settings.ros2 else [])
+    yield examine.extras(["ros2"] if settings and settings.ros2 and settings.ros2.dialect != "rclpy" else [])
     if settings is not None:
         yield examine.own_controller(settings.fallback.name, settings.fallback.options)
     if address is not None:
@@ -145,21 +145,21 @@ def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
     """The ROS 2 graph: its router, and the types of what the service takes and gives."""
     from skytether.api.config_file import ConfigError
     from skytether.robot.diagnosis.doctor import Finding
-    from skytether.ros.ros2.config import need_extra
+
+    from .robot.ros2 import look_ros2
 
     if settings.ros2 is None:
         return
     try:
-        need_extra()
-        from .robot.ros2 import look_ros2
-
         found = [f for f in look_ros2(settings, settings.ros2, folder, token) if f.what != "orchestrator"]
     except ConfigError as error:
         yield _trouble("ros graph", str(error), "correct ros2 in robot.yaml, or install the extra")
         return
     for f in (f for f in found if not f.good):
         todo = (
-            "start the graph's Zenoh router, or correct ros2.router in robot.yaml"
+            "start the robot's nodes, or correct ros2 in robot.yaml"
+            if f.what == "ROS 2 graph"
+            else "start the graph's Zenoh router, or correct ros2.router in robot.yaml"
             if f.what == "ROS 2 router"
             else f"give {f.where} the type {f.kind}, or name another topic in remap of robot.yaml"
         )

@@ -79,7 +79,8 @@ def load_safety(path: Path) -> SafetyConfig:
     safety = read_config(path, _GateFile).safety
     if safety.ros2 is None:
         return safety
-    need_extra()
+    if safety.ros2.dialect != "rclpy":
+        need_extra()
     if safety.ros2.zenoh_config is None:
         return safety
     there = safety.ros2.model_copy(update={"zenoh_config": path.absolute().parent / safety.ros2.zenoh_config})

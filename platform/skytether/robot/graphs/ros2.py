@@ -10,15 +10,14 @@ from functools import partial
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
-from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, hash_of, type_of
+from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, encode, hash_of, type_of
 from skytether.ros import permissions
 from skytether.ros.names import Names, namespace_of, resolve
 from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
 from skytether.ros.ros2.dialect import Endpoint, Kind
-from skytether.ros.ros2.endpoints import Handle
-from skytether.ros.ros2.node import Ros2Node
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
+from skytether.ros.ros2.seam import GraphNode, Handle
 from skytether.wire.topic import Role, Topic
 
 from ..session.topic_table import Offer, robot_table, spoken
@@ -101,18 +100,27 @@ class Ros2Robot:
 
     encoding: Encoding = "cdr"
 
-    def __init__(self, config: Ros2RobotConfig, node: Ros2Node, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, config: Ros2RobotConfig, node: GraphNode, *, clock: Callable[[], float] = time.time) -> None:
         self._config = config
         self._node = node
         self._clock = clock
         self._port: Ros2Port | None = None
         self._handles: list[Handle] = []
+        self._told = False
         own = config.names(())
         send: Callable[[bytes], object] = nowhere
         if config.cmd_vel is not None:
-            wheels = node.publish(self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type))
+            stand: Message = Twist() if config.cmd_vel_type == Twist.TYPE else TwistStamped()
+            endpoint = self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type)
+            wheels = node.publish(endpoint, farewell=encode(stand))
             self._handles.append(wheels)
-            send = wheels.put
+
+            def send(velocity: bytes) -> None:
+                if wheels.put(velocity):
+                    self._told = True
+                elif self._told:  # then the loop goes on from standstill when they can be told again
+                    raise ConnectionError(wheels.refused or "the wheels cannot be told: the ROS 2 graph was lost")
+
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
         make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is
         self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s)

@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -16,6 +16,7 @@ from skytether.guard.kinematics import Bounds
 from skytether.messages import Bool, Message, String
 from skytether.robot.control.supervisor import Limits
 from skytether.ros.names import check_name, resolve
+from skytether.ros.ros2.join import Way, check_keys
 
 from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
@@ -77,10 +78,12 @@ class Ros1Way(Numbers):
 class Ros2Way(Numbers):
     """A robot that is a ROS 2 graph; the keys are those of the section ``ros2``."""
 
+    dialect: Way = "rclpy"
+    python: str | None = None
+    ros_args: tuple[str, ...] = ()
     router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
     zenoh_config: Path | None = None
-    dialect: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
-    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    domain: Annotated[int, Field(ge=0, le=232)] | None = None
     type_hashes: bool = True
     bridge_namespace: str = "/"
     namespace: str = "/"
@@ -96,6 +99,11 @@ class Ros2Way(Numbers):
     @classmethod
     def _a_name(cls, name: str) -> str:
         return check_name(name, 2)
+
+    @model_validator(mode="after")
+    def _keys_of_one_way(self) -> Self:
+        check_keys(self, self.zenoh_config)
+        return self
 
 
 class SafetyConfig(SourcesConfig):

@@ -1,6 +1,7 @@
-"""The gate's way to the hardware of a robot that is a ROS 2 graph: nodes of its own on the graph's Zenoh router.
+"""The gate's way to the hardware of a robot that is a ROS 2 graph: nodes of its own in it.
 
-A router that dies takes sensors and wheels away at once: a base that is told nothing must stop by itself.
+A graph that is lost (the program that is our node, or a Zenoh router) takes sensors and wheels away at once: a base
+that is told nothing must stop by itself.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from skytether.control.admittance import Velocity
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
 from skytether.robot.graphs.wheels_watch import NOBODY, Others, WheelsWatch
 from skytether.ros.names import resolve
-from skytether.ros.ros2.dialect import Dialect, Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
-from skytether.ros.ros2.node import Ros2Error, Ros2Node
+from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
+from skytether.ros.ros2.join import make_node
 from skytether.ros.ros2.qos import Qos
+from skytether.ros.ros2.seam import GraphNode, Ros2Error
 
 from .config import Ros2Way
 from .inbox import Inbox, Topics
@@ -37,7 +39,10 @@ class Ros2Wheels:
         self._way = way
         self._node = _start(way, role)
         self._topic = resolve(way.cmd_vel, way.namespace)
-        self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type))
+        stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
+        farewell = encode(stand) if role == "guard" else b""
+        endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
+        self._publication = self._node.publish(endpoint, farewell=farewell)
         self._watch = None
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
@@ -141,13 +146,10 @@ class Ros2Display:
         self._node.close()
 
 
-def _start(way: Ros2Way, role: str) -> Ros2Node:
-    dialect: Dialect = (
-        RmwZenoh(way.domain, way.type_hashes) if way.dialect == "rmw_zenoh" else Ros2Dds(way.bridge_namespace)
-    )
+def _start(way: Ros2Way, role: str) -> GraphNode:
     name = NodeName(way.namespace, f"{way.node}_{role}")
     try:
-        node = Ros2Node(dialect, router=way.router, config_file=way.zenoh_config, name=name)
+        node = make_node(way, name, way.zenoh_config)
     except Ros2Error as error:
         raise OSError(str(error)) from error
     node.start()

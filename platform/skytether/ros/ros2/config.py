@@ -5,31 +5,41 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from skytether.api.config_file import ConfigError
 from skytether.api.manifest import Strict
 from skytether.ros.names import check_name
 
-if TYPE_CHECKING:
-    from skytether.ros.ros2.node import Ros2Node
+from .dialect import NodeName
+from .join import Way, check_keys, make_node
+from .parameters import Parameters
+from .seam import GraphNode, Ros2Error
 
-_EXTRA = "a ROS 2 graph needs the extra 'ros2': pip install 'skytether[ros2]'"
+_EXTRA = "a ROS 2 graph with a Zenoh router needs the extra 'ros2': pip install 'skytether[ros2]'"
 
 
 class Ros2Graph(Strict):
-    """A ROS 2 graph, by its Zenoh router."""
+    """A ROS 2 graph: of the ROS 2 on this machine, or by its Zenoh router."""
 
+    dialect: Way = "rclpy"
+    """``rclpy``: as a node of the ROS 2 that is installed, with its RMW. Without ROS 2 on this machine, by a Zenoh
+    router: of nodes that run rmw_zenoh_cpp (``rmw_zenoh``), or of nodes on DDS behind zenoh-bridge-ros2dds
+    (``ros2dds``)."""
+    python: str | None = None
+    """That has rclpy; null: SKYTETHER_ROS2_PYTHON, or the first of python3 and the system's that has it. Of ``rclpy``,
+    as what follows."""
+    ros_args: tuple[str, ...] = ()
+    """As they follow ``--ros-args`` at any node: ``["-r", "scan:=/front/scan", "--log-level", "debug"]``."""
     router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
-    """``tcp/HOST:PORT`` or ``tls/HOST:PORT``; null: as ``zenoh_config`` says, or tcp/127.0.0.1:7447."""
+    """``tcp/HOST:PORT`` or ``tls/HOST:PORT``; null: as ``zenoh_config`` says, or tcp/127.0.0.1:7447. Not of ``rclpy``,
+    nor is what follows about Zenoh."""
     zenoh_config: Path | None = None
     """Configuration file of Zenoh's (JSON5), for certificates and the like; relative to this file's folder."""
-    dialect: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
-    """Nodes that run rmw_zenoh_cpp, or nodes on DDS behind zenoh-bridge-ros2dds."""
-    domain: Annotated[int, Field(ge=0, le=232)] = 0
-    """ROS_DOMAIN_ID; of ``rmw_zenoh``."""
+    domain: Annotated[int, Field(ge=0, le=232)] | None = None
+    """ROS_DOMAIN_ID; null: of ``rclpy`` as in the environment, of ``rmw_zenoh`` 0."""
     type_hashes: bool = True
     """False for ROS 2 Humble, whose types have no hash; of ``rmw_zenoh``."""
     bridge_namespace: str = "/"
@@ -43,6 +53,11 @@ class Ros2Graph(Strict):
     @classmethod
     def _a_namespace(cls, name: str) -> str:
         return check_name(name, 2)
+
+    @model_validator(mode="after")
+    def _keys_of_one_way(self) -> Self:
+        check_keys(self, self.zenoh_config)
+        return self
 
 
 def need_extra() -> None:
@@ -58,7 +73,7 @@ def need_extra() -> None:
 
 
 @contextmanager
-def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Iterator[Ros2Node]:
+def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Iterator[GraphNode]:
     """The node that a configuration asks for, for as long as the context lasts; it sets the parameters of others.
 
     Args:
@@ -67,24 +82,20 @@ def join_graph(settings: Ros2Graph, folder: Path, namespace: str = "/") -> Itera
         namespace: Of the node in the graph.
 
     Raises:
-        ConfigError: The extra is not installed, Zenoh does not take a setting, or a value can be no parameter.
+        ConfigError: ROS 2 or the extra is not installed, Zenoh does not take a setting, or a value can be no parameter.
     """
-    need_extra()
-    from skytether.ros.ros2.dialect import Dialect, NodeName, RmwZenoh, Ros2Dds
-    from skytether.ros.ros2.node import Ros2Error, Ros2Node
-    from skytether.ros.ros2.parameters import Parameters
-
-    dialect: Dialect
-    if settings.dialect == "rmw_zenoh":
-        dialect = RmwZenoh(settings.domain, settings.type_hashes)
-    else:
-        dialect = Ros2Dds(settings.bridge_namespace)
+    if settings.dialect != "rclpy":
+        need_extra()
     file = None if settings.zenoh_config is None else folder / settings.zenoh_config
     name = NodeName(namespace, settings.node)
     try:
-        node = Ros2Node(dialect, router=settings.router, config_file=file, name=name)
+        node = make_node(settings, name, file)
         parameters = Parameters(node, settings.parameters)
     except (Ros2Error, ValueError) as error:
         raise ConfigError(f"ros2: {error}") from error
-    with node, parameters:
-        yield node
+    node.start()
+    try:
+        with parameters:
+            yield node
+    finally:
+        node.close()

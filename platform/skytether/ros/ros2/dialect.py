@@ -53,6 +53,7 @@ class Endpoint:
         type_hash: ``RIHS01_...``; empty if not known.
         qos: Quality of service.
         node: Name of its node with namespace; empty where tokens do not tell.
+        priority: Of ours: which messages go first where several wait.
     """
 
     kind: Kind
@@ -61,6 +62,7 @@ class Endpoint:
     type_hash: str = ""
     qos: Qos = SERVICE
     node: str = ""
+    priority: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ import zenoh
 from .dialect import Dialect, Endpoint, Kind, NodeName
 from .endpoints import Client, Handle, Publication, Server, Subscription
 from .graph import Graph, learned_hash, mismatches
+from .seam import Ros2Error, Troubles
 
 _log = logging.getLogger(__name__)
 
@@ -36,16 +37,10 @@ WORKERS = 16
 """Of these at the same time: an action's result is a call that waits as long as the action."""
 MAX_CHANGES = 100_000
 """Changes of the graph that wait for the node's thread."""
-MAX_SAID = 1000
-"""Troubles that are remembered, so that each is told once."""
 _POLL_S = 0.5
 _LOOK_S = (2.0, 4.0, 8.0, 16.0)
 _RETRY_S = (0.25, 0.5, 1.0, 2.0)
 _H = TypeVar("_H", bound=Handle)
-
-
-class Ros2Error(Exception):
-    """The node cannot be what it was told to be; the text says what to change."""
 
 
 class Ros2Node:
@@ -74,7 +69,7 @@ class Ros2Node:
     ) -> None:
         self.dialect = dialect
         self._name = name or NodeName()
-        self._say = say or _log.warning
+        self._troubles = Troubles(say)
         self._router = router or ("the one that its configuration names" if config_file else DEFAULT_ROUTER)
         self._config = _config(router or (None if config_file else DEFAULT_ROUTER), config_file)
         self._lock = threading.Lock()
@@ -84,7 +79,6 @@ class Ros2Node:
         self._handles: list[Handle] = []
         self._changes: deque[tuple[str, bool]] = deque(maxlen=MAX_CHANGES)
         self._known: dict[str, Endpoint] = {}
-        self._said: dict[str, str] = {}
         self._outbox: queue.Queue[Callable[[], object] | None] = queue.Queue(MAX_OUTBOX)
         self._working = threading.Semaphore(MAX_WORKING)
         self._workers: concurrent.futures.ThreadPoolExecutor | None = None
@@ -115,13 +109,9 @@ class Ros2Node:
     ) -> None:
         self.close()
 
-    def publish(self, endpoint: Endpoint, *, waits: bool = False) -> Publication:
-        """Be a publisher.
-
-        Args:
-            endpoint: Which; a type hash that is not known is learned from subscriptions on the graph.
-            waits: No message is dropped because Zenoh has no room for it now, unless very many wait.
-        """
+    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
+        """Be a publisher; a farewell is not said, because a router has no way to do it for us."""
+        del farewell
         publication = Publication(self, endpoint)
         publication.waits = waits
         return self._add(publication)
@@ -153,8 +143,7 @@ class Ros2Node:
     @property
     def troubles(self) -> tuple[str, ...]:
         """What is wrong now, a sentence each."""
-        with self._lock:
-            return tuple(self._said.values())
+        return self._troubles.texts
 
     # --- Host --------------------------------------------------------------------------------------------------------
 
@@ -167,7 +156,9 @@ class Ros2Node:
         try:
             self._outbox.put_nowait(send)
         except queue.Full:
-            self._trouble(f"outbox {name}", f"{name}: the ROS 2 graph takes messages too slowly; some were dropped")
+            self._troubles.report(
+                f"outbox {name}", f"{name}: the ROS 2 graph takes messages too slowly; some were dropped"
+            )
             return False
         return True
 
@@ -183,13 +174,12 @@ class Ros2Node:
         return True
 
     def report(self, key: str, text: str) -> None:
-        """Tell a trouble once: again only after `settle`, or with another text."""
-        self._trouble(key, text)
+        """Tell a trouble once: again only after `settle`."""
+        self._troubles.report(key, text)
 
     def settle(self, key: str) -> None:
         """A trouble is over; nothing is said."""
-        with self._lock:
-            self._said.pop(key, None)
+        self._troubles.settle(key)
 
     # --- threads -----------------------------------------------------------------------------------------------------
 
@@ -217,14 +207,16 @@ class Ros2Node:
                 session = zenoh.open(self._config())
             except zenoh.ZError as error:
                 reason = str(error).partition(" at ")[0].strip()
-                self._trouble("router", f"the ROS 2 graph's router ({self._router}) is not there: {reason}; trying on")
+                self._troubles.report(
+                    "router", f"the ROS 2 graph's router ({self._router}) is not there: {reason}; trying on"
+                )
                 self._closing.wait(_RETRY_S[min(tried, len(_RETRY_S) - 1)])
                 tried += 1
                 continue
             try:
                 self._keep(session)
             except zenoh.ZError as error:
-                self._trouble("router", f"the ROS 2 graph was lost: {error}; trying on")
+                self._troubles.report("router", f"the ROS 2 graph was lost: {error}; trying on")
                 self._closing.wait(_RETRY_S[0])
             finally:
                 self._joined.clear()
@@ -282,7 +274,7 @@ class Ros2Node:
             self.settle("graph")
             return True
         text = f"the ROS 2 graph's router ({self._router}) does not tell of all the graph within {patience_s:g} s"
-        self._trouble("graph", f"{text}; it is asked again")
+        self._troubles.report("graph", f"{text}; it is asked again")
         return False
 
     def _declare(self, session: zenoh.Session, ours: str, number: int, handle: Handle) -> list[Any]:
@@ -303,12 +295,7 @@ class Ros2Node:
         ours = handle.endpoint
         others = graph.endpoints(ours.name)
         found = mismatches(ours, others)
-        for mismatch in found:
-            self._trouble(f"{ours.name} {mismatch.reason}", mismatch.reason)
-        with self._lock:
-            gone = [k for k in self._said if k.startswith(f"{ours.name} ") and k not in _keys(ours.name, found)]
-            for key in gone:
-                self._said.pop(key)
+        self._troubles.keep(ours.name, [mismatch.reason for mismatch in found])
         # In rmw_zenoh's keys the types stand, so what does not fit never meets; with DDS one has to look.
         handle.refused = found[0].reason if found and not self.dialect.attaches else ""
         if ours.type_hash:
@@ -319,28 +306,14 @@ class Ros2Node:
     def _look_at_router(self, session: zenoh.Session) -> None:
         info = session.info
         if info.routers_zid() or info.peers_zid():
-            with self._lock:
-                was_away = self._said.pop("router", None)
-            if was_away:
-                self._say(f"the ROS 2 graph's router ({self._router}) is there now")
+            self._troubles.settle("router", f"the ROS 2 graph's router ({self._router}) is there now")
         else:
-            self._trouble("router", f"the ROS 2 graph's router ({self._router}) went away; waiting for it")
+            self._troubles.report("router", f"the ROS 2 graph's router ({self._router}) went away; waiting for it")
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         """In a thread of Zenoh's."""
         self._changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         self._wake.set()
-
-    def _trouble(self, key: str, text: str) -> None:
-        with self._lock:
-            if key in self._said or len(self._said) >= MAX_SAID:
-                return
-            self._said[key] = text
-        self._say(text)
-
-
-def _keys(name: str, found: list[Any]) -> set[str]:
-    return {f"{name} {mismatch.reason}" for mismatch in found}
 
 
 def _retract(handle: Handle, things: list[Any]) -> None:

@@ -11,9 +11,8 @@ from skytether.bridge.calls import CallError
 from skytether.messages import DecodeError, decode_plain, encode_plain, hash_of
 
 from .dialect import Endpoint, Kind
-from .endpoints import Client
 from .names import full_name
-from .node import Ros2Node
+from .seam import Client, GraphNode
 
 SERVICE = "rcl_interfaces/srv/SetParameters"
 TIMEOUT_S = 10.0
@@ -65,7 +64,7 @@ class Parameters:
         ValueError: A name or a value can be none; the text names it.
     """
 
-    def __init__(self, node: Ros2Node, wanted: Mapping[str, Mapping[str, Any]]) -> None:
+    def __init__(self, node: GraphNode, wanted: Mapping[str, Mapping[str, Any]]) -> None:
         self._node = node
         self._wanted = {full_name(name): dict(values) for name, values in wanted.items()}
         self._requests = {name: set_request(values) for name, values in self._wanted.items()}

@@ -21,10 +21,9 @@ from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Role, Topic
 
 from .dialect import Endpoint, Kind
-from .endpoints import Client, Handle, Publication
 from .names import check_type, full_name
-from .node import Ros2Node
 from .qos import SERVICE, qos_of
+from .seam import Client, GraphNode, Handle, Publication
 
 _RIHS = "RIHS01_"
 
@@ -48,10 +47,12 @@ class _Way:
 
     Attributes:
         handle: What we are on the graph for it.
+        publication: The same, where we publish.
         refusal: Why nothing goes this way; empty if it does.
     """
 
     handle: Handle | None = None
+    publication: Publication | None = None
     refusal: str = ""
 
 
@@ -76,7 +77,7 @@ class Ros2Port:
 
     def __init__(
         self,
-        node: Ros2Node,
+        node: GraphNode,
         topics: Iterable[Topic],
         role: Role,
         *,
@@ -132,10 +133,10 @@ class Ros2Port:
     def deliver(self, message: MessageReceived) -> None:
         """Port: publish what came from the peer."""
         way = self._ways.get(message.topic)
-        if way is None or not isinstance(way.handle, Publication):
+        if way is None or way.publication is None:
             return
-        if self._may(Access.PUBLISH, message.topic, way.handle.endpoint.name):
-            way.handle.put(message.payload)
+        if self._may(Access.PUBLISH, message.topic, way.publication.endpoint.name):
+            way.publication.put(message.payload)
 
     def notify(self, event: Event) -> None:
         """Port: see what was agreed with the peer."""
@@ -168,14 +169,15 @@ class Ros2Port:
         comes_in = row.direction.sender is not self._role
         kind = Kind.PUBLISHER if comes_in else Kind.SUBSCRIPTION
         qos = qos_of(row, publishes=comes_in)
-        return Endpoint(kind, self._named(row.name), self._typed(row.name, row.type), self._hash(row), qos)
+        type_name = self._typed(row.name, row.type)
+        return Endpoint(kind, self._named(row.name), type_name, self._hash(row), qos, priority=row.priority)
 
     def _join_topic(self, row: Topic) -> None:
         endpoint = self._endpoints[row.name]
         way = self._ways[row.name]
         if endpoint.kind is Kind.PUBLISHER:
             if self._may(Access.PUBLISH, row.name, endpoint.name):
-                way.handle = self._node.publish(endpoint, waits=row.reliable)
+                way.handle = way.publication = self._node.publish(endpoint, waits=row.reliable)
         else:
             send = partial(self._send, row.name)
             if endpoint.name == STATIC_TF:
@@ -185,7 +187,7 @@ class Ros2Port:
                 way.handle = self._node.subscribe(endpoint, send)
 
     def _send(self, topic: str, payload: bytes) -> None:
-        """In a thread of Zenoh's: a message from the graph."""
+        """In a thread of the node's: a message from the graph."""
         if self._publisher is None:
             return
         try:

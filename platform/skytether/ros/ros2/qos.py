@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from skytether.wire.topic import Topic
@@ -19,12 +20,16 @@ class Qos:
     Attributes:
         reliable: Else best effort.
         transient_local: A newcomer gets the newest ``depth`` messages; else volatile.
-        depth: Messages kept; of a history that keeps all, as many as a topic of the bridge may.
+        depth: Messages kept; of a history that keeps all, as many as a topic of the bridge may. 0: nobody told.
+        deadline_s: At most so long between two messages; None: nobody asks for that.
+        manual: Liveliness is told by hand, topic by topic.
     """
 
     reliable: bool = True
     transient_local: bool = False
     depth: int = DEFAULT_DEPTH
+    deadline_s: float | None = None
+    manual: bool = False
 
 
 SERVICE = Qos(depth=10)
@@ -53,6 +58,47 @@ def row_settings(qos: Qos) -> dict[str, bool | int]:
         return {"reliable": False, "latched": False, "depth": 1}
     depth = 1 if qos.transient_local else max(1, min(qos.depth, MAX_DEPTH))
     return {"reliable": True, "latched": qos.transient_local, "depth": depth}
+
+
+# --- DDS: what is offered must be at least what is asked for, or nothing is delivered -------------------------------
+
+MIN_FOLLOWED, MAX_FOLLOWED = 10, 1000
+"""Messages that a subscription keeps, whatever is offered; most kinds of DDS do not tell a publisher's depth."""
+
+
+def follow(row: Qos, offers: Collection[Qos]) -> Qos:
+    """What to ask for where publishers offer these: all that each of them offers, so that each is heard.
+
+    Args:
+        row: What the bridge's table asks for; of it the depth counts.
+        offers: Of the publishers there are, one at least.
+    """
+    depth = max(row.depth, sum(offer.depth or MIN_FOLLOWED for offer in offers))
+    return Qos(
+        reliable=all(offer.reliable for offer in offers),
+        transient_local=all(offer.transient_local for offer in offers),
+        depth=min(max(depth, MIN_FOLLOWED), MAX_FOLLOWED),
+    )
+
+
+def clash(offered: Qos, asked: Qos) -> str:
+    """Why a subscription that asks for the one is not served by a publisher that offers the other; empty if it is."""
+    found = []
+    if asked.reliable and not offered.reliable:
+        found.append(("reliable", "best effort"))
+    if asked.transient_local and not offered.transient_local:
+        found.append(("transient local", "volatile"))
+    if asked.deadline_s is not None and (offered.deadline_s is None or offered.deadline_s > asked.deadline_s):
+        offer = "none" if offered.deadline_s is None else f"{offered.deadline_s:g} s"
+        found.append((f"a deadline of {asked.deadline_s:g} s", offer))
+    if asked.manual and not offered.manual:
+        found.append(("liveliness by hand", "automatic liveliness"))
+    return ", ".join(f"{want} is asked for, {have} is offered" for want, have in found)
+
+
+def history_missed(offers: Collection[Qos]) -> bool:
+    """Whether a newcomer misses what some of these publishers keep for it, because others of them keep nothing."""
+    return len({offer.transient_local for offer in offers}) > 1
 
 
 # --- rmw_zenoh: rmw_zenoh_cpp/src/detail/liveliness_utils.cpp, qos_to_keyexpr and keyexpr_to_qos ----------------------

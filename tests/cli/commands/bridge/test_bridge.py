@@ -229,7 +229,10 @@ def test_a_new_key_is_readable_by_its_owner_only_and_never_overwritten(tmp_path)
 
 
 def ros2_end(**ros2):
-    return {k: v for k, v in BOTH.items() if k != "sources"} | {"role": "service", "ros2": ros2}
+    return {k: v for k, v in BOTH.items() if k != "sources"} | {
+        "role": "service",
+        "ros2": {"dialect": "rmw_zenoh"} | ros2,
+    }
 
 
 @pytest.mark.parametrize(
@@ -238,6 +241,9 @@ def ros2_end(**ros2):
         (BOTH | {"ros2": {}}, "ros2: is for role 'robot' or 'service', and without sources"),
         (ros2_end(router="127.0.0.1"), "ros2.router"),
         (ros2_end(domain=300), "ros2.domain"),
+        (ros2_end(dialect="rclpy", router="tcp/127.0.0.1:1"), "ros2: router: is for a graph with a Zenoh router"),
+        (ros2_end(python="python3"), "ros2: python: is for dialect: rclpy, and this one is rmw_zenoh"),
+        (ros2_end(dialect="rclpy", python="no-such"), "ros2: no Python with ROS 2 is here (no-such: there is no such"),
         (ros2_end(dialekt="x"), "ros2.dialekt: unknown key, did you mean 'dialect'?"),
         (ros2_end(namespace="/3po"), "ros2: namespace: '/3po' is no name of a ROS 2 graph"),
         (ros2_end(remap={"skan": "/scan"}), "ros2.remap.skan: there is no such topic or call"),
@@ -255,7 +261,7 @@ def test_the_extra_is_named_where_it_is_missing(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "zenoh", None)
     result = run(ros2_end(), "--seconds", "0.1")
     assert result.exit_code == 2
-    assert "a ROS 2 graph needs the extra 'ros2': pip install 'skytether[ros2]'" in result.output
+    assert "a ROS 2 graph with a Zenoh router needs the extra 'ros2': pip install 'skytether[ros2]'" in result.output
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from skytether.wire.topic import Role, Topic
 from .config import BridgeConfig, LinkConfig, Source
 
 if TYPE_CHECKING:
-    from skytether.ros.ros2.node import Ros2Node
+    from skytether.ros.ros2.seam import GraphNode
 
 
 class End:
@@ -38,7 +38,12 @@ class End:
     """
 
     def __init__(
-        self, settings: BridgeConfig, key: bytes, role: Role, peer: tuple[str, int] | None, node: Ros2Node | None = None
+        self,
+        settings: BridgeConfig,
+        key: bytes,
+        role: Role,
+        peer: tuple[str, int] | None,
+        node: GraphNode | None = None,
     ) -> None:
         """Prepare; a node is the ROS 2 graph at this end.
 
@@ -103,7 +108,7 @@ class Sources:
 
 
 def _ros2_port(
-    node: Ros2Node,
+    node: GraphNode,
     settings: BridgeConfig,
     topics: Sequence[Topic],
     role: Role,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +16,9 @@ from skytether.ros.names import Names
 from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
-from skytether.ros.ros2.node import Ros2Node
-from skytether.ros.ros2.qos import row_settings
+from skytether.ros.ros2.native.node import RclpyNode, clashes
+from skytether.ros.ros2.qos import Qos, history_missed, row_settings
+from skytether.ros.ros2.seam import GraphNode
 
 from .check import (
     Finding,
@@ -30,8 +32,10 @@ from .check import (
     unknown,
 )
 
-_JOIN_S = 5.0
-"""For the router to answer, and to tell of the graph."""
+_JOIN_S = 10.0
+"""For the node to come up, or the router to answer and to tell of the graph."""
+_LOOK_S = 5.0
+"""For nodes on DDS to be discovered: nobody says when all of them are."""
 
 
 def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
@@ -59,7 +63,7 @@ def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator
     """The robot as a graph, for as long as the context lasts.
 
     Raises:
-        ConfigError: The extra is missing, or Zenoh does not take a setting.
+        ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
     """
     config = ros2_config(settings, ros2)
     with join_graph(ros2, folder, config.home) as node:
@@ -74,7 +78,7 @@ def check_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str
     """Look whether everything is there that a run will need, and print a table. True if nothing is wrong.
 
     Raises:
-        ConfigError: The extra is missing, or Zenoh does not take a setting.
+        ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
     """
     return show(look_ros2(settings, ros2, folder, token))
 
@@ -83,24 +87,22 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
     """Everything that a run will need, one by one.
 
     Raises:
-        ConfigError: The extra is missing, or Zenoh does not take a setting.
+        ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
     """
     config = ros2_config(settings, ros2)
     manifest, findings = look_at_orchestrator(settings, token)
     with join_graph(ros2, folder, config.home) as node:
         joined = node.wait_until_joined(_JOIN_S)
-        router = ros2.router or "as configured"
-        if not joined:
-            says = "does not answer; is it running? (ros2 run rmw_zenoh_cpp rmw_zenohd)"
-            findings.append(Finding("ROS 2 router", router, "", says, good=False))
-        else:
-            says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
-            findings.append(Finding("ROS 2 router", router, "", says))
+        graph = len(findings)
+        findings.append(_graph(ros2, node) if isinstance(node, RclpyNode) else _router(ros2, node, joined))
         if manifest is not None and joined:
             specs = spoken(manifest.spec.robot_topics, "ros2_action")
             names = config.names(specs)
             findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
+            if isinstance(node, RclpyNode):
+                _wait(node, [names.of(row.name) for row in rows if row.kind == "topic" and row.direction == "in"])
+                findings[graph] = _graph(ros2, node)
             findings += [_row(settings, part, names, node) for part in rows]
             findings += forbidden(config.permissions(), specs, names, settings.command_topic)
             if config.cmd_vel is not None:
@@ -110,7 +112,40 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
     return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
 
 
-def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) -> Finding:
+def _router(ros2: Ros2Config, node: GraphNode, joined: bool) -> Finding:
+    router = ros2.router or "as configured"
+    if not joined:
+        says = "does not answer; is it running? (ros2 run rmw_zenoh_cpp rmw_zenohd)"
+        return Finding("ROS 2 router", router, "", says, good=False)
+    says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
+    return Finding("ROS 2 router", router, "", says)
+
+
+def _graph(ros2: Ros2Config, node: RclpyNode) -> Finding:
+    """The node that we are, and whether anybody else is seen."""
+    if not node.middleware:
+        says = "; ".join(node.troubles) or f"our node was not there within {_JOIN_S:g} s"
+        return Finding("ROS 2 graph", ros2.node, "", says, good=False)
+    where = f"{node.middleware}, domain {node.domain}"
+    if node.troubles:
+        return Finding("ROS 2 graph", where, "", "; ".join(node.troubles), good=False)
+    if not node.nodes:
+        says = (
+            "no other node is seen: do they have the same ROS_DOMAIN_ID and RMW_IMPLEMENTATION, and may they be "
+            "discovered (ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS)?"
+        )
+        return Finding("ROS 2 graph", where, "", says, good=False)
+    return Finding("ROS 2 graph", where, "", f"{node.nodes} other nodes are seen")
+
+
+def _wait(node: RclpyNode, names: list[str]) -> None:
+    """Until all of these are published, for a while."""
+    deadline = time.monotonic() + _LOOK_S
+    while time.monotonic() < deadline and not all(node.endpoints(name, Kind.PUBLISHER) for name in names):
+        time.sleep(0.05)
+
+
+def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: GraphNode) -> Finding:
     if row.kind == "topic" and row.direction == "out" and row.name == settings.command_topic:
         return Finding(row.name, "", row.type, "drives, past the supervisor")
     if row.kind == "call":
@@ -125,21 +160,28 @@ def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: Ros2Node) ->
             if row.direction == "in"
             else (Kind.PUBLISHER, "will be published", "")
         )
-    ours = Endpoint(kind, name, row.type, hash_of(row.type, "cdr"))
+    qos = Qos(reliable=True, transient_local=row.latched)
+    ours = Endpoint(kind, name, row.type, hash_of(row.type, "cdr"), qos)
     others = node.endpoints(name, kind.answers)
-    wrong = mismatches(ours, others)
+    wrong = [mismatch.reason for mismatch in mismatches(ours, others)]
+    if kind is Kind.PUBLISHER and isinstance(node, RclpyNode):
+        wrong += clashes(ours, others)
     if wrong:
-        return Finding(row.name, name, row.type, wrong[0].reason, good=False)
+        return Finding(row.name, name, row.type, wrong[0], good=False)
     if waits and not others:
         return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for")
     who = ", ".join(sorted({o.node for o in others if o.node}))
     says = f"{verb} {who}".strip() if waits else verb
     if kind is Kind.SUBSCRIPTION and not row.latched and any(row_settings(o.qos)["latched"] for o in others):
         says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
+    if kind is Kind.SUBSCRIPTION and isinstance(node, RclpyNode) and history_missed([o.qos for o in others]):
+        kept = ", ".join(sorted({o.node for o in others if o.qos.transient_local}))
+        lost = ", ".join(sorted({o.node for o in others if not o.qos.transient_local}))
+        says += f"; what {kept} keeps for newcomers (transient local) is missed, because {lost} offers volatile"
     return Finding(row.name, name, row.type, says)
 
 
-def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: Ros2Node) -> Finding:
+def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: GraphNode) -> Finding:
     name = config.names(()).own(cmd_vel)
     ours = Endpoint(Kind.PUBLISHER, name, config.cmd_vel_type, hash_of(config.cmd_vel_type, "cdr"))
     others = node.endpoints(name, Kind.SUBSCRIPTION)

@@ -105,11 +105,8 @@ def _run_ros2(
     """
     from skytether.robot.agent.agent import Agent
     from skytether.robot.control.fallback import FallbackError
-    from skytether.ros.ros2.config import need_extra
 
     from .gate_process import gate
-
-    need_extra()
     from .ros2 import check_ros2, join_ros2
 
     folder = path.parent

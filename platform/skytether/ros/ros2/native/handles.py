@@ -1,0 +1,263 @@
+"""What we are on a ROS 2 graph through rclpy, one object each; the node's program (`side`) has the real ones."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import logging
+import threading
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
+from typing import Protocol
+
+from skytether.bridge.calls import CallError
+
+from ..dialect import Endpoint
+from ..qos import Qos, follow
+from .side.frames import Frame, Kind, control, numbered, pull_number
+from .side.outbox import Sender
+
+_log = logging.getLogger(__name__)
+
+MAX_WAITING = 1000
+"""Messages that wait for the node's program where none may be dropped."""
+MAX_CALLS = 64
+"""Requests and answers that wait for it."""
+
+
+class Host(Protocol):
+    """The node, as its endpoints see it."""
+
+    def remove(self, handle: Handle) -> None:
+        """Have the graph without it."""
+        ...
+
+    def work(self, job: Callable[[], object]) -> bool:
+        """Have something done that may take its time; False if too much is being done already."""
+        ...
+
+    def report(self, key: str, text: str) -> None:
+        """Tell a trouble once."""
+        ...
+
+
+class Handle:
+    """One endpoint of ours.
+
+    Attributes:
+        endpoint: What it is.
+        channel: Its number on the socket.
+        refused: Why nothing is carried: a sentence, or empty.
+        dropped: Messages that could not be given on.
+    """
+
+    def __init__(self, host: Host, channel: int, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self.channel = channel
+        self.refused = ""
+        self.dropped = 0
+        self._host = host
+        self._sender: Sender | None = None
+
+    def close(self) -> None:
+        """Leave the graph; from any thread, and again."""
+        self._host.remove(self)
+
+    def join(self, sender: Sender) -> None:
+        """The program runs: become part of the graph."""
+        self._sender = sender
+
+    def leave(self) -> None:
+        """The program is gone."""
+        self._sender = None
+
+    def take(self, frame: Frame) -> None:
+        """In the node's thread: a frame of this channel came."""
+
+    def review(self, others: Collection[Endpoint]) -> None:
+        """In the node's thread: these are the endpoints of others that go with this one."""
+
+
+class Publication(Handle):
+    """A publisher."""
+
+    def __init__(self, host: Host, channel: int, endpoint: Endpoint, *, waits: bool, farewell: bytes) -> None:
+        super().__init__(host, channel, endpoint)
+        self._waits = waits
+        self._farewell = farewell
+        self._kept: bytes | None = None
+        """The newest message of a transient-local topic, for when the program runs again."""
+
+    def put(self, payload: bytes | memoryview) -> bool:
+        """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
+        body = bytes(payload)
+        if self.endpoint.qos.transient_local:
+            self._kept = body
+        sender = self._sender
+        if sender is None or self.refused:
+            self.dropped += 1
+            return False
+        # What is pushed out is an older one of this topic.
+        self.dropped += sender.put(Frame(Kind.DATA, self.channel, body))
+        return True
+
+    def join(self, sender: Sender) -> None:
+        ours = self.endpoint
+        depth = max(ours.qos.depth, MAX_WAITING) if self._waits else ours.qos.depth
+        sender.set(self.channel, ours.priority, depth)
+        sender.put(
+            control(
+                do="publish",
+                channel=self.channel,
+                name=ours.name,
+                kind=ours.type,
+                reliable=ours.qos.reliable,
+                transient_local=ours.qos.transient_local,
+                depth=ours.qos.depth,
+                farewell=base64.b64encode(self._farewell).decode(),
+            )
+        )
+        if self._kept is not None:
+            sender.put(Frame(Kind.DATA, self.channel, self._kept))
+        super().join(sender)
+
+
+class Subscription(Handle):
+    """A subscription; it is made when somebody publishes, with the quality that is offered, and follows changes."""
+
+    def __init__(self, host: Host, channel: int, endpoint: Endpoint, take: Callable[[bytes], object]) -> None:
+        super().__init__(host, channel, endpoint)
+        self._take = take
+        self._asked: Qos | None = None
+
+    def join(self, sender: Sender) -> None:
+        self._asked = None
+        sender.put(control(do="watch", channel=self.channel, name=self.endpoint.name))
+        super().join(sender)
+
+    def review(self, others: Collection[Endpoint]) -> None:
+        offers = [other.qos for other in others]
+        wanted = follow(self.endpoint.qos, offers) if offers else None
+        sender = self._sender
+        if sender is None or wanted is None or wanted == self._asked:
+            return
+        self._asked = wanted
+        ours = self.endpoint
+        sender.put(
+            control(
+                do="subscribe",
+                channel=self.channel,
+                name=ours.name,
+                kind=ours.type,
+                reliable=wanted.reliable,
+                transient_local=wanted.transient_local,
+                depth=wanted.depth,
+                priority=ours.priority,
+                keep=ours.qos.depth,
+            )
+        )
+
+    def take(self, frame: Frame) -> None:
+        if self.refused:
+            self.dropped += 1
+            return
+        try:
+            self._take(frame.body)
+        except Exception:  # the node's thread must live on
+            _log.exception("A message of %s was lost", self.endpoint.name)
+
+
+class Server(Handle):
+    """A service; its function answers, in threads of its own, and raises `CallError` where it cannot."""
+
+    def __init__(self, host: Host, channel: int, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> None:
+        super().__init__(host, channel, endpoint)
+        self._answer = answer
+
+    def join(self, sender: Sender) -> None:
+        ours = self.endpoint
+        sender.set(self.channel, ours.priority, MAX_CALLS)
+        sender.put(control(do="serve", channel=self.channel, name=ours.name, kind=ours.type, priority=ours.priority))
+        super().join(sender)
+
+    def take(self, frame: Frame) -> None:
+        number, request = pull_number(frame.body)
+        if not self._host.work(lambda: self._work(number, request)):
+            self._fail(number, "too many calls at the same time")
+
+    def _work(self, number: int, request: bytes) -> None:
+        try:
+            response = self._answer(request)
+        except CallError as error:
+            self._fail(number, str(error))
+            return
+        except Exception as error:
+            _log.exception("A call of %s failed", self.endpoint.name)
+            self._fail(number, type(error).__name__)
+            return
+        sender = self._sender
+        if sender is not None:
+            sender.put(numbered(Kind.RESPONSE, self.channel, number, response))
+
+    def _fail(self, number: int, why: str) -> None:
+        """DDS has no word for a failure: who asked is not answered, so it is told here."""
+        self.dropped += 1
+        self._host.report(f"call {self.endpoint.name}", f"{self.endpoint.name}: a call was not answered: {why}")
+        sender = self._sender
+        if sender is not None:
+            sender.put(numbered(Kind.FAILURE, self.channel, number, why.encode()))
+
+
+class Client(Handle):
+    """A client of a service."""
+
+    def __init__(self, host: Host, channel: int, endpoint: Endpoint) -> None:
+        super().__init__(host, channel, endpoint)
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._waiting: dict[int, Future[bytes]] = {}
+
+    def call(self, request: bytes, timeout: float) -> bytes:
+        """See `skytether.ros.ros2.seam.Client.call`."""
+        name, sender = self.endpoint.name, self._sender
+        if self.refused:
+            raise CallError(self.refused)
+        if sender is None:
+            raise CallError(f"{name}: the ROS 2 graph is out of reach")
+        number, answer = next(self._numbers), Future[bytes]()
+        with self._lock:
+            self._waiting[number] = answer
+        try:
+            sender.put(numbered(Kind.REQUEST, self.channel, number, request))
+            return answer.result(timeout)
+        except NoAnswer:
+            sender.put(control(do="forget", channel=self.channel, number=number))
+            raise CallError(f"{name}: no answer within {timeout:g} s") from None
+        finally:
+            with self._lock:
+                self._waiting.pop(number, None)
+
+    def join(self, sender: Sender) -> None:
+        ours = self.endpoint
+        sender.set(self.channel, ours.priority, MAX_CALLS)
+        sender.put(control(do="client", channel=self.channel, name=ours.name, kind=ours.type, priority=ours.priority))
+        super().join(sender)
+
+    def leave(self) -> None:
+        super().leave()
+        with self._lock:
+            waiting, self._waiting = self._waiting, {}
+        for answer in waiting.values():
+            answer.set_exception(CallError(f"{self.endpoint.name}: the ROS 2 graph was lost"))
+
+    def take(self, frame: Frame) -> None:
+        number, body = pull_number(frame.body)
+        with self._lock:
+            answer = self._waiting.pop(number, None)
+        if answer is None:
+            return
+        if frame.kind is Kind.RESPONSE:
+            answer.set_result(body)
+        else:
+            answer.set_exception(CallError(body.decode(errors="replace")))

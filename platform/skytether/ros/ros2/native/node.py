@@ -1,0 +1,336 @@
+"""Our node on a ROS 2 graph through rclpy: the program that has it, and what was made of it.
+
+The program is started, watched and, if it ends, started again; everything is made anew then. A robot whose program is
+away is told nothing, and says so.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+from ..dialect import Endpoint, Kind, NodeName
+from ..graph import mismatches
+from ..qos import Qos, clash
+from ..seam import Troubles
+from .handles import Client, Handle, Publication, Server, Subscription
+from .interpreter import find_python
+from .side.frames import Frame, control, pull_frame
+from .side.frames import Kind as FrameKind
+from .side.outbox import Sender
+
+MAX_WORKING = 64
+"""Calls from the graph that are worked on or wait for it."""
+WORKERS = 16
+"""Of these at the same time: an action's result is a call that waits as long as the action."""
+LEAVE_S = 3.0
+"""For the program to end by itself."""
+_SIDE = Path(__file__).parent / "side" / "__main__.py"
+_BUFFER = 256 * 1024
+_RETRY_S = (0.25, 0.5, 1.0, 2.0, 5.0)
+_H = TypeVar("_H", bound=Handle)
+
+
+class RclpyNode:
+    """One node of a ROS 2 graph; every method may be called from any thread.
+
+    Args:
+        name: Who we are.
+        python: That has rclpy; None: it is found.
+        domain: ``ROS_DOMAIN_ID``; None: as in the environment.
+        arguments: For rclpy, as they follow ``--ros-args``: remappings, enclave, log level.
+        say: Told each trouble once, and its end; by default it is logged.
+
+    Raises:
+        Ros2Error: There is no Python with rclpy.
+    """
+
+    def __init__(
+        self,
+        name: NodeName | None = None,
+        *,
+        python: str | None = None,
+        domain: int | None = None,
+        arguments: Sequence[str] = (),
+        say: Callable[[str], object] | None = None,
+    ) -> None:
+        self._name = name or NodeName()
+        self._python = find_python(python)
+        self._environment = dict(os.environ) if domain is None else {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        self._arguments = list(arguments)
+        self._troubles = Troubles(say)
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._joined = threading.Event()
+        self._handles: dict[int, Handle] = {}
+        self._channels = itertools.count(1)
+        self._sender: Sender | None = None
+        self._link: socket.socket | None = None
+        self._known: dict[str, Endpoint] = {}
+        self._lost: dict[int, int] = {}
+        self._working = threading.Semaphore(MAX_WORKING)
+        self._workers: concurrent.futures.ThreadPoolExecutor | None = None
+        self._thread: threading.Thread | None = None
+        self.nodes = 0
+        """Other nodes of the graph."""
+        self.middleware = ""
+        """``rmw_fastrtps_cpp``, once joined."""
+        self.domain = ""
+        """``ROS_DOMAIN_ID``, once joined."""
+        self.pid = 0
+        """Of the program; 0: there is none now."""
+
+    def start(self) -> None:
+        """Begin to join the graph; returns at once."""
+        self._workers = concurrent.futures.ThreadPoolExecutor(WORKERS, thread_name_prefix="ros2-call")
+        self._thread = threading.Thread(target=self._run, name="ros2-node", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the graph, and wait until that is done."""
+        self._closing.set()
+        with self._lock:
+            if self._link is not None:
+                self._link.shutdown(socket.SHUT_RDWR)
+        if self._thread is not None:
+            self._thread.join()
+        if self._workers is not None:
+            self._workers.shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> RclpyNode:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
+        """Be a publisher; see `skytether.ros.ros2.seam.GraphNode`."""
+        return self._add(Publication(self, next(self._channels), endpoint, waits=waits, farewell=farewell))
+
+    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Subscription:
+        """Be a subscription; the function gets each serialised message, in the node's thread."""
+        return self._add(Subscription(self, next(self._channels), endpoint, take))
+
+    def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:
+        """Be a service; see `Server`."""
+        return self._add(Server(self, next(self._channels), endpoint, answer))
+
+    def client(self, endpoint: Endpoint) -> Client:
+        """Be a client of a service."""
+        return self._add(Client(self, next(self._channels), endpoint))
+
+    def wait_until_joined(self, timeout: float) -> bool:
+        """Whether the node was in the graph within so many seconds; who else is there may take longer to see."""
+        return self._joined.wait(timeout)
+
+    def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
+        """What others have on the graph now."""
+        return [e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind)]
+
+    def lives(self, name: str, kind: Kind) -> set[str]:
+        """Something for each endpoint of a name and kind that is another after it was away."""
+        return {key for key, e in self._known.items() if (e.name, e.kind) == (name, kind)}
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong now, a sentence each."""
+        return self._troubles.texts
+
+    def report(self, key: str, text: str) -> None:
+        """Tell a trouble once: again only after `settle`."""
+        self._troubles.report(key, text)
+
+    def settle(self, key: str) -> None:
+        """A trouble is over; nothing is said."""
+        self._troubles.settle(key)
+
+    # --- Host --------------------------------------------------------------------------------------------------------
+
+    def remove(self, handle: Handle) -> None:
+        """Host: have the graph without it."""
+        with self._lock:
+            if self._handles.pop(handle.channel, None) is None:
+                return
+            handle.leave()
+            if self._sender is not None:
+                self._sender.put(control(do="close", channel=handle.channel))
+                self._sender.remove(handle.channel)
+
+    def work(self, job: Callable[[], object]) -> bool:
+        """Host: have something done in a worker's thread."""
+        if self._workers is None or not self._working.acquire(blocking=False):
+            return False
+        try:
+            self._workers.submit(job).add_done_callback(lambda _: self._working.release())
+        except RuntimeError:  # closing
+            self._working.release()
+            return False
+        return True
+
+    # --- the program -------------------------------------------------------------------------------------------------
+
+    def _add(self, handle: _H) -> _H:
+        with self._lock:
+            self._handles[handle.channel] = handle
+            if self._sender is not None:
+                handle.join(self._sender)
+                self._review(handle)
+        return handle
+
+    def _run(self) -> None:
+        """Thread of the node."""
+        tried = 0
+        while not self._closing.is_set():
+            ours, its = socket.socketpair()
+            with ours:
+                with its:
+                    program = subprocess.Popen(
+                        [self._python, str(_SIDE), str(its.fileno())],
+                        pass_fds=[its.fileno()],
+                        stdin=subprocess.DEVNULL,
+                        env=self._environment,
+                    )
+                self.pid = program.pid
+                try:
+                    self._keep(ours)
+                finally:
+                    self.pid = 0
+                    code = _end(program)
+            if self._joined.is_set():
+                tried = 0
+                self._joined.clear()
+            if not self._closing.is_set():
+                how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+                self.report("program", f"the program that is our ROS 2 node ended {how}; it is started again")
+                self._closing.wait(_RETRY_S[min(tried, len(_RETRY_S) - 1)])
+                tried += 1
+
+    def _keep(self, link: socket.socket) -> None:
+        """Tell a new program what to be, and take what it tells until it ends."""
+        sender = Sender(link, lambda: None)
+        sender.put(control(node=self._name.name, namespace=self._name.namespace, arguments=self._arguments))
+        with self._lock:
+            if self._closing.is_set():
+                return
+            self._link, self._sender = link, sender
+            for handle in self._handles.values():
+                handle.join(sender)
+        try:
+            with link.makefile("rb", buffering=_BUFFER) as stream:
+                while (frame := pull_frame(stream)) is not None:
+                    self._take(frame)
+        except OSError:
+            pass
+        finally:
+            with self._lock:
+                self._link = self._sender = None
+                self._known = {}
+                for handle in self._handles.values():
+                    handle.leave()
+            sender.close()
+
+    def _take(self, frame: Frame) -> None:
+        if frame.kind is not FrameKind.CONTROL:
+            handle = self._handles.get(frame.channel)
+            if handle is not None:
+                handle.take(frame)
+            return
+        told = json.loads(frame.body)
+        match told["what"]:
+            case "ready":
+                self.middleware, self.domain = told["rmw"], told["domain"]
+                self._troubles.settle("refused")
+                self._troubles.settle("program", "our ROS 2 node is there again")
+            case "refused":
+                self.report("refused", f"ROS 2 does not let us be a node: {told['why']}; trying on")
+            case "trouble":
+                self._trouble(told["channel"], told["why"])
+            case "graph":
+                self._look(told)
+                self._joined.set()
+
+    def _trouble(self, channel: int, why: str) -> None:
+        handle = self._handles.get(channel)
+        name = handle.endpoint.name if handle is not None else "ROS 2"
+        self.report(f"trouble {name} {why}", f"{name}: {why}")
+
+    # --- the graph ---------------------------------------------------------------------------------------------------
+
+    def _look(self, told: dict[str, Any]) -> None:
+        """The graph is another."""
+        self.nodes = told["nodes"]
+        known = {str(row[0]): _endpoint(row) for row in told["endpoints"]}
+        changed = known != self._known
+        self._known = known
+        with self._lock:
+            handles = list(self._handles.values())
+            if changed:
+                for handle in handles:
+                    self._review(handle)
+            for handle in handles:
+                dropped, lost = told["lost"].get(str(handle.channel), (0, 0))
+                self._count(handle, dropped, lost)
+        if told["same"]:
+            name = f"{self._name.namespace.rstrip('/')}/{self._name.name}"
+            self.report(
+                "same", f"another node of this ROS 2 graph is called {name}, too: name ours otherwise (ros2.node)"
+            )
+        else:
+            self.settle("same")
+
+    def _review(self, handle: Handle) -> None:
+        """See whether a handle of ours fits the graph, and have it follow."""
+        ours = handle.endpoint
+        others = self.endpoints(ours.name, ours.kind.answers)
+        found = mismatches(ours, others)
+        handle.refused = found[0].reason if found else ""
+        sentences = [mismatch.reason for mismatch in found]
+        if ours.kind is Kind.PUBLISHER:
+            sentences += [f"{ours.name}: {c}" for c in clashes(ours, others)]
+        self._troubles.keep(ours.name, sentences)
+        handle.review([other for other in others if other.type == ours.type])
+
+    def _count(self, handle: Handle, dropped: int, lost: int) -> None:
+        """What the program could not give on, and what it lost because it was too slow."""
+        new = dropped + lost - self._lost.get(handle.channel, 0)
+        if new <= 0:
+            return
+        self._lost[handle.channel] = dropped + lost
+        handle.dropped += new
+        if lost:
+            name = handle.endpoint.name
+            self.report(f"lost {name}", f"{name}: messages come quicker than they are taken; {lost} are lost so far")
+
+
+def clashes(ours: Endpoint, others: Sequence[Endpoint]) -> list[str]:
+    """Subscriptions that get nothing of what we publish, because they ask for more than we offer; a sentence each."""
+    found = ((other.node, clash(ours.qos, other.qos)) for other in others if other.kind is Kind.SUBSCRIPTION)
+    return [f"the subscription{' of ' if node else ''}{node} gets nothing: {why}" for node, why in found if why]
+
+
+def _endpoint(row: list[Any]) -> Endpoint:
+    _, kind, name, type_name, type_hash, node, reliable, transient_local, depth, deadline, manual = row
+    qos = Qos(reliable, transient_local, depth, deadline, manual)
+    return Endpoint(Kind(kind), name, type_name, type_hash, qos, node)
+
+
+def _end(program: subprocess.Popen[bytes]) -> int:
+    """The program has lost us, so it ends; whatever hangs is killed."""
+    try:
+        return program.wait(LEAVE_S)
+    except subprocess.TimeoutExpired:
+        program.kill()
+        return program.wait()

@@ -1,0 +1,80 @@
+"""What goes over the socket between the agent and the node: frames of a kind, for a channel.
+
+A channel is one publisher, subscription, service or client; the agent numbers them from 1. Layout, little-endian:
+uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
+
+- CONTROL: a JSON object; from the agent what to do, from the node what is;
+- DATA: one serialised message;
+- REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
+- FAILURE: uint64 number of the call, why it failed as UTF-8.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from enum import IntEnum
+from typing import Any, NamedTuple, Protocol
+
+HEAD = struct.Struct("<IBI")
+NUMBER = struct.Struct("<Q")
+MAX_BODY = 512 * 1024 * 1024
+"""Bytes; the largest message that a socket may carry."""
+
+
+class Kind(IntEnum):
+    """What a frame holds."""
+
+    CONTROL = 0
+    DATA = 1
+    REQUEST = 2
+    RESPONSE = 3
+    FAILURE = 4
+
+
+class Frame(NamedTuple):
+    """One frame."""
+
+    kind: Kind
+    channel: int
+    body: bytes
+
+
+class Readable(Protocol):
+    """A buffered stream of bytes."""
+
+    def read(self, size: int, /) -> bytes:
+        """So many bytes, or fewer at the end."""
+        ...
+
+
+def push_head(frame: Frame) -> bytes:
+    """What goes before the body."""
+    return HEAD.pack(len(frame.body), frame.kind, frame.channel)
+
+
+def pull_frame(stream: Readable) -> Frame | None:
+    """The next frame; None at the end, or where it is no frame."""
+    head = stream.read(HEAD.size)
+    if len(head) < HEAD.size:
+        return None
+    size, kind, channel = HEAD.unpack(head)
+    if kind > max(Kind) or size > MAX_BODY:
+        return None
+    body = stream.read(size)
+    return Frame(Kind(kind), channel, body) if len(body) == size else None
+
+
+def control(**what: Any) -> Frame:
+    """A frame of control."""
+    return Frame(Kind.CONTROL, 0, json.dumps(what).encode())
+
+
+def numbered(kind: Kind, channel: int, number: int, body: bytes) -> Frame:
+    """A frame of a call."""
+    return Frame(kind, channel, NUMBER.pack(number) + body)
+
+
+def pull_number(body: bytes) -> tuple[int, bytes]:
+    """Number and rest of a frame of a call."""
+    return NUMBER.unpack_from(body)[0], body[NUMBER.size :]

@@ -1,0 +1,346 @@
+"""The node: does what the agent says over the socket, tells it what comes, and ends when the agent is gone."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.service import Service
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_rmw_implementation_identifier
+
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks
+except ImportError:  # Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks
+
+from . import graph, types
+from .frames import Frame, Kind, control, numbered, pull_frame, pull_number, push_head
+from .outbox import FIRST, Sender
+
+LOOK_S = 0.2
+"""Between two looks at the topics that the agent has something to do with."""
+EVERY = 10
+"""Each so many of them it is the whole graph."""
+GRAPH = 0xFFFF_FFFF
+"""Channel in which the newest graph waits; where it is read slowly, older ones are left out."""
+MAX_ASKED = 64
+"""Calls of one service that wait for the agent; who comes then is not answered."""
+NAMED_S = 1.0
+"""For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
+FAREWELL_S = 0.3
+"""For the last messages to reach who listens."""
+
+
+class _Server:
+    """A service whose answers come later, from the agent."""
+
+    def __init__(self, service: Service, ask: Callable[[int, bytes], object]) -> None:
+        self.service = service
+        self._ask = ask
+        self._waiting: dict[int, Any] = {}
+        self._numbers = 0
+        # An executor hands the callback's result to `send_response`, beside the header that tells who asked: so the
+        # request is what our callback gives back, and it is answered when the answer is there. A coroutine would do the
+        # same, but keeps executors of several distributions busy as long as it waits.
+        service.send_response = self._asked
+
+    def _asked(self, request: Any, header: Any) -> None:
+        if len(self._waiting) >= MAX_ASKED:
+            del self._waiting[next(iter(self._waiting))]
+        self._numbers += 1
+        self._waiting[self._numbers] = header
+        self._ask(self._numbers, bytes(serialize_message(request)))
+
+    def answer(self, number: int, body: bytes) -> None:
+        """Answer a call."""
+        header = self._waiting.pop(number, None)
+        if header is not None:
+            Service.send_response(self.service, deserialize_message(body, self.service.srv_type.Response), header)
+
+    def leave(self, number: int) -> None:
+        """Do not answer a call: ROS 2 has no word for a failure, and its client waits as long as it wants to."""
+        self._waiting.pop(number, None)
+
+
+class Program:
+    """One node.
+
+    Args:
+        link: To the agent.
+        start: Name, namespace, arguments and parameters, as the agent tells them.
+    """
+
+    def __init__(self, link: socket.socket, start: dict[str, Any]) -> None:
+        self._ended = threading.Event()
+        arguments = ["skytether", "--ros-args", *start["arguments"]]
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node(start["node"], namespace=start["namespace"], start_parameter_services=False)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._sender = Sender(link, self._ended.set)
+        self._sender.set(GRAPH, FIRST, 1)
+        self._lock = threading.Lock()
+        self._names: dict[int, str] = {}
+        self._publishers: dict[int, Any] = {}
+        self._farewells: dict[int, bytes] = {}
+        self._subscriptions: dict[int, Any] = {}
+        self._servers: dict[int, _Server] = {}
+        self._clients: dict[int, Any] = {}
+        self._pending: dict[tuple[int, int], Any] = {}
+        self._lost: dict[int, int] = {}
+        self._all: list[list[Any]] = []
+        self._unnamed: dict[str, float] = {}
+        self._say(
+            what="ready",
+            rmw=get_rmw_implementation_identifier(),
+            domain=os.environ.get("ROS_DOMAIN_ID", "0"),
+            distribution=os.environ.get("ROS_DISTRO", ""),
+            name=self._node.get_fully_qualified_name(),
+        )
+
+    def run(self, stream: Any) -> None:
+        """Be the node until the agent's end of the socket is closed."""
+        for job in (lambda: self._read(stream), self._watch):
+            threading.Thread(target=job, daemon=True).start()
+        while not self._ended.is_set() and rclpy.ok():
+            try:
+                self._executor.spin_once(timeout_sec=0.5)
+            except ExternalShutdownException:
+                break
+            except Exception as error:  # one bad message or request must not end the node
+                self._say(what="trouble", channel=0, why=f"{type(error).__name__}: {error}")
+        self._leave()
+
+    def _leave(self) -> None:
+        for channel, body in list(self._farewells.items()):
+            with contextlib.suppress(Exception):
+                self._publishers[channel].publish(body)
+        for channel in list(self._farewells):
+            with contextlib.suppress(Exception):
+                self._publishers[channel].wait_for_all_acked(Duration(seconds=FAREWELL_S))
+        self._sender.close()
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
+
+    def _say(self, **what: Any) -> None:
+        self._sender.put(control(**what))
+
+    # --- from the agent ----------------------------------------------------------------------------------------------
+
+    def _read(self, stream: Any) -> None:
+        while True:
+            frame = pull_frame(stream)
+            if frame is None:
+                self._ended.set()
+                self._executor.create_task(lambda: None)  # wakes it
+                return
+            try:
+                self._do(frame)
+            except types.NotInstalledError as error:
+                self._say(what="trouble", channel=frame.channel, why=str(error))
+            except Exception as error:
+                self._say(what="trouble", channel=frame.channel, why=f"{type(error).__name__}: {error}")
+
+    def _do(self, frame: Frame) -> None:
+        if frame.kind is Kind.DATA:
+            publisher = self._publishers.get(frame.channel)
+            if publisher is not None:
+                publisher.publish(frame.body)
+        elif frame.kind is Kind.CONTROL:
+            what = json.loads(frame.body)
+            try:
+                getattr(self, f"_do_{what.pop('do')}")(**what)
+            except types.NotInstalledError as error:
+                self._say(what="trouble", channel=what.get("channel", 0), why=str(error))
+        elif frame.kind is Kind.REQUEST:
+            self._call(frame.channel, *pull_number(frame.body))
+        elif frame.channel in self._servers:
+            number, body = pull_number(frame.body)
+            server = self._servers[frame.channel]
+            if frame.kind is Kind.RESPONSE:
+                server.answer(number, body)
+            else:
+                server.leave(number)
+
+    def _do_publish(
+        self, channel: int, name: str, kind: str, reliable: bool, transient_local: bool, depth: int, farewell: str
+    ) -> None:
+        self._names[channel] = name
+        qos = graph.profile(reliable, transient_local, depth)
+        self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
+        if farewell:
+            self._farewells[channel] = base64.b64decode(farewell)
+
+    def _do_watch(self, channel: int, name: str) -> None:
+        self._names[channel] = name
+
+    def _do_subscribe(
+        self,
+        channel: int,
+        name: str,
+        kind: str,
+        reliable: bool,
+        transient_local: bool,
+        depth: int,
+        priority: int,
+        keep: int,
+    ) -> None:
+        """Subscribe, or again with another quality: the new one first, so that the graph is never without."""
+        self._names[channel] = name
+        self._sender.set(channel, priority, keep)
+
+        def put(message: bytes) -> None:
+            self._sender.put(Frame(Kind.DATA, channel, message))
+
+        before = self._subscriptions.pop(channel, None)
+        cls, qos = types.load(kind), graph.profile(reliable, transient_local, depth)
+        try:
+            new = self._node.create_subscription(cls, name, put, qos, raw=True, event_callbacks=self._events(channel))
+        except Exception:  # this middleware does not tell of lost messages
+            new = self._node.create_subscription(cls, name, put, qos, raw=True)
+        self._subscriptions[channel] = new
+        if before is not None:
+            self._node.destroy_subscription(before)
+
+    def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
+        self._names[channel] = name
+        self._sender.set(channel, priority, MAX_ASKED)
+
+        def ask(number: int, body: bytes) -> None:
+            self._sender.put(numbered(Kind.REQUEST, channel, number, body))
+
+        service = self._node.create_service(types.load(kind), name, lambda request, _: request)
+        self._servers[channel] = _Server(service, ask)
+
+    def _do_client(self, channel: int, name: str, kind: str, priority: int) -> None:
+        self._names[channel] = name
+        self._sender.set(channel, priority, MAX_ASKED)
+        self._clients[channel] = self._node.create_client(types.load(kind), name)
+
+    def _do_close(self, channel: int) -> None:
+        self._names.pop(channel, None)
+        self._farewells.pop(channel, None)
+        server = self._servers.pop(channel, None)
+        for thing, destroy in (
+            (self._publishers.pop(channel, None), self._node.destroy_publisher),
+            (self._subscriptions.pop(channel, None), self._node.destroy_subscription),
+            (self._clients.pop(channel, None), self._node.destroy_client),
+            (server.service if server else None, self._node.destroy_service),
+        ):
+            if thing is not None:
+                destroy(thing)
+        self._sender.remove(channel)
+
+    def _do_forget(self, channel: int, number: int) -> None:
+        future = self._pending.pop((channel, number), None)
+        if future is not None and channel in self._clients:
+            self._clients[channel].remove_pending_request(future)
+
+    def _call(self, channel: int, number: int, body: bytes) -> None:
+        client = self._clients.get(channel)
+        if client is None or not client.service_is_ready():
+            name = self._names.get(channel, "this service")
+            why = f"{name}: no node of the ROS 2 graph offers this service"
+            self._sender.put(numbered(Kind.FAILURE, channel, number, why.encode()))
+            return
+
+        def answer(future: Any) -> None:
+            self._pending.pop((channel, number), None)
+            response = future.result()
+            if response is not None:
+                self._sender.put(numbered(Kind.RESPONSE, channel, number, bytes(serialize_message(response))))
+
+        future = client.call_async(deserialize_message(body, client.srv_type.Request))
+        self._pending[channel, number] = future
+        future.add_done_callback(answer)
+
+    # --- of the graph ------------------------------------------------------------------------------------------------
+
+    def _events(self, channel: int) -> SubscriptionEventCallbacks:
+        """Count what a subscription loses because we take it too slowly."""
+
+        def lost(event: Any) -> None:
+            self._lost[channel] = self._lost.get(channel, 0) + event.total_count_change
+
+        callbacks = SubscriptionEventCallbacks(use_default_callbacks=False)
+        callbacks.message_lost = lost
+        return callbacks
+
+    def _watch(self) -> None:
+        """Thread that looks at the graph, and tells it when it is another."""
+        told = ""
+        turn = 0
+        while not self._ended.wait(LOOK_S if turn else 0.0):
+            try:
+                news = self._look(whole=turn % EVERY == 0)
+            except Exception as error:
+                if self._ended.is_set() or not rclpy.ok():
+                    return
+                news = {"what": "trouble", "channel": 0, "why": f"the graph cannot be looked at: {error}"}
+            turn += 1
+            text = json.dumps(news)
+            if text != told:
+                told = text
+                self._sender.put(control(**news), GRAPH)
+
+    def _look(self, *, whole: bool) -> dict[str, Any]:
+        wanted = {self._node.resolve_topic_name(name): name for name in list(self._names.values())}
+        if whole:
+            served = {self._names.get(channel, "") for channel in list(self._servers)}
+            self._all = graph.look(self._node, None) + graph.look_at_services(self._node, served)
+        else:
+            services = [e for e in self._all if e[1] == graph.SERVER]
+            rest = [e for e in self._all if e[1] != graph.SERVER and e[2] not in wanted]
+            self._all = rest + services + graph.look(self._node, sorted(wanted))
+        known = self._known(sorted(self._all, key=lambda e: str(e[0])))
+        endpoints = [[*e[:2], wanted.get(e[2], e[2]), *e[3:]] for e in known]
+        nodes, same = graph.others(self._node)
+        dropped = self._sender.dropped()
+        lost = {c: [dropped.get(c, 0), self._lost.get(c, 0)] for c in {*dropped, *self._lost}}
+        return {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
+
+    def _known(self, endpoints: list[list[Any]]) -> list[list[Any]]:
+        """Those whose nodes are known, or will not be."""
+        now = time.monotonic()
+        unnamed = {e[0] for e in endpoints if not e[5]}
+        self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
+        return [e for e in endpoints if e[5] or e[1] == graph.SERVER or now - self._unnamed[e[0]] >= NAMED_S]
+
+
+def main(arguments: list[str]) -> int:
+    """Be the node of the agent that has the other end of a socket.
+
+    Args:
+        arguments: The socket's descriptor.
+    """
+    for ignored in (signal.SIGINT, signal.SIGTERM):  # whoever ends the agent ends this program, by the socket
+        signal.signal(ignored, signal.SIG_IGN)
+    link = socket.socket(fileno=int(arguments[0]))
+    stream = link.makefile("rb", buffering=256 * 1024)
+    first = pull_frame(stream)
+    if first is None:
+        return 0
+    try:
+        program = Program(link, json.loads(first.body))
+    except Exception as error:
+        with contextlib.suppress(OSError):
+            frame = control(what="refused", why=f"{type(error).__name__}: {error}")
+            link.sendall(push_head(frame) + frame.body)
+        return 1
+    program.run(stream)
+    sys.stdout.flush()
+    os._exit(0)  # threads of the middleware may hang

@@ -1,0 +1,163 @@
+"""A node of ours on a ROS 2 graph, whatever joins it: ROS 2's own rclpy (`native`), or a Zenoh router (`node`)."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from .dialect import Endpoint, Kind
+
+_log = logging.getLogger(__name__)
+
+MAX_SAID = 1000
+"""Troubles that are remembered, so that each is told once."""
+
+
+class Ros2Error(Exception):
+    """The node cannot be what it was told to be; the text says what to change."""
+
+
+class Handle(Protocol):
+    """One endpoint of ours.
+
+    Attributes:
+        endpoint: What it is; its type hash may be learned later.
+        refused: Why nothing is carried: a sentence, or empty.
+        dropped: Messages that could not be given on.
+    """
+
+    endpoint: Endpoint
+    refused: str
+    dropped: int
+
+    def close(self) -> None:
+        """Leave the graph; from any thread, and again."""
+        ...
+
+
+class Publication(Handle, Protocol):
+    """A publisher."""
+
+    def put(self, payload: bytes | memoryview) -> bool:
+        """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
+        ...
+
+
+class Client(Handle, Protocol):
+    """A client of a service."""
+
+    def call(self, request: bytes, timeout: float) -> bytes:
+        """Ask, and wait.
+
+        Args:
+            request: Serialised.
+            timeout: Seconds.
+
+        Raises:
+            CallError: No answer; the text says why.
+        """
+        ...
+
+
+class GraphNode(Protocol):
+    """Our node; every method may be called from any thread."""
+
+    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
+        """Be a publisher.
+
+        Args:
+            endpoint: Which; a type hash that is not known is learned from subscriptions on the graph.
+            waits: No message is dropped because there is no room for it now, unless very many wait.
+            farewell: Published when this process ends, however it ends, where the way to the graph can do that.
+        """
+        ...
+
+    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Handle:
+        """Be a subscription; the function gets each serialised message, one at a time, and must return at once."""
+        ...
+
+    def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Handle:
+        """Be a service; the function answers, in threads of its own, and raises `CallError` where it cannot."""
+        ...
+
+    def client(self, endpoint: Endpoint) -> Client:
+        """Be a client of a service."""
+        ...
+
+    def wait_until_joined(self, timeout: float) -> bool:
+        """Whether the graph was reached within so many seconds."""
+        ...
+
+    def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
+        """What others have on the graph now."""
+        ...
+
+    def lives(self, name: str, kind: Kind) -> set[str]:
+        """Something for each endpoint of a name and kind that is another after it was away."""
+        ...
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong now, a sentence each."""
+        ...
+
+    def report(self, key: str, text: str) -> None:
+        """Tell a trouble once: again only after `settle`."""
+        ...
+
+    def settle(self, key: str) -> None:
+        """A trouble is over; nothing is said."""
+        ...
+
+    def start(self) -> None:
+        """Begin to join the graph; returns at once."""
+        ...
+
+    def close(self) -> None:
+        """Leave the graph, and wait until that is done."""
+        ...
+
+
+class Troubles:
+    """What is wrong, each told once; every method may be called from any thread.
+
+    Args:
+        say: Told each sentence; by default it is logged.
+    """
+
+    def __init__(self, say: Callable[[str], object] | None = None) -> None:
+        self._say = say or _log.warning
+        self._lock = threading.Lock()
+        self._said: dict[str, str] = {}
+
+    def report(self, key: str, text: str) -> None:
+        """See `GraphNode.report`."""
+        with self._lock:
+            if key in self._said or len(self._said) >= MAX_SAID:
+                return
+            self._said[key] = text
+        self._say(text)
+
+    def settle(self, key: str, text: str = "") -> None:
+        """A trouble is over, if there was one; ``text`` says so."""
+        with self._lock:
+            known = self._said.pop(key, None)
+        if known is not None and text:
+            self._say(text)
+
+    def keep(self, name: str, sentences: Iterable[str]) -> None:
+        """These are all that is wrong with a name of the graph."""
+        keys = {f"{name} {sentence}": sentence for sentence in sentences}
+        for key, sentence in keys.items():
+            self.report(key, sentence)
+        with self._lock:
+            for key in [k for k in self._said if k.startswith(f"{name} ") and k not in keys]:
+                self._said.pop(key)
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What is wrong now."""
+        with self._lock:
+            return tuple(self._said.values())

@@ -1,0 +1,135 @@
+"""Real nodes of ROS 2, in processes of their own under ROS 2's Python; every test has a ROS domain to itself."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import queue
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+LIMIT_S = 30.0
+"""Patience; discovery takes up to 3 s, on a machine that others use too longer."""
+
+_BEFORE = """
+import json, sys, threading, time
+import rclpy
+from rclpy.qos import DurabilityPolicy as Durability, QoSProfile, ReliabilityPolicy as Reliability
+
+def qos(reliable=True, latched=False, depth=10):
+    return QoSProfile(
+        depth=depth,
+        reliability=Reliability.RELIABLE if reliable else Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
+    )
+
+def say(what):
+    print(json.dumps(what), flush=True)
+
+rclpy.init()
+node = rclpy.create_node(NAME, namespace=NAMESPACE)
+"""
+_AFTER = """
+say("ready")
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+
+class Node:
+    """One process with one node, ``node`` in its code; what it says with ``say`` is read with `next`."""
+
+    def __init__(self, python: str, name: str, namespace: str, code: str, wrap: list[str] | None = None) -> None:
+        text = f"NAME, NAMESPACE = {name!r}, {namespace!r}\n{_BEFORE}{code}{_AFTER}"
+        self.process = subprocess.Popen([*(wrap or []), python, "-c", text], stdout=subprocess.PIPE, text=True)
+        self._said: queue.Queue[Any] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        assert self.next() == "ready"
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._said.put(json.loads(line))
+        self._said.put(EOFError("the node has ended"))
+
+    def next(self, limit_s: float = LIMIT_S) -> Any:
+        """What it says next."""
+        said = self._said.get(timeout=limit_s)
+        if isinstance(said, EOFError):
+            raise said
+        return said
+
+    def all(self) -> list[Any]:
+        """What it has said, and nobody has read."""
+        found = []
+        while not self._said.empty():
+            found.append(self._said.get())
+        return found
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+class Ros2Nodes:
+    """The nodes of one domain."""
+
+    def __init__(self, python: str, domain: int) -> None:
+        self.python, self.domain = python, domain
+        self._nodes: list[Node] = []
+
+    def start(self, code: str, name: str = "peer", namespace: str = "/", wrap: list[str] | None = None) -> Node:
+        """Start a node; returns when it spins."""
+        self._nodes.append(Node(self.python, name, namespace, code, wrap))
+        return self._nodes[-1]
+
+    def close(self) -> None:
+        for node in self._nodes:
+            node.close()
+
+
+@pytest.fixture
+def ros2_nodes(ros2: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros2Nodes]:
+    """A domain that no other test on this machine has, discovery limited to the machine."""
+    folder = Path(tempfile.gettempdir()) / "skytether-ros2-domains"
+    folder.mkdir(exist_ok=True)
+    for domain in range(1, 101):
+        lock = (folder / str(domain)).open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        break
+    else:
+        pytest.fail("100 domains of ROS 2 are in use")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
+    monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
+    nodes = Ros2Nodes(ros2, domain)
+    with lock:
+        yield nodes
+        nodes.close()
+
+
+def until(condition: Callable[[], object], what: str = "it", limit_s: float = LIMIT_S) -> None:
+    """Wait until something is so."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"waited {limit_s:g} s for {what}")
+        time.sleep(0.01)
