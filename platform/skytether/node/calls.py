@@ -114,10 +114,11 @@ def _call(url: str, context: ssl.SSLContext, request: Strict, answer: type[Answe
             context.wrap_socket(plain, server_hostname=SERVER_NAME) as link,
         ):
             _check_protocol(link.selected_alpn_protocol(), url)
-            link.settimeout(6 * ANSWER_S)  # a site that ends may take its time
+            until = time.monotonic() + 6 * ANSWER_S  # a site that ends may take its time
             link.sendall(line_of(request))
             line = b""
             while not line.endswith(b"\n"):
+                link.settimeout(max(0.01, until - time.monotonic()))  # in drops it takes no longer
                 piece = link.recv(MOST_LINE)
                 line += piece
                 if not piece or len(line) > MOST_LINE:

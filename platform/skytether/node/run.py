@@ -9,8 +9,10 @@ import asyncio
 import contextlib
 import logging
 import random
+import resource
 import ssl
 import time
+from asyncio import sslproto
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any
@@ -35,6 +37,7 @@ from skytether.api.node import (
     Way,
     line_of,
 )
+from skytether.api.printable import printable
 from skytether.api.splice import PIECE, Stream, closed, keep_alive, splice
 
 from . import calls
@@ -53,6 +56,10 @@ an orchestrator that was restarted do not come at once."""
 _REFUSED_S = 300.0
 """Before another attempt where the last one was refused for good."""
 _RENEW_AGAIN_S = 60.0
+_MOST_URLS = 16
+"""Orchestrators that are linked with, whatever one of them says."""
+_FILES = 65_536
+"""Open at a time, as far as the system lets us: each way takes two."""
 
 
 @dataclass
@@ -90,6 +97,8 @@ class NodeProgram:
 
     async def run(self) -> None:
         """Keep all links; returns when it is cancelled."""
+        _allow_connections()
+        sslproto.SSLProtocol.max_size = PIECE  # of each connection's buffer: by itself a thousand ways take 256 MiB
         try:
             async with asyncio.TaskGroup() as group:
                 self._group = group
@@ -101,9 +110,11 @@ class NodeProgram:
     def _learn(self, urls: tuple[str, ...]) -> None:
         """Link with those that are new, and keep them."""
         for url in urls:
-            if url not in self._links:
-                self._links[url] = self._group.create_task(self._keep(url))
-        if new := tuple(url for url in urls if url not in self._config.urls):
+            if url not in self._links and len(self._links) < _MOST_URLS:
+                with contextlib.suppress(NodeError):
+                    address_of(url)
+                    self._links[url] = self._group.create_task(self._keep(url))
+        if new := tuple(url for url in self._links if url not in self._config.urls):
             self._config = self._config.model_copy(update={"urls": (*self._config.urls, *new)})
             with contextlib.suppress(OSError):  # it is told again
                 self._store.save(self._config)
@@ -129,7 +140,7 @@ class NodeProgram:
         """Once, however often it is so."""
         if self._told.get(url) != text:
             self._told[url] = text
-            log.warning("%s", text)
+            log.warning("%s", printable(text, lines=False))
 
     # One link
 
@@ -207,6 +218,8 @@ class NodeProgram:
                     way = asyncio.create_task(self._way(url, writer, link))
                     ways.add(way)
                     way.add_done_callback(ways.discard)
+                async with asyncio.timeout(SILENT_S):  # whoever asks, and takes no answer, is not heard on
+                    await writer.drain()
         except asyncio.IncompleteReadError:
             return
         finally:
@@ -296,3 +309,12 @@ class NodeProgram:
             pass  # whoever asked sees the connection end
         finally:
             writer.transport.abort()
+
+
+def _allow_connections() -> None:
+    """As many as the system lets this program have; a unit says that itself, and lets it change nothing."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    enough = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    if resource.RLIM_INFINITY != soft < enough:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (enough, hard))

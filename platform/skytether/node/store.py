@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from pydantic import Field, ValidationError
@@ -122,11 +123,24 @@ class NodeStore:
         self.save(config)
 
     def renew(self, key: ec.EllipticCurvePrivateKey, certificate: str) -> None:
-        """Be known by another key and certificate."""
+        """Be known by another key and certificate.
+
+        Raises:
+            NodeError: It is not for that key, or not by whom this machine trusts: what is there stays.
+            OSError: It cannot be written.
+        """
+        try:
+            made = x509.load_pem_x509_certificate(certificate.encode())
+            made.verify_directly_issued_by(x509.load_pem_x509_certificate(self.authority().encode()))
+            good = made.public_key() == key.public_key()
+        except (ValueError, TypeError, InvalidSignature):
+            good = False
+        if not good:
+            raise NodeError("what was sent is no certificate for this machine's key: it is not kept")
         pem = key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
-        self._put(_IDENTITY, pem + certificate.encode())
+        self._put(_IDENTITY, pem + made.public_bytes(serialization.Encoding.PEM))
 
     def clear(self) -> None:
         """Forget all of it."""

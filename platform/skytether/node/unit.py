@@ -55,6 +55,7 @@ SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
 SystemCallErrorNumber=EPERM
 MemoryMax=512M
+LimitNOFILE=65536
 TasksMax=256
 Environment=OPENBLAS_NUM_THREADS=1
 
