@@ -13,7 +13,7 @@ from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock, Mock
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
 
@@ -40,6 +40,8 @@ class Engine:
         self.links: set[str] = set()
         """In its images."""
         self.volumes: list[dict[str, Any]] = []
+        self.digests: list[str] = []
+        """Of the image that it has by any name but "new"."""
         engine = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -55,8 +57,11 @@ class Engine:
                 said = {"Id": ID, "Config": {"Labels": labels}, "Labels": labels, "Image": "a", **engine.container}
                 if "/system/df" in self.path:
                     said = {"Containers": [{"Command": "secret"}], "Volumes": engine.volumes}
+                if "/images/" in self.path and self.command == "GET":
+                    said = {"RepoDigests": engine.digests}
                 text = json.dumps(said).encode()
-                self.send_response(201 if self.path == "/containers/create" else 200)
+                missing = self.path.startswith("/images/new")
+                self.send_response(404 if missing else 201 if self.path == "/containers/create" else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {"mode": 1 << 27 if asked in engine.links else 0}
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
@@ -157,7 +162,7 @@ def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
     ("path", "kind"),
     [
         ("/containers/prune?filters=%7B%22label%22%3A+%5B%22skytether.io%2Fguard%22%5D%7D", "x-www-form-urlencoded"),
-        ("/images/create?fromImage=a&tag=1", "x-www-form-urlencoded"),
+        ("/images/create?fromImage=new&tag=1", "x-www-form-urlencoded"),
     ],
 )
 def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: str) -> None:
@@ -166,9 +171,32 @@ def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: s
     said = say(engine, request(f"POST {path}", form, f"Content-Type: application/{kind}"))
     assert b"the call has a body" in said
     assert b"200 OK" in say(engine, request(f"POST {path}", b"null", f"Content-Type: application/{kind}"))
-    ((_, headers, got),) = engine.asked
+    _, headers, got = engine.asked[-1]
+    assert [line for line in engine.lines if line.startswith("POST")] == [f"POST {path}"]
     assert not got
     assert "content-type" not in {name.lower() for name in headers}
+
+
+@pytest.mark.parametrize(
+    ("image", "digests", "good"),
+    [
+        ("new", [], True),
+        ("docker.io/library/debian", ["debian@sha256:aa"], True),
+        ("registry.example:5000/a/b", ["other@sha256:aa", "registry.example:5000/a/b@sha256:aa"], True),
+        ("somebody/app", [], False),  # made on this machine
+        ("somebody/app", ["debian@sha256:aa"], False),
+        ("registry.example/debian", ["debian@sha256:aa"], False),
+    ],
+)
+def test_no_pull_takes_the_name_of_an_image_that_is_from_elsewhere(
+    engine: Engine, image: str, digests: list[str], good: bool
+) -> None:
+    """Whoever starts something by that name on this machine, with whatever rights, would start what was pulled."""
+    engine.digests = digests
+    got = say(engine, request(f"POST /images/create?fromImage={quote(image, safe='')}&tag=1"))
+    assert (b"200 OK" in got) is good
+    assert good or b"of this machine was not pulled from there" in got
+    assert any(line.startswith("POST") for line in engine.lines) is good
 
 
 MOUNTED = [

@@ -58,7 +58,8 @@ def service(options: DockerOptions, namespace: Namespace | None = None, **needs:
 )
 def test_what_the_runtime_makes_is_passed_on(body: dict[str, Any]) -> None:
     sent = json.loads(json.dumps(body))
-    assert asked("POST", "/v1.47/containers/create", sent, ("/dev/video0",), name="skytether-edge-i1-1") is None
+    devices = ("/dev/video0", "/dev/nvidia0", "/dev/nvidia1")
+    assert asked("POST", "/v1.47/containers/create", sent, devices, name="skytether-edge-i1-1") is None
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,10 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
     assert (
         asked("POST", "/volumes/create", {"Name": name, "Driver": None, "DriverOpts": None, "Labels": labels}) is None
     )
-    assert asked("POST", "/images/create", fromImage="registry.example/a", tag="1") is None
+    pulled = {"fromImage": "registry.example:5000/a/b", "tag": "1.2-x"}
+    about = (("images", "registry.example:5000/a/b:1.2-x"),)
+    assert judge(Call("POST", "/images/create", pulled, None)) == (None, about)
+    assert judge(Call("POST", "/images/create", {**pulled, "tag": "sha256:" + ID}, None)) == (None, ())
     assert (
         asked("POST", f"/containers/{ID}/update", {"Memory": 1, "MemorySwap": 1, "NanoCpus": 1, "CpuShares": 2}) is None
     )
@@ -116,6 +120,10 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
         None,
         (("containers", ID), ("joined networks", "n")),
     )
+
+
+def gpu(*numbers: str) -> dict[str, Any]:
+    return {"Driver": "nvidia", "DeviceIDs": list(numbers), "Capabilities": [["gpu"]]}
 
 
 HOST: dict[str, Any] = {
@@ -162,6 +170,10 @@ HOST: dict[str, Any] = {
         ({"Devices": [{"PathOnHost": "/dev/sda"}]}, "by `site join --device /dev/sda`"),
         ({"Devices": [{"PathOnHost": "/dev/video0", "pathonhost": "/dev/sda"}]}, "a device has 'pathonhost'"),
         ({"DeviceRequests": [{"Driver": "cdi", "DeviceIDs": ["vendor.com/all=all"]}]}, "odd devices"),
+        ({"DeviceRequests": [gpu("0")]}, "by `site join --device /dev/nvidia0`"),
+        ({"DeviceRequests": [gpu("0/../sda")]}, "by `site join --device /dev/nvidia0/../sda`"),
+        ({"DeviceRequests": [gpu()]}, "by `site join --device /dev/nvidia0`"),
+        ({"DeviceRequests": [{**gpu("0"), "Capabilities": [["gpu", "display"]]}]}, "odd devices"),
         ({"LogConfig": {"Type": "syslog"}}, "its log goes elsewhere"),
         ({"NetworkMode": None}, "its network is ''"),  # and not the network of that name
         ({"ReadonlyRootfs": False}, "it may change its own files"),
@@ -197,6 +209,10 @@ def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any]
         ("POST", "/containers/prune", None, {}),
         ("POST", "/containers/prune", None, {"filters": '{"until": ["1s"]}'}),
         ("POST", "/images/create", None, {"fromSrc": "-"}),
+        ("POST", "/images/create", None, {"fromImage": "a", "tag": ""}),  # all tags
+        ("POST", "/images/create", None, {"fromImage": "a:1", "tag": "2"}),
+        ("POST", "/images/create", None, {"fromImage": "a@sha256:" + ID, "tag": "2"}),
+        ("POST", "/images/create", None, {"fromImage": "a/../b", "tag": "2"}),
         ("POST", "/volumes/prune", None, {}),
         ("POST", "/volumes/create", {"Name": "database", "Labels": OWNER}, {}),
         ("POST", "/volumes/create", {"Name": "skytether-x", "Labels": OWNER, "DriverOpts": {"device": "/"}}, {}),

@@ -153,10 +153,20 @@ class EngineGate:
         if refused:
             raise RefusedCall(refused)
         for subject in subjects:
-            if not await self._is_ours(subject):
+            if subject[0] == "images":
+                await self._may_be_pulled(subject[1])
+            elif not await self._is_ours(subject):
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
         if call.path.endswith("/archive"):
             await self._may_be_opened(subjects[0][1])
+
+    async def _may_be_pulled(self, image: str) -> None:
+        """Raises if something else of this machine has that name: who starts it by that name would start ours."""
+        status, found = await self._asked(f"/images/{image}/json")
+        digests = found.get("RepoDigests") if isinstance(found, dict) else None
+        known = {_familiar(str(one).partition("@")[0]) for one in digests or ()}
+        if status != HTTPStatus.NOT_FOUND and _familiar(image.rpartition(":")[0]) not in known:
+            raise RefusedCall(f"the image {image[:80]} of this machine was not pulled from there")
 
     async def _may_be_opened(self, container: str) -> None:
         """Raises unless the engine may look into its files."""
@@ -201,7 +211,7 @@ class EngineGate:
     async def _is_ours(self, subject: Subject) -> bool:
         """Whether an orchestrator made it, or there is none: the engine says that itself."""
         kind, name = subject
-        if name in self._ours:
+        if kind == "containers" and name in self._ours:
             return True
         what = kind.rpartition(" ")[2]
         path = f"/{what}/{name}/json" if what == "containers" else f"/{what}/{name}"
@@ -226,3 +236,8 @@ def _header(row: bytes) -> tuple[bytes, bytes]:
     if not colon or not re.fullmatch(rb"[A-Za-z-]+", name) or not re.fullmatch(rb"[\t -~]*", value):
         raise RefusedCall("it is no plain request")
     return name.lower(), value.strip()
+
+
+def _familiar(image: str) -> str:
+    """A name as an engine shortens it."""
+    return re.sub(r"^(?:(?:index\.)?docker\.io/)?(?:library/)?", "", image)

@@ -77,6 +77,8 @@ _OURS = "skytether-"
 By any other name, somebody else on this machine could have ours for his own: it is looked for before the beginnings of
 ids, and by name where a container starts."""
 _NETWORK, _BRIDGE = r"skytether(?:-[A-Za-z0-9_.-]+)?", "skt-[0-9A-Za-z]{1,11}"
+_IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
+_TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
 _MOST_PIDS = 1 << 15
 """Of a container's processes and threads."""
 _MOST_PORTS = 1
@@ -96,8 +98,9 @@ class Call:
 
 
 Subject = tuple[str, str]
-"""Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all; of networks
-that must be ours or open to us, ``seen networks``, if they are there, and ``joined networks``, which must be."""
+"""Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all. What is one of
+``seen networks`` may be open to us, too, and so may ``joined networks``, which must be there. ``images`` must not be
+there, or be from where they are pulled."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -156,6 +159,12 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             filters = _json(call.query.get("filters", ""))
             ours = isinstance(filters, dict) and filters.get("label") in ([OLD_GUARD], {OLD_GUARD: True})
             return None if ours else "only what earlier releases left is pruned", ()
+        case "pull":
+            image, tag = call.query.get("fromImage", ""), call.query.get("tag", "")
+            if re.fullmatch(_IMAGE, image) and re.fullmatch(_DIGEST, tag):
+                return None, ()  # by that nothing gets another name
+            odd = None if re.fullmatch(_IMAGE, image) and re.fullmatch(_TAG, tag) else "a pull names one image"
+            return odd, (("images", f"{image}:{tag}"),)
         case "listed":
             filters = _json(call.query.get("filters", ""))
             labels = filters.get("label") if isinstance(filters, dict) else None
@@ -193,7 +202,7 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         _only(_at(host, "LogConfig"), {"Type", "Config"}, "a log"),
         *(_mount(mount) for mount in _list(host, "Mounts")),
         *(_device(one, devices) for one in _list(host, "Devices")),
-        *(_gpu(one) for one in _list(host, "DeviceRequests")),
+        *(_gpu(one, devices) for one in _list(host, "DeviceRequests")),
     )
     return next(filter(None, checks), None)
 
@@ -235,9 +244,15 @@ def _device(device: Any, devices: set[str]) -> str | None:
     return f"it has the device {str(path)[:80]}, and this machine gives none but by `site join --device {path}`"
 
 
-def _gpu(request: Any) -> str | None:
-    gpus = isinstance(request, dict) and request.get("Driver") == "nvidia"
-    return _only(request, {"Driver", "DeviceIDs", "Capabilities"}, "a GPU") if gpus else "it asks for odd devices"
+def _gpu(request: Any, devices: set[str]) -> str | None:
+    if not isinstance(request, dict) or request.get("Driver") != "nvidia" or request.get("Capabilities") != [["gpu"]]:
+        return "it asks for odd devices"
+    numbers = _list(request, "DeviceIDs")
+    closed = [one for one in numbers if not re.fullmatch(r"\d+", str(one)) or f"/dev/nvidia{one}" not in devices]
+    if closed or not numbers:
+        what = f"/dev/nvidia{str(closed[0])[:20]}" if closed else "/dev/nvidia0"
+        return f"it has a GPU, and this machine gives none but by `site join --device {what}`"
+    return _only(request, {"Driver", "DeviceIDs", "Capabilities"}, "a GPU")
 
 
 def _network(body: Mapping[str, Any]) -> str | None:
