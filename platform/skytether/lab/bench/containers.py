@@ -36,14 +36,24 @@ class ServiceImage:
 
 
 @contextmanager
-def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str, service: str) -> Iterator[ServiceImage]:
+def docker_site(
+    orchestrator: EmbeddedOrchestrator, prefix: str, service: str, bind_host: str | None = None
+) -> Iterator[ServiceImage]:
     """Make this machine's engine the only site, and remove what is left there in the end; gives what it runs.
+
+    Args:
+        orchestrator: Whose site it is.
+        prefix: Of the images' names.
+        service: The one that is to run.
+        bind_host: Address on which its instances are reached; None: the site's own default.
 
     Raises:
         BenchError: There is no such image, or no engine.
     """
     owner = f"bench-{secrets.token_hex(4)}"
     options = {"owner": owner, "network": f"skytether-{owner}", "guard_image": f"{prefix}guard:1", "pull": "never"}
+    if bind_host is not None:
+        options["bind_host"] = bind_host
     if "DOCKER_HOST" in os.environ:  # as the command line has it
         options["engine"] = os.environ["DOCKER_HOST"]
     image = f"{prefix}{service}:1"
@@ -62,6 +72,15 @@ def docker_site(orchestrator: EmbeddedOrchestrator, prefix: str, service: str) -
     finally:
         orchestrator.stop()
         clean(owner, options["network"])
+
+
+def gateway() -> str:
+    """This machine's address on the engine's own network.
+
+    What comes to it goes to a container as a robot's packets do that come from elsewhere: by the kernel. What comes to
+    loopback is passed on by a process of the engine, which must wait for a processor each time.
+    """
+    return docker("network", "inspect", "bridge", "--format", "{{(index .IPAM.Config 0).Gateway}}").strip()
 
 
 def clean(owner: str, network: str) -> None:

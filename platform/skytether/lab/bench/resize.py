@@ -4,25 +4,29 @@ Everything is real: an orchestrator, the service in a container of this machine'
 walker whose agent drives at 100 Hz, an operator in a process of its own. The instance is under load: another program in
 its container, within its limits, keeps half a core busy. Beside each change the same is measured over as long a time
 without one.
+
+A robot has a computer of its own. Here it shares the processors with its edge machine, so its threads go before all
+others where that is permitted, and its packets take the way of those that come from elsewhere.
 """
 
 from __future__ import annotations
 
 import gc
 import multiprocessing
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from skytether.api.client import Client
 from skytether.api.rest import Resize, RobotCreate, Size
-from skytether.lab.bench.containers import docker, docker_site
+from skytether.lab.bench.containers import docker, docker_site, gateway
 from skytether.lab.bench.migrate import PERIOD_MS, Commands, instance_of, wait_for
 from skytether.lab.bench.pair import BenchError
 from skytether.lab.demo import ROBOT, SERVICE, WalkerHardware
@@ -64,6 +68,7 @@ class ResizeRow:
         resize_p50_s: Median time from the request until the instance had it.
         fallbacks: Changes during which the robot's own controller took over.
         restarts: Of the instance.
+        robot_first: Whether the robot's threads could be given real-time priority.
     """
 
     runtime: str
@@ -77,6 +82,7 @@ class ResizeRow:
     resize_p50_s: float
     fallbacks: int
     restarts: int
+    robot_first: bool
 
     def document(self) -> dict[str, object]:
         """For ``--json``."""
@@ -106,21 +112,26 @@ def bench_resize(
     still: list[float] = []
     took: list[float] = []
     fallbacks = 0
+    host: str | None = None
     with (
         EmbeddedOrchestrator() as orchestrator,
-        docker_site(orchestrator, prefix, SERVICE) if runtime == "docker" else nullcontext(),
         ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as operators,
+        ExitStack() as site,
     ):
+        if runtime == "docker":
+            host = gateway() if "DOCKER_HOST" not in os.environ else None
+            site.enter_context(docker_site(orchestrator, prefix, SERVICE, host))
         access = orchestrator.url, orchestrator.operator_token
         with Client(*access) as operator:
             token = operator.create_robot(RobotCreate(name=ROBOT, services=(SERVICE,))).token
-        config = AgentConfig(ROBOT, orchestrator.url, SERVICE, token, bind=("127.0.0.1", 0))
+        config = AgentConfig(ROBOT, orchestrator.url, SERVICE, token, bind=(host or "127.0.0.1", 0))
         seen = Commands()
         with Agent(config, WalkerHardware(World(Trail(), seed=1)), observer=seen) as agent:
             wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             instance = instance_of(agent)
             operators.submit(_look, access, instance, 0.0).result()  # it is there, and has imported all
+            robot_first = _robot_first()
             with _loaded(instance, runtime):
                 for i in range(n):
                     time.sleep(2 * _AROUND_S)
@@ -152,7 +163,20 @@ def bench_resize(
         round(float(np.median(took)), 3),
         fallbacks,
         restarts,
+        robot_first,
     )
+
+
+def _robot_first() -> bool:
+    """Let the threads of this process, the robot, go before all others; whether that is permitted."""
+    try:
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except ProcessLookupError:
+        return _robot_first()  # one of them ended meanwhile
+    except PermissionError:
+        return False
+    return True
 
 
 def _change(access: tuple[str, str], instance: str, size: Size) -> tuple[float, float]:
