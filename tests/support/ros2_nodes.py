@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import queue
 import subprocess
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from skytether.lab.netns import Namespace
 
 LIMIT_S = 30.0
 """Patience; discovery takes up to 3 s, on a machine that others use too longer."""
@@ -48,9 +52,12 @@ except BaseException:
 class Node:
     """One process with one node, ``node`` in its code; what it says with ``say`` is read with `next`."""
 
-    def __init__(self, python: str, name: str, namespace: str, code: str, wrap: list[str] | None = None) -> None:
+    def __init__(self, python: str, name: str, namespace: str, code: str, environment: dict[str, str]) -> None:
         text = f"NAME, NAMESPACE = {name!r}, {namespace!r}\n{_BEFORE}{code}{_AFTER}"
-        self.process = subprocess.Popen([*(wrap or []), python, "-c", text], stdout=subprocess.PIPE, text=True)
+        command = [python, "-c", text]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         self._said: queue.Queue[Any] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -76,12 +83,18 @@ class Node:
             found.append(self._said.get())
         return found
 
+    def tell(self, line: str) -> None:
+        """Give its code a line to read."""
+        assert self.process.stdin is not None
+        print(line, file=self.process.stdin, flush=True)
+
     def close(self) -> None:
         self.process.kill()
         self.process.wait()
         self._reader.join()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
 
 
 class Ros2Nodes:
@@ -91,9 +104,14 @@ class Ros2Nodes:
         self.python, self.domain = python, domain
         self._nodes: list[Node] = []
 
-    def start(self, code: str, name: str = "peer", namespace: str = "/", wrap: list[str] | None = None) -> Node:
+    def start(self, code: str, name: str = "peer", namespace: str = "/", where: Namespace | None = None) -> Node:
         """Start a node; returns when it spins."""
-        self._nodes.append(Node(self.python, name, namespace, code, wrap))
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain)}
+
+        def start() -> Node:
+            return Node(self.python, name, namespace, code, environment)
+
+        self._nodes.append(start() if where is None else where.run(start))
         return self._nodes[-1]
 
     def close(self) -> None:
@@ -101,9 +119,9 @@ class Ros2Nodes:
             node.close()
 
 
-@pytest.fixture
-def ros2_nodes(ros2: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros2Nodes]:
-    """A domain that no other test on this machine has, discovery limited to the machine."""
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """A domain that no other test on this machine has."""
     folder = Path(tempfile.gettempdir()) / "skytether-ros2-domains"
     folder.mkdir(exist_ok=True)
     for domain in range(1, 101):
@@ -116,12 +134,28 @@ def ros2_nodes(ros2: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros2Nodes
         break
     else:
         pytest.fail("100 domains of ROS 2 are in use")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    with lock:
+        yield domain
+
+
+@pytest.fixture
+def ros2_nodes(ros2: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros2Nodes]:
+    """A graph of its own, discovery limited to the machine."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
     monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
-    nodes = Ros2Nodes(ros2, domain)
-    with lock:
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        nodes = Ros2Nodes(ros2, domain)
+        yield nodes
+        nodes.close()
+
+
+@pytest.fixture
+def far_nodes(ros2_nodes: Ros2Nodes) -> Iterator[Ros2Nodes]:
+    """Another graph: also where networks part them, shared memory would not."""
+    with own_domain() as domain:
+        nodes = Ros2Nodes(ros2_nodes.python, domain)
         yield nodes
         nodes.close()
 

@@ -32,6 +32,7 @@ class Qos:
     manual: bool = False
 
 
+_ACTION_STATUS = "/_action/status"
 SERVICE = Qos(depth=10)
 """ROS 2's profile for services."""
 
@@ -41,9 +42,10 @@ def qos_of(row: Topic, *, publishes: bool) -> Qos:
 
     In ROS 2 an endpoint that offers more matches one that asks for less. So we always publish reliably (either kind of
     subscription matches) and subscribe reliably only where the row is reliable (a best-effort subscription matches
-    either kind of publisher). A latched row is transient local with a depth of 1: the bridge keeps its newest message.
+    either kind of publisher). A latched row is transient local with a depth of 1: the bridge keeps its newest message;
+    so is the status of an action where we publish it, for clients of actions ask for that (rcl_action).
     """
-    if row.latched:
+    if row.latched or (publishes and row.name.endswith(_ACTION_STATUS)):
         return Qos(reliable=True, transient_local=True, depth=1)
     return Qos(reliable=publishes or row.reliable, depth=row.depth)
 

@@ -101,7 +101,12 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
             findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
             rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
             if isinstance(node, RclpyNode):
-                _wait(node, [names.of(row.name) for row in rows if row.kind == "topic" and row.direction == "in"])
+                awaited = [
+                    (Kind.PUBLISHER, names.of(r.name)) for r in rows if r.kind == "topic" and r.direction == "in"
+                ]
+                if config.cmd_vel is not None:
+                    awaited.append((Kind.SUBSCRIPTION, config.names(()).own(config.cmd_vel)))
+                _wait(node, awaited)
                 findings[graph] = _graph(ros2, node)
             findings += [_row(settings, part, names, node) for part in rows]
             findings += forbidden(config.permissions(), specs, names, settings.command_topic)
@@ -138,10 +143,10 @@ def _graph(ros2: Ros2Config, node: RclpyNode) -> Finding:
     return Finding("ROS 2 graph", where, "", f"{node.nodes} other nodes are seen")
 
 
-def _wait(node: RclpyNode, names: list[str]) -> None:
-    """Until all of these are published, for a while."""
+def _wait(node: RclpyNode, awaited: list[tuple[Kind, str]]) -> None:
+    """Until all of these are seen, for a while."""
     deadline = time.monotonic() + _LOOK_S
-    while time.monotonic() < deadline and not all(node.endpoints(name, Kind.PUBLISHER) for name in names):
+    while time.monotonic() < deadline and not all(node.endpoints(name, kind) for kind, name in awaited):
         time.sleep(0.05)
 
 
