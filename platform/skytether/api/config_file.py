@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -27,12 +28,13 @@ class Endpoint(Strict):
     """To bind to: 0 takes any free one."""
 
 
-def read_config(path: Path, model: type[_Model]) -> _Model:
+def read_config(path: Path, model: type[_Model], lay: Callable[[Any], Any] = lambda document: document) -> _Model:
     """Read and check a configuration.
 
     Args:
         path: Of the YAML file.
         model: Its schema.
+        lay: What is laid over the file before it is checked.
 
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key is wrong.
@@ -45,7 +47,7 @@ def read_config(path: Path, model: type[_Model]) -> _Model:
         raise ConfigError(str(error)) from error
     if len(documents) > 1:
         raise ConfigError(f"{path} holds {len(documents)} documents; a configuration is one")
-    return check_config(documents[0] if documents else None, model, str(path))
+    return check_config(lay(documents[0] if documents else None), model, str(path))
 
 
 def check_config(document: Any, model: type[_Model], where: str) -> _Model:

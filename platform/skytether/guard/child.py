@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import threading
@@ -13,6 +14,8 @@ from .descriptors import refuse
 
 _HANGS_S = 3.0
 """One that says nothing for this long is ended and started anew."""
+LEAVE = signal.SIGUSR1
+"""Asks it to end by itself; what ends programs is ignored by it."""
 _STARTS_S = 15.0
 """It may take this long to say its first word."""
 
@@ -81,6 +84,11 @@ class Child:
         if self.heard_at is None:
             return f"did not start within {_STARTS_S:g} s" if now - self._started_at > _STARTS_S else ""
         return f"hangs for {_HANGS_S:g} s" if now - self.heard_at > _HANGS_S else ""
+
+    def leave(self) -> None:
+        """Have it end by itself and leave its graph in order, when nothing is wanted of it any more; `end` it after."""
+        if self._process is not None:
+            self._process.send_signal(LEAVE)
 
     def end(self) -> None:
         """Have the kernel end it. One that cannot die now is not waited for."""

@@ -42,7 +42,7 @@ _KEPT_S = 1.0
 _ENDS_S = 10.0
 """A guard that is told to end brakes for so long at most."""
 _LEAVES_S = 2.0
-"""For the writer to leave its graph, and for the disk."""
+"""For writer and gate to leave their graph, and for the disk."""
 _MOST_PACKETS = 64
 """Taken from the gate in one turn; one that says more has gone mad, and the rest waits."""
 _LAST_PACKETS = 1024
@@ -149,7 +149,7 @@ class Guard:
         self._event("guard", "end", f"{lost} was removed or replaced" if lost else "told to end")
         self._brake()
         if self._gate is not None:
-            self._gate.end()
+            self._gate.leave()
         if self._writer is not None:
             self._writer.socket.close()  # it says standstill for a while, leaves the graph and ends
         self._display.leave()
@@ -158,9 +158,13 @@ class Guard:
             self._estop.close()
         end = time.monotonic() + _LEAVES_S
         while time.monotonic() < end and not (
-            self._record.written and self._latch.kept and (self._writer is None or self._writer.reaped())
+            self._record.written
+            and self._latch.kept
+            and all(child is None or child.reaped() for child in (self._gate, self._writer))
         ):
             time.sleep(0.01)
+        if self._gate is not None:
+            self._gate.end()
         if self._writer is not None:
             self._writer.end()
         self._display.end()

@@ -84,7 +84,8 @@ class Names:
         specs: The service's topics.
         robot: Namespace of what the robot sends and answers.
         service: Namespace of what the service sends and answers.
-        remap: Other names, by topic, call or action; relative ones are in the namespace that it would have had.
+        remap: Other names, by topic, call or action, or by the absolute name that it would have; relative ones are in
+            the namespace that it would have had.
         ros: Generation, for what is allowed.
 
     Raises:
@@ -104,6 +105,7 @@ class Names:
         self._robot = robot
         self._remap = dict(remap or {})
         self._names: dict[str, str] = {}
+        self._absolute: set[str] = set()
         self._anything = False
         for spec in specs:
             if spec.name == ANY_TOPIC:
@@ -111,10 +113,15 @@ class Names:
                 continue
             asks = spec.kind != "topic"
             home = robot if (spec.direction == "in") is not asks else service
-            name = check_name(resolve(self._remap.get(spec.name, spec.name), home), ros)
+            name = check_name(self._renamed(spec.name, home), ros)
             self._names[spec.name] = name
             for part in (*spec.parts(), *spec.rows()):
                 self._names[part.name] = name + part.name.removeprefix(spec.name)
+
+    def _renamed(self, name: str, home: str) -> str:
+        plain = resolve(name, home)
+        self._absolute.add(plain)
+        return resolve(self._remap.get(name) or self._remap.get(plain, name), home)
 
     def of(self, topic: str) -> str:
         """The graph's name of a topic, a call or an action of the bridge. What only a row ``*`` takes keeps its name.
@@ -123,7 +130,7 @@ class Names:
             GraphNameError: It is not allowed in this graph.
         """
         known = self._names.get(topic)
-        return known or check_name(resolve(self._remap.get(topic, topic), self._robot), self._ros)
+        return known or check_name(self._renamed(topic, self._robot), self._ros)
 
     def own(self, name: str) -> str:
         """The graph's name of something of the robot alone (its wheels, a reading), remapped too.
@@ -131,9 +138,9 @@ class Names:
         Raises:
             GraphNameError: It is not allowed in this graph.
         """
-        return check_name(resolve(self._remap.get(name, name), self._robot), self._ros)
+        return check_name(self._renamed(name, self._robot), self._ros)
 
     def unused(self, more: Iterable[str] = ()) -> list[str]:
         """Remappings of nothing that there is: a typing error, most likely."""
-        known = {*self._names, *more}
+        known = {*self._names, *more, *self._absolute}
         return [] if self._anything else sorted(set(self._remap) - known)

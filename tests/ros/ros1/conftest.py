@@ -1,3 +1,6 @@
+import os
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,6 +71,18 @@ def orchestrator(tmp_path):
         client.delete_site("local")
         orchestrator.client = client
         yield orchestrator
+
+
+@pytest.fixture
+def program(tmp_path):
+    """The command line of this checkout, as an installed program."""
+    path = tmp_path / "skytether"
+    folders = os.pathsep.join(sys.path)
+    path.write_text(
+        f'#!/bin/sh\nPYTHONPATH={shlex.quote(folders)} exec {shlex.quote(sys.executable)} -m skytether.cli "$@"\n'
+    )
+    path.chmod(0o755)
+    return path
 
 
 @pytest.fixture

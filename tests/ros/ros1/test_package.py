@@ -1,10 +1,8 @@
 """The package folder for ROS users: roslaunch, the script that it starts, the unit of systemd."""
 
 import os
-import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,18 +19,6 @@ UNITS = [
 ]
 NODE = ROOT / "docs" / "examples" / "node" / "skytether-node.service"
 ORCHESTRATOR = ROOT / "docs" / "examples" / "orchestrator" / "skytether-orchestrator.service"
-
-
-@pytest.fixture
-def program(tmp_path):
-    """The command line of this checkout, as an installed program."""
-    path = tmp_path / "skytether"
-    folders = os.pathsep.join(sys.path)
-    path.write_text(
-        f'#!/bin/sh\nPYTHONPATH={shlex.quote(folders)} exec {shlex.quote(sys.executable)} -m skytether.cli "$@"\n'
-    )
-    path.chmod(0o755)
-    return path
 
 
 @pytest.fixture
@@ -76,7 +62,7 @@ def test_the_script_says_what_is_missing_and_passes_on_what_is_not_ros_s(tmp_pat
         text=True,
         env={"PATH": "/usr/bin:/bin", "SKYTETHER": "echo"},
     )
-    assert echo.stdout == "robot run a b.yaml --check\n"
+    assert echo.stdout == "robot run a b.yaml __name:=skytether --check __log:=/x\n"
 
 
 def test_the_package_s_files_are_what_catkin_and_roslaunch_read():

@@ -123,7 +123,7 @@ def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
         yield Finding("ros master", "trouble", str(error), todo)
         return
     yield Finding("ros master", "ok", f"answers at {ros1.master}")
-    node = Node(f"{ros1.node}_doctor", ros1.master, host=ros1.host, on_end=lambda _: None)
+    node = Node(settings.node("doctor"), ros1.master, host=ros1.host, on_end=lambda _: None)
     try:
         node.start()
     except NodeError as error:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 from skytether.api.config_file import read_config
 from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
 from skytether.ros.names import namespace_of
+from skytether.ros.ros1.arguments import RosArguments
 from skytether.ros.ros2.config import need_extra
 
 
@@ -70,13 +71,17 @@ def inherit(document: Any) -> Any:
     return document | {"safety": safety}
 
 
-def load_safety(path: Path) -> SafetyConfig:
+def load_safety(path: Path, ros: RosArguments | None = None) -> SafetyConfig:
     """Read and check the section ``safety``.
+
+    Args:
+        path: The file.
+        ros: What ROS gave on the command line, which counts more than the file.
 
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key of the section is wrong or missing.
     """
-    safety = read_config(path, _GateFile).safety
+    safety = read_config(path, _GateFile, (ros or RosArguments()).over).safety
     if safety.ros2 is None:
         return safety
     if safety.ros2.dialect != "rclpy":

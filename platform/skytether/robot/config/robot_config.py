@@ -27,6 +27,7 @@ from skytether.robot.safety.config_base import no_switches
 from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
 from skytether.ros.permissions import Access, Allowed, Permissions
+from skytether.ros.ros1.arguments import RosArguments
 from skytether.ros.ros2.config import Ros2Graph
 
 DEFAULT_MASTER = "http://localhost:11311"
@@ -103,7 +104,7 @@ class Ros1Config(GraphConfig):
     host: str | None = None
     """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
     node: Annotated[str, Field(min_length=1)] = "skytether"
-    """Name of the node in the graph."""
+    """Name of the node; below the robot's namespace unless it is absolute."""
     params: tuple[str, ...] = ()
     """Parameters that the service's graph gets, by name or namespace: ``/robot_description``."""
     use_sim_time: bool | None = None
@@ -119,6 +120,10 @@ class Ros1Config(GraphConfig):
     @model_validator(mode="after")
     def _names_are_legal(self) -> Ros1Config:
         self.check_names(1)
+        try:
+            check_name(self.node)
+        except ValueError as error:
+            raise ValueError(f"node: {error}") from None
         for i, name in enumerate(self.params):
             try:
                 check_name(name)
@@ -353,8 +358,12 @@ class RobotConfig(Strict):
             return ()
         node = way.node if way is not None and "node" in way.model_fields_set else graph.node
         namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
-        where = "/" if self.ros1 is not None else namespace
-        return tuple(resolve(f"{node}_{role}", where) for role in ("guard", "gate"))
+        return tuple(resolve(f"{node}_{role}", namespace) for role in ("guard", "gate"))
+
+    def node(self, what: str = "") -> str:
+        """Absolute name of the agent's node in a ROS 1 graph, or of one that looks for it."""
+        name = self.ros1.node if self.ros1 is not None else ""
+        return resolve(f"{name}_{what}" if what else name, self.home)
 
     @property
     def _way(self) -> Ros1Way | Ros2Way | None:
@@ -382,13 +391,17 @@ class RobotConfig(Strict):
         return found | safety_names(self.safety, self.home, prefix)
 
 
-def load_config(path: Path) -> RobotConfig:
+def load_config(path: Path, ros: RosArguments | None = None) -> RobotConfig:
     """Read and check a robot.yaml.
+
+    Args:
+        path: The file.
+        ros: What ROS gave on the command line, which counts more than the file.
 
     Raises:
         ConfigError: It cannot be read, is no YAML, or a key is wrong.
     """
-    settings = read_config(path, RobotConfig)
+    settings = read_config(path, RobotConfig, (ros or RosArguments()).over)
     if settings.ca_file is None:
         return settings
     return settings.model_copy(update={"ca_file": path.parent / settings.ca_file})

@@ -65,7 +65,7 @@ class Ros1Way(Numbers):
     """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
     namespace: str = "/"
     node: Topic = "skytether"
-    """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
+    """The nodes are called so, in ``namespace``, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
     cmd_vel: Topic = "cmd_vel"
     """What the wheels listen to; nobody else may publish it."""
 

@@ -21,6 +21,7 @@ from typing import Any
 
 from skytether.guard import privileges
 from skytether.guard.board import Board
+from skytether.guard.child import LEAVE
 from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
 from skytether.guard.estop import LATCH_FILE, EstopFile, boot_id, lasting_file
@@ -258,6 +259,7 @@ def main() -> None:
     """Run as the guard's child."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends when the guard does, with the wheels at a standstill
+    signal.signal(LEAVE, lambda *_: sys.exit())  # the guard has stopped the wheels, and ends
     config = SafetyConfig.model_validate_json(thaw(int(sys.argv[2])))
     logging.basicConfig(format="%(levelname)s gate: %(message)s", level=logging.INFO)
     log_without_waiting()
@@ -269,10 +271,15 @@ def main() -> None:
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
     sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)
-    loop = GateLoop(config, guard, sensors, open_wheels(config, "gate"), Board(int(sys.argv[3])), refused)
+    wheels = open_wheels(config, "gate")
+    loop = GateLoop(config, guard, sensors, wheels, Board(int(sys.argv[3])), refused)
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short
-    loop.run()
+    try:
+        loop.run()
+    finally:
+        wheels.close()  # a graph is left in order: its master would name the node for ever
+        sensors.close()
 
 
 if __name__ == "__main__":

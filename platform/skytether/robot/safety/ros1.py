@@ -42,7 +42,7 @@ class Ros1Wheels:
         self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
         self._watch = None
         if role == "gate":
-            own = [resolve(f"{way.node}_{each}", "/") for each in ("guard", "gate")]
+            own = [resolve(f"{way.node}_{each}", way.namespace) for each in ("guard", "gate")]
             self._watch = WheelsWatch(topic, own, partial(self._node.master.publishers, topic))
         self._enable = None
         if enable_topic:
@@ -140,7 +140,7 @@ class Ros1Display:
 
 
 def _start(way: Ros1Way, role: str) -> Node:
-    node = Node(f"{way.node}_{role}", way.master, host=way.host)
+    node = Node(resolve(f"{way.node}_{role}", way.namespace), way.master, host=way.host)
     try:
         node.start()
     except NodeError as error:

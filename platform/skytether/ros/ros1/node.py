@@ -34,6 +34,8 @@ from .tcpros import HeaderError, pack_header, read_header
 
 _T = TypeVar("_T")
 
+_SAME_NAME = "new node registered with same name"
+"""What a ROS master says to the node that it ends for it."""
 _HEADER_S = 10.0
 """For a connection to say what it is for."""
 _WORKERS = 16
@@ -109,7 +111,8 @@ class Node:
         master_uri: ``http://HOST:PORT``. Nobody need be there yet.
         host: Address of this machine that other nodes reach; found out from the environment and the way to the master
             if not given.
-        on_end: Called in a thread of its own if the master or a person wants the node to end.
+        on_end: Called in a thread of its own if the master or a person wants the node to end. None: it goes on, and
+            keeps its name against others that register by it.
         look_s: Between looks at the master.
     """
 
@@ -119,7 +122,7 @@ class Node:
         master_uri: str,
         *,
         host: str | None = None,
-        on_end: Callable[[str], None] = lambda _: None,
+        on_end: Callable[[str], None] | None = None,
         look_s: float = LOOK_S,
     ) -> None:
         self.name = resolve(name, "/")
@@ -347,6 +350,14 @@ class Node:
         return [[i, who, way, "TCPROS", topic, True] for i, (who, way, topic) in enumerate(rows)]
 
     def asked_to_end(self, reason: str) -> None:
+        if self._on_end is None:
+            return
+        if _SAME_NAME in reason:
+            self._registry.hold()  # else each would register again, and have the other one ended
+            reason = (
+                f"another node registered as {self.name}, and a name is one node's alone: start that one or this one "
+                "with another name (ros1.node in robot.yaml, __name:= or __ns:= of ROS)"
+            )
         threading.Thread(target=self._on_end, args=(reason,), name="ros1-end", daemon=True).start()
 
     # --- in the node's thread --------------------------------------------------------------------------------------

@@ -61,6 +61,7 @@ class Registry:
         self._changed = threading.Condition()
         self._dirty = False
         self._closing = False
+        self._held = False
         self._wanted: list[Entry] = []
         self._done: list[Entry] = []
         self._said: set[str] = set()
@@ -83,6 +84,10 @@ class Registry:
                 self._wanted.remove(entry)
             self._wake()
 
+    def hold(self) -> None:
+        """Register nothing any more: the name is another node's now; from any thread."""
+        self._held = True
+
     def close(self) -> None:
         """Take everything back, if the master is there, and end."""
         with self._changed:
@@ -94,7 +99,7 @@ class Registry:
     def step(self) -> None:
         """One round."""
         try:
-            if self._done and (known := self._master.knows(self._node)) != self._uri():
+            if self._done and not self._held and (known := self._master.knows(self._node)) != self._uri():
                 why = f"knows {self._node} at {known[:200]}: end that node" if known else "was restarted"
                 _log.warning("the ROS master at %s %s; registering again", self._master.uri, why)
                 self._done.clear()
@@ -113,7 +118,7 @@ class Registry:
     def _settle(self) -> dict[str, NonsenseError]:
         """Tell the master what it does not know yet. Returns what it answers nonsense for, by name."""
         with self._changed:
-            missing = [entry for entry in self._wanted if entry not in self._done]
+            missing = [] if self._held else [entry for entry in self._wanted if entry not in self._done]
             surplus = [entry for entry in self._done if entry not in self._wanted]
         if not missing and not surplus and not self._done:
             self._master.knows(self._node)  # whether it is there at all

@@ -63,7 +63,7 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         if graph.cmd_vel is not None:
             findings.append(_wheels(graph.cmd_vel, graph, node))
         if graph.wheels is not None:
-            own = graph.drivers or [resolve(settings.ros1.node if settings.ros1 else "", "/")]
+            own = graph.drivers or [settings.node()]
             findings += other_publishers(graph.wheels, node.master.publishers(graph.wheels), own)
     return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
 

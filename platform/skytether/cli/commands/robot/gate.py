@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from ...output import console, fail, print_foreign, print_json
+from ...ros_words import RosWords, given
 
 Folder = Annotated[
     Path | None, typer.Option(help="The gate's folder (safety.folder in robot.yaml), if it is not the usual one.")
@@ -16,7 +17,10 @@ Folder = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
-def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With a section safety.")]) -> None:
+def gate(
+    config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With a section safety.")],
+    ros: RosWords = None,
+) -> None:
     """Own the wheels: let velocities through that are safe, and stop the robot when there are none.
 
     Runs beside the agent, as processes of its own, and needs neither network nor agent. This command checks the
@@ -27,7 +31,7 @@ def gate(config: Annotated[Path, typer.Argument(metavar="ROBOT.YAML", help="With
     from skytether.robot.safety.start import become_guard
 
     try:
-        become_guard(load_safety(config))
+        become_guard(load_safety(config, given(ros)))
     except ConfigError as error:
         fail(str(error), 2)
     except OSError as error:

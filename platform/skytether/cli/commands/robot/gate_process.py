@@ -11,8 +11,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from skytether.guard.record import lost_at_reboot
 from skytether.robot.config.gate_config import load_safety
 from skytether.robot.safety.client import GateError, ask, listens
 from skytether.robot.safety.config import SafetyConfig
+from skytether.ros.ros1.arguments import RosArguments
 
 from ...output import console, fail
 
+_OWN_GATE = "skytether.cli.commands.robot.own_gate"
 _START_S = 20.0
 """For a gate to listen: it reads the configuration, and becomes another program."""
 _END_S = 10.0
@@ -78,13 +81,20 @@ class OwnGate:
         config: The robot.yaml.
         safety: Its section.
         assumed: There is none: whoever starts the robot has reset and started it, as far as there is something to.
+        words: What else its command line has.
         clock: Monotonic seconds.
     """
 
     def __init__(
-        self, config: Path, safety: SafetyConfig, *, assumed: bool, clock: Callable[[], float] = time.monotonic
+        self,
+        config: Path,
+        safety: SafetyConfig,
+        *,
+        assumed: bool,
+        words: Sequence[str] = (),
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._config = config
+        self._arguments = (str(config), *words)
         self._folder = safety.place()
         self._clock = clock
         self._started_at, self._again_s = clock(), _AGAIN_S
@@ -136,14 +146,7 @@ class OwnGate:
 
     def _start(self) -> subprocess.Popen[bytes]:
         # -P: whoever may write where the robot was started is not its gate.
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "skytether.cli.commands.robot.own_gate",
-            str(os.getpid()),
-            str(self._config),
-        ]
+        command = [sys.executable, "-P", "-m", _OWN_GATE, str(os.getpid()), *self._arguments]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
 
     def _let_go(self, *, start: bool) -> bool:
@@ -223,13 +226,13 @@ class FoundGate:
             self._own.close()
 
 
-def other_wheels(config: Path, folder: Path) -> str:
+def other_wheels(config: Path, folder: Path, ros: RosArguments) -> str:
     """Whether the gate that runs in a folder is another robot's: a sentence; empty: it is this one's, or hangs.
 
     Raises:
         ConfigError: The gate's part of the file is wrong.
     """
-    ours = load_safety(config).frozen().wheels_at()
+    ours = load_safety(config, ros).frozen().wheels_at()
     try:
         theirs = ask(folder, {"do": "status"}, _ASK_S)["wheels"]
     except (GateError, KeyError, OSError):
@@ -243,13 +246,16 @@ def other_wheels(config: Path, folder: Path) -> str:
 
 
 @contextmanager
-def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterator[OwnGate | FoundGate | None]:
+def gate(
+    config: Path, safety: SafetyConfig | None, *, assumed: bool, ros: RosArguments
+) -> Iterator[OwnGate | FoundGate | None]:
     """See that there is a gate for as long as the context lasts; None: there is to be none.
 
     Args:
         config: The robot.yaml.
         safety: Its section; None: there is to be no gate.
         assumed: The section is not written.
+        ros: What ROS gave on the command line.
     """
     if safety is None:
         console.print(f"warning: {NO_GATE}", style="yellow", markup=False, soft_wrap=True)
@@ -257,13 +263,14 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         return
     if _there(safety.place()):
         try:
-            strange = other_wheels(config, safety.place())
+            strange = other_wheels(config, safety.place(), ros)
         except (ConfigError, OSError) as error:
             fail(str(error), 2)
         if strange:
             fail(strange)
         console.print(f"gate: uses the one that runs in {safety.place()}", markup=False, soft_wrap=True)
-        found = FoundGate(config, safety, assumed=assumed)
+        make = partial(OwnGate, words=ros.words)
+        found = FoundGate(config, safety, assumed=assumed, make=make)
         try:
             yield found
         finally:
@@ -271,7 +278,7 @@ def gate(config: Path, safety: SafetyConfig | None, *, assumed: bool) -> Iterato
         return
     if assumed:
         console.print(f"warning: {ASSUMED}", style="yellow", markup=False, soft_wrap=True)
-    own = OwnGate(config, safety, assumed=assumed)
+    own = OwnGate(config, safety, assumed=assumed, words=ros.words)
     try:
         try:
             own.wait()

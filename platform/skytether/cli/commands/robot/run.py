@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ...output import console, fail
+from ...ros_words import RosWords, given
 from .never_wait import never_wait
 
 if TYPE_CHECKING:
@@ -22,9 +24,12 @@ if TYPE_CHECKING:
     from skytether.robot.config.robot_config import RobotConfig, Ros1Config, Ros2Config
     from skytether.robot.control.control_loop import RobotHardware
     from skytether.robot.graphs.ros1 import Ros1RobotConfig
+    from skytether.ros.ros1.arguments import RosArguments
     from skytether.ros.ros1.node import Node
 
     from .gate_process import FoundGate, OwnGate
+
+_log = logging.getLogger(__name__)
 
 _STATUS_S = 0.5
 """Between looks at the agent, to say what changed."""
@@ -38,6 +43,7 @@ def run(
         bool, typer.Option("--check", help="Only look whether everything is there, topic by topic; status 1 if not.")
     ] = False,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after this long; without it at Ctrl-C.")] = None,
+    ros: RosWords = None,
 ) -> None:
     """Join the robot's ROS graph, ask for its service, and drive with what the service says.
 
@@ -49,14 +55,18 @@ def run(
 
     if not check:
         never_wait()  # a log that nobody reads must cost no robot anything
+    ros1 = given(ros)
     try:
-        settings = load_config(config)
+        settings = load_config(config, ros1)
+        if ros1.name and settings.ros1 is not None:
+            ros1 = private_parameters(ros1, settings.ros1.master, settings.node())
+            settings = load_config(config, ros1)
         token = load_token(settings, config.parent)
     except ConfigError as error:
         fail(str(error), 2)
     if settings.ros2 is not None:
         try:
-            _run_ros2(settings, settings.ros2, config, token, seconds, check=check)
+            _run_ros2(settings, settings.ros2, config, token, seconds, ros1, check=check)
         except ConfigError as error:
             fail(str(error), 2)
         return
@@ -66,29 +76,38 @@ def run(
         from .check import check_robot
 
         # With the agent's own name the master would end the agent that runs.
-        checks = settings.ros1.model_copy(update={"node": f"{settings.ros1.node}_check"})
-        with _node(settings, checks, threading.Event()) as node:
+        with _node(settings, settings.ros1, settings.node("check"), threading.Event()) as node:
             raise typer.Exit(0 if check_robot(settings, ros1_config(settings, settings.ros1), node, token) else 1)
-    _run(settings, settings.ros1, config, token, seconds)
+    _run(settings, settings.ros1, config, token, seconds, ros1)
 
 
-def _run(settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, seconds: float | None) -> None:
+def _run(
+    settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, seconds: float | None, ros: RosArguments
+) -> None:
     from skytether.robot.agent.agent import Agent
+    from skytether.robot.agent.diagnostics import Ros1Diagnostics
     from skytether.robot.control.fallback import FallbackError
     from skytether.robot.graphs.ros1 import Ros1Robot
+    from skytether.ros.ros1.arguments import PRIVATE
+    from skytether.ros.ros1.console import Console
 
     from .gate_process import gate
 
     ended = threading.Event()
     config = agent_config(settings, path.parent, token)
     with (
-        gate(path, settings.safety, assumed=settings.gate_is_assumed) as own,
-        _node(settings, ros1, ended) as node,
+        gate(path, settings.safety, assumed=settings.gate_is_assumed, ros=ros) as own,
+        _node(settings, ros1, settings.node(), ended) as node,
+        Console(node),
     ):
+        for name in ros.unused:
+            _log.warning("the private parameter %s/%s is none of %s", node.name, name, ", ".join(PRIVATE))
         robot = Ros1Robot(ros1_config(settings, ros1), node)
         try:
             with Agent(config, _base(settings, robot.base), graph=robot) as agent:
-                _watch(agent.status, ended, seconds, own)
+                _watch(
+                    agent.status, ended, seconds, own, Ros1Diagnostics(settings.robot, settings.service, node).publish
+                )
         except FallbackError as error:
             fail(str(error), 2)
         finally:
@@ -96,7 +115,14 @@ def _run(settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, second
 
 
 def _run_ros2(
-    settings: RobotConfig, ros2: Ros2Config, path: Path, token: str, seconds: float | None, *, check: bool
+    settings: RobotConfig,
+    ros2: Ros2Config,
+    path: Path,
+    token: str,
+    seconds: float | None,
+    ros: RosArguments,
+    *,
+    check: bool,
 ) -> None:
     """A robot that is a ROS 2 graph.
 
@@ -113,7 +139,7 @@ def _run_ros2(
     if check:
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
     with (
-        gate(path, settings.safety, assumed=settings.gate_is_assumed) as own,
+        gate(path, settings.safety, assumed=settings.gate_is_assumed, ros=ros) as own,
         join_ros2(settings, ros2, folder) as robot,
     ):
         try:
@@ -134,15 +160,17 @@ def _base(settings: RobotConfig, graph: RobotHardware) -> RobotHardware:
 
 
 @contextmanager
-def _node(settings: RobotConfig, ros1: Ros1Config, ended: threading.Event) -> Iterator[Node]:
+def _node(settings: RobotConfig, ros1: Ros1Config, name: str, ended: threading.Event) -> Iterator[Node]:
     """The node; what goes wrong with it ends the command."""
     from skytether.ros.ros1.node import Node, NodeError
 
     def end(reason: str) -> None:
-        console.print(f"robot {settings.robot}: asked to end: {reason or 'by rosnode kill'}", markup=False)
+        says = f"robot {settings.robot} ends: {reason or 'asked to by rosnode kill'}"
+        _log.error("%s", says)
+        console.print(says, markup=False, soft_wrap=True)
         ended.set()
 
-    node = Node(ros1.node, ros1.master, host=ros1.host, on_end=end)
+    node = Node(name, ros1.master, host=ros1.host, on_end=end)
     try:
         node.start()
     except NodeError as error:
@@ -153,15 +181,43 @@ def _node(settings: RobotConfig, ros1: Ros1Config, ended: threading.Event) -> It
         node.close()
 
 
+def private_parameters(ros: RosArguments, master: str, node: str) -> RosArguments:
+    """With those that roslaunch has set: below the node's name, or below the one that roslaunch takes for it."""
+    from skytether.ros.ros1.master import Master, MasterError
+
+    found: dict[str, Any] = {}
+    for name in (f"/{ros.name.lstrip('/')}", node):
+        try:
+            params = Master(master, node).get_param(name)
+        except MasterError:  # it has none, or does not answer: the node says so
+            continue
+        found.update(params if isinstance(params, dict) else {})
+    return ros.private(found)
+
+
 def _watch(
-    status: Callable[[], AgentStatus], ended: threading.Event, seconds: float | None, gate: OwnGate | FoundGate | None
+    status: Callable[[], AgentStatus],
+    ended: threading.Event,
+    seconds: float | None,
+    gate: OwnGate | FoundGate | None,
+    tell: Callable[[AgentStatus], object] = lambda _: None,
 ) -> None:
-    """Say what changes, until the end."""
+    """Say what changes, until the end.
+
+    Args:
+        status: How the agent is.
+        ended: Somebody wants the end.
+        seconds: Until the end; None: for ever.
+        gate: Before the wheels.
+        tell: Told often how the agent is.
+    """
     gc.freeze()  # all that is loaded by now stays: looking through it for garbage takes ticks of the control loop
     begin = time.monotonic()
     before = ""
     while seconds is None or time.monotonic() - begin < seconds:
-        now = _sentence(status())
+        found = status()
+        tell(found)
+        now = _sentence(found)
         if now != before:
             console.print(now, markup=False, soft_wrap=True)
             before = now

@@ -1,0 +1,32 @@
+"""Arguments that ROS gives a node: as a command takes them, and what becomes of them."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .output import fail
+
+if TYPE_CHECKING:
+    from skytether.ros.ros1.arguments import RosArguments
+
+RosWords = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[FROM:=TO]...",
+        help="As ROS 1 and roslaunch give them: remappings, _PARAMETER:=VALUE, __name:=, __ns:=, __master:=, __ip:=.",
+        show_default=False,
+    ),
+]
+
+
+def given(words: list[str] | None) -> RosArguments:
+    """What they say, and the environment; a word that ROS does not know ends the command."""
+    from skytether.ros.ros1.arguments import ArgumentError, parse
+
+    try:
+        return parse(words or (), os.environ)
+    except ArgumentError as error:
+        fail(str(error), 2)
