@@ -29,7 +29,7 @@ CHART = ROOT / "helm" / "skytether"
 SOURCE = ROOT / "helm" / "values.schema.yaml"
 KUBERNETES = "1.37.0"
 _GROUPS = ("io.k8s.api.core.v1.", "io.k8s.api.networking.v1.", "io.k8s.apimachinery.pkg.apis.meta.v1.")
-_OURS = ("state_dir", "host", "port", "database_url", "secrets_dir", "catalogue_dir", "sites_file", "advertise")
+_OURS = ("state_dir", "host", "port", "database_url", "secrets_dir", "catalog_dir", "sites_file", "advertise")
 _OURS += ("local_site", "echo", "insecure_http", "tls", "nodes")
 """Settings that the chart sets."""
 _LEFT_OUT = ("title", "default", "description", "format", "discriminator")

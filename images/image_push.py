@@ -118,7 +118,7 @@ class Pusher:
 def values(rows: Iterable[Pushed]) -> dict[str, object]:
     """What the chart is told: the orchestrator's image, and of each service its manifest with the image; by digest."""
     found: dict[str, object] = {}
-    catalogue: dict[str, object] = {}
+    catalog: dict[str, object] = {}
     for row in rows:
         name = row.image.rpartition("/")[2]
         manifest = _SERVICES / name.replace("-", "_") / "service.yaml"
@@ -127,8 +127,8 @@ def values(rows: Iterable[Pushed]) -> dict[str, object]:
         elif manifest.exists():
             document = yaml.safe_load(manifest.read_text())
             document["spec"]["image"] = f"{row.image}@{row.digest}"
-            catalogue[name] = document
-    return found | ({"catalogue": catalogue} if catalogue else {})
+            catalog[name] = document
+    return found | ({"catalog": catalog} if catalog else {})
 
 
 def _platform(row: Mapping[str, object]) -> str:

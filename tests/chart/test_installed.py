@@ -22,7 +22,7 @@ from value_sets import SETS
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate
-from skytether.orchestrator.scheduling.catalogue import read_builtin
+from skytether.orchestrator.scheduling.catalog import read_builtin
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 
@@ -36,7 +36,7 @@ def images(docker_images: Images) -> Iterator[Images]:
         yield docker_images
 
 
-def catalogue(images: Images) -> Values:
+def catalog(images: Images) -> Values:
     """``virtual-trail`` as ``trail``, with the image of this run of the tests."""
     from importlib.metadata import entry_points
 
@@ -44,7 +44,7 @@ def catalogue(images: Images) -> Values:
     document = manifests["virtual-trail"].model_dump(mode="json", by_alias=True)
     document["metadata"]["name"] = "trail"
     document["spec"] |= {"image": images.name("virtual-trail"), "entrypoint": None}
-    return {"catalogue": {"trail": document}}
+    return {"catalog": {"trail": document}}
 
 
 @pytest.fixture
@@ -82,10 +82,10 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
     kept = {"persistence": {"storageClass": "", "volumeName": volume}}
     service = {"type": "NodePort", "nodePort": _RELAY_PORT}
     with ExitStack() as stack:
-        first = HelmRelease(images, kubeconfig, f"skytether-chart-{unique}-a", catalogue(images) | site() | kept)
+        first = HelmRelease(images, kubeconfig, f"skytether-chart-{unique}-a", catalog(images) | site() | kept)
         stack.callback(first.close)
         at_relay = site(reach="relay", relay=f"{first.node()}:{_RELAY_PORT}")
-        values = catalogue(images) | at_relay | {"persistence": {"enabled": False}}
+        values = catalog(images) | at_relay | {"persistence": {"enabled": False}}
         values |= {"relay": {"enabled": True, "service": service}, "echo": {"enabled": True}}
         second = HelmRelease(images, kubeconfig, f"skytether-chart-{unique}-b", values)
         stack.callback(second.close)
@@ -127,7 +127,7 @@ def test_two_orchestrators_over_postgresql_lose_and_double_nothing_when_the_lead
     images: Images, kubeconfig: str, postgres_programs: None
 ) -> None:
     """In the midst of starts; and what the robots have is driven all the time."""
-    values = catalogue(images) | site() | {"database": {"existingSecret": "database"}}
+    values = catalog(images) | site() | {"database": {"existingSecret": "database"}}
     values["orchestrator"] = {"replicas": 2, "service": {"type": "NodePort"}, "resources": {"requests": {"cpu": "50m"}}}
     release = HelmRelease(images, kubeconfig, f"skytether-chart-{secrets.token_hex(4)}", values)
     with ExitStack() as stack:

@@ -16,6 +16,6 @@ def test_the_chart_has_what_was_pushed_by_digest() -> None:
     made = objects(written)
     container = at(made["Deployment/orchestrator"], "spec template spec containers orchestrator")
     assert container["image"] == f"registry.example/lab/orchestrator@{DIGEST}"
-    (catalogue,) = (one for key, one in made.items() if key.startswith("ConfigMap/") and key.endswith("catalogue"))
-    images = {yaml.safe_load(text)["spec"]["image"] for text in catalogue["data"].values()}
+    (catalog,) = (one for key, one in made.items() if key.startswith("ConfigMap/") and key.endswith("catalog"))
+    images = {yaml.safe_load(text)["spec"]["image"] for text in catalog["data"].values()}
     assert images == {f"registry.example/lab/{name}@{DIGEST}" for name in names[4:]}

@@ -217,7 +217,7 @@ def test_a_change_of_the_configuration_begins_new_pods() -> None:
     assert before == sums({"orchestrator": {"service": {"type": "NodePort"}}})
     assert before != sums({"config": {"limits": {"events": 7}}})
     assert before != sums({"sites": {"cluster": {"cost": 3}}})
-    assert before != sums({"catalogue": SETS["sites"]["catalogue"]})
+    assert before != sums({"catalog": SETS["sites"]["catalog"]})
 
 
 def test_secrets_are_made_of_256_random_bits_and_never_the_same() -> None:
@@ -304,8 +304,8 @@ def test_nothing_secret_is_in_an_argument_or_a_variable() -> None:
         ),
         ({"image": {"tag": ""}}, "image: give a tag or a digest"),
         (
-            {"catalogue": {"other": SETS["sites"]["catalogue"]["trail"]}},
-            "catalogue.other: its manifest's metadata.name is 'trail': give both the same name",
+            {"catalog": {"other": SETS["sites"]["catalog"]["trail"]}},
+            "catalog.other: its manifest's metadata.name is 'trail': give both the same name",
         ),
     ],
 )

@@ -101,7 +101,7 @@ def _objects(node: Any, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
         ({"sites": {"a": {"tier": "edge", "runtime": "process"}}}, "at '/sites/a/runtime': value must be one of"),
         ({"sites": {"a": {"tier": "edge", "runtime": "docker", "options": {"reach": "pod"}}}}, "'reach' not allowed"),
         ({"sites": {"A": {"tier": "edge", "runtime": "docker"}}}, "invalid propertyName 'A'"),
-        ({"catalogue": {"a": {"spec": {"imag": "a"}}}}, "additional properties 'imag' not allowed"),
+        ({"catalog": {"a": {"spec": {"imag": "a"}}}}, "additional properties 'imag' not allowed"),
         ({"relay": {"config": {"upstraem": None, "routes": []}}}, "additional properties 'upstraem' not allowed"),
         ({"labels": {"a": 1}}, "at '/labels/a': got number, want string"),
         ({"gateway": {"parentRefs": [{"nam": "a"}]}}, "missing property 'name'"),

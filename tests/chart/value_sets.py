@@ -109,7 +109,7 @@ SETS: dict[str, dict[str, Any]] = {
             "far": {"tier": "cloud", "runtime": "kubernetes", "options": {"kubeconfig": "/etc/far/config"}},
             "engine": {"tier": "edge", "runtime": "docker", "options": {"engine": "ssh://docker@192.0.2.7"}},
         },
-        "catalogue": {"trail": MANIFEST},
+        "catalog": {"trail": MANIFEST},
     },
     "nodes": {
         "nodes": {
@@ -183,7 +183,7 @@ CASES: list[tuple[str, str, str, Any]] = [
     ("defaults", _ORCHESTRATOR, f"{_BOX} resources limits memory", "1Gi"),
     ("defaults", _ORCHESTRATOR, f"{_BOX} envFrom", ABSENT),
     ("defaults", _ORCHESTRATOR, f"{_BOX} volumeMounts state mountPath", "/state"),
-    ("defaults", _ORCHESTRATOR, f"{_BOX} volumeMounts catalogue", ABSENT),
+    ("defaults", _ORCHESTRATOR, f"{_BOX} volumeMounts catalog", ABSENT),
     ("defaults", _ORCHESTRATOR, f"{_POD} serviceAccountName", "demo-skytether-orchestrator"),
     ("defaults", _ORCHESTRATOR, f"{_POD} enableServiceLinks", False),
     ("defaults", _ORCHESTRATOR, f"{_POD} imagePullSecrets", ABSENT),
@@ -221,7 +221,7 @@ CASES: list[tuple[str, str, str, Any]] = [
     ("defaults", "Deployment/echo", "", None),
     ("defaults", "ServiceMonitor/orchestrator", "", None),
     ("defaults", "HTTPRoute/orchestrator", "", None),
-    ("defaults", "ConfigMap/catalogue", "", None),
+    ("defaults", "ConfigMap/catalog", "", None),
     ("defaults", "ConfigMap/dashboard", "", None),
     # State in PostgreSQL, or on which volume.
     ("postgres", _ORCHESTRATOR, "spec replicas", 3),
@@ -343,8 +343,8 @@ CASES: list[tuple[str, str, str, Any]] = [
     ("sites", "Role/orchestrator", "metadata namespace", "ns"),
     ("sites", "RoleBinding/demo-skytether@ward", "subjects 0 namespace", "ns"),
     ("sites", "RoleBinding/uninstall@ward", "subjects 0 name", "demo-skytether-uninstall"),
-    ("sites", _ORCHESTRATOR, f"{_BOX} volumeMounts catalogue mountPath", "/etc/skytether/catalogue"),
-    ("sites", _ORCHESTRATOR, f"{_POD} volumes catalogue configMap name", "demo-skytether-catalogue"),
+    ("sites", _ORCHESTRATOR, f"{_BOX} volumeMounts catalog mountPath", "/etc/skytether/catalog"),
+    ("sites", _ORCHESTRATOR, f"{_POD} volumes catalog configMap name", "demo-skytether-catalog"),
     # Machines that join.
     ("defaults", "Service/nodes", "", None),
     ("nodes", "Service/nodes", "spec type", "LoadBalancer"),

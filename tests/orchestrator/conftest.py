@@ -26,7 +26,8 @@ from skytether.orchestrator.http import app
 from skytether.orchestrator.http.app import create_app
 from skytether.orchestrator.http.pause import Pause
 from skytether.orchestrator.http.server import listening
-from skytether.orchestrator.scheduling import catalogue, sites
+from skytether.orchestrator.scheduling import catalog as catalog
+from skytether.orchestrator.scheduling import sites
 from skytether.orchestrator.scheduling.sites import load_runtime
 from skytether.orchestrator.store.store import Store
 from skytether.testing import runtimes
@@ -107,11 +108,11 @@ def migrated() -> bytes:
 @pytest.fixture(scope="session", autouse=True)
 def installed_services_are_read_once() -> Iterator[None]:
     """They stay what they are while the tests run, and hundreds of orchestrators want to know."""
-    read, installed = cache(catalogue.read_builtin), cache(entry_points)
+    read, installed = cache(catalog.read_builtin), cache(entry_points)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalogue, "entry_points", installed)
+        patch.setattr(catalog, "entry_points", installed)
         patch.setattr(sites, "entry_points", installed)
-        patch.setattr(catalogue, "read_builtin", lambda points: read(tuple(points)))
+        patch.setattr(catalog, "read_builtin", lambda points: read(tuple(points)))
         yield
 
 

@@ -19,7 +19,7 @@ from skytether.orchestrator.groups.groups import Groups
 from skytether.orchestrator.groups.scaler import Scaler
 from skytether.orchestrator.providers.base import Invitation, Provider
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
-from skytether.orchestrator.scheduling.catalogue import Catalogue
+from skytether.orchestrator.scheduling.catalog import Catalog
 from skytether.orchestrator.scheduling.moves import Moves
 from skytether.orchestrator.scheduling.reconcile import Reconciler
 from skytether.orchestrator.scheduling.sites import Site, Sites
@@ -74,7 +74,7 @@ class GroupsBench:
         self.reconciler.sites = self.sites
         self.moves = Moves(
             store,
-            Catalogue(store),
+            Catalog(store),
             lambda: self.sites,
             self.reconciler.weigh,
             self.reconciler.promised,

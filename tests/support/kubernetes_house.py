@@ -55,7 +55,7 @@ class House:
 
     def put(self, name: str, **spec: Any) -> None:
         document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": name}, "spec": spec}
-        self.core.catalogue.put(name, Manifest.model_validate(document))
+        self.core.catalog.put(name, Manifest.model_validate(document))
 
     def ask(self, service: str) -> str:
         asked = InstanceCreate(robot="walker", service=service, lease_s=600)
@@ -63,7 +63,7 @@ class House:
 
     def put_trail(self, image: str) -> None:
         """The manifest of ``virtual-trail``, under the name ``trail`` and with this image."""
-        shipped = self.core.catalogue.get("virtual-trail").spec.model_dump(mode="json")
+        shipped = self.core.catalog.get("virtual-trail").spec.model_dump(mode="json")
         self.put("trail", **shipped | {"image": image, "entrypoint": None})
 
     def drive(self, instance: str) -> Session:

@@ -10,7 +10,7 @@ from skytether.orchestrator.config.settings import Limits, Timing, Weights
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.domain.strain import Strain
-from skytether.orchestrator.scheduling.catalogue import Catalogue
+from skytether.orchestrator.scheduling.catalog import Catalog
 from skytether.orchestrator.scheduling.moves import Moves
 from skytether.orchestrator.scheduling.reconcile import Reconciler
 from skytether.orchestrator.scheduling.sites import Site
@@ -68,9 +68,9 @@ class Bench:
         asked = SiteCreate(name="lab", tier="edge", runtime="fake")
         site = Site(asked, self.runtime, self.reconciler.site_step, Timing(site_silent=1e9))
         self._let_know(site)
-        reconciler, catalogue, sites = self.reconciler, Catalogue(self.store), self.reconciler.sites
+        reconciler, catalog, sites = self.reconciler, Catalog(self.store), self.reconciler.sites
         reconciler.moves = Moves(
-            self.store, catalogue, lambda: sites, reconciler.weigh, reconciler.promised, self.clock, Timing(), Weights()
+            self.store, catalog, lambda: sites, reconciler.weigh, reconciler.promised, self.clock, Timing(), Weights()
         )
         return site
 

@@ -229,7 +229,7 @@ class Client(Connection):
         waited = "" if state.final else f" after {timeout:g} s"
         raise NotRunning(f"instance {instance_id} is {state}{waited}{why}")
 
-    # Catalogue
+    # Catalog
 
     def services(self) -> list[Manifest]:
         """What one may ask for."""

@@ -557,7 +557,7 @@ class RobotCreated(Robot):
 
 Scope = Literal["read", "instances", "sessions", "catalog", "sites", "robots", "tokens", "metrics"]
 """What an operator's token may: see everything but keys; change instances; get the keys of sessions (and so speak as a
-robot or its service); change catalogue, sites, robots, tokens; read /metrics."""
+robot or its service); change catalog, sites, robots, tokens; read /metrics."""
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 

@@ -39,7 +39,7 @@ from .robots.exchange import Exchange
 from .robots.gates import Gates
 from .robots.stops import Stops
 from .runtimes.base import Runtime
-from .scheduling.catalogue import Catalogue
+from .scheduling.catalog import Catalog
 from .scheduling.events import Broker
 from .scheduling.instances import Instances
 from .scheduling.loops import Loop
@@ -113,7 +113,7 @@ class Orchestrator:
             self._group_gauges,
         )
         self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
-        self.catalogue = Catalogue(self.store, settings.catalog)
+        self.catalog = Catalog(self.store, settings.catalog)
         self.strain = Strain()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
@@ -154,7 +154,7 @@ class Orchestrator:
             )
         moves = Moves(
             self.store,
-            self.catalogue,
+            self.catalog,
             lambda: self.sites,
             self.reconciler.weigh,
             self.reconciler.promised,
@@ -197,7 +197,7 @@ class Orchestrator:
         self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(
             self.store,
-            self.catalogue,
+            self.catalog,
             self.sites,
             self.reconciler,
             moves,
@@ -246,13 +246,13 @@ class Orchestrator:
         self.access.charge(caller, length)
 
     def start(self) -> None:
-        """Bring the database up to date, load the catalogue, adopt what runs, begin to reconcile.
+        """Bring the database up to date, load the catalog, adopt what runs, begin to reconcile.
 
         Raises:
-            InvalidError: The catalogue's folder, or the file of sites, is wrong.
+            InvalidError: The catalog's folder, or the file of sites, is wrong.
             SecretFileError: The database belongs to orchestrators with another secret key.
         """
-        self.catalogue.load(self.settings.catalogue_dir)
+        self.catalog.load(self.settings.catalog_dir)
         file = self.settings.sites_file
         declared, groups = (read_sites(file), read_groups(file)) if file else ([], [])
         self.store.migrate()

@@ -362,7 +362,7 @@ def test_a_graph_of_the_operators_gives_scope_catalog_no_other_launch_file(
         return document
 
     (tmp_path / "ours/nav.yaml").write_text(json.dumps(graph("nav", "/srv/nav.launch")))
-    served = served_with(catalogue_dir=tmp_path / "ours")
+    served = served_with(catalog_dir=tmp_path / "ours")
     token = served.operator.create_token(TokenCreate(name="cook", scopes=("catalog", "read"))).token
     cook = served.client(token)
     cook.put_service("mine", graph("mine", "/srv/nav.launch"))

@@ -44,7 +44,7 @@ def test_a_queue_of_containers_grows_it_to_its_max_and_all_is_gone_when_they_hav
 def grow_and_shrink(core: Orchestrator, docker: DockerSite) -> None:
     spec = {"image": docker.images.toy, "needs": {"cpu": 1}, "params": {"type": "object"}}
     document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "toy"}, "spec": spec}
-    core.catalogue.put("toy", Manifest.model_validate(document))
+    core.catalog.put("toy", Manifest.model_validate(document))
     given = {key: value for key, value in docker.options().items() if key not in ("owner", "network")}
     options = {"runtime": "docker", "cpu": 1, "options": given}
     asked = GroupCreate(name="cloud", provider="local", options=options, max=MOST, grow_after_s=0, idle_s=1)

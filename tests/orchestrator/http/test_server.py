@@ -288,7 +288,7 @@ def test_a_second_orchestrator_over_the_same_folder_is_kept_out(programs: Any) -
     assert (first.folder / "address").exists()
 
 
-def test_a_catalogue_with_a_typo_is_one_sentence(programs: Any, manifest: Any, tmp_path: Path) -> None:
+def test_a_catalog_with_a_typo_is_one_sentence(programs: Any, manifest: Any, tmp_path: Path) -> None:
     (tmp_path / "cat").mkdir()
     typo = manifest(topics=[{"name": "a", "type": "b", "direction": "in", "prority": 3}])
     (tmp_path / "cat/mine.yaml").write_text(yaml.safe_dump(typo))

@@ -134,7 +134,7 @@ def test_what_a_process_reports_is_an_event_once_over_a_restart_of_the_orchestra
     toy = {"entrypoint": "skytether.testing.toy_service", "params": {"type": "object", "additionalProperties": True}}
     document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "toy"}, "spec": toy}
     with house(tmp_path) as core:
-        core.catalogue.put("toy", Manifest.model_validate(document))
+        core.catalog.put("toy", Manifest.model_validate(document))
         asked = InstanceCreate(robot="walker", service="toy", lease_s=600, params={"report": "\x1b[31mhere"})
         made = core.instances.create(OPERATOR, asked, None).id
         assert until_told(core, made, "\\x1b[31mhere") == [("said", "\\x1b[31mhere")]

@@ -41,7 +41,7 @@ def apply(
     token_file: TokenFile = None,
     json: Json = False,
 ) -> None:
-    """Make the catalogue's services as the files say: created, changed or left as they are. May be run again.
+    """Make the catalog's services as the files say: created, changed or left as they are. May be run again.
 
     All are looked at before the first is stored: if one is wrong, none is.
     """

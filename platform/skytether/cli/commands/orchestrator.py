@@ -84,7 +84,7 @@ def run(
         "port": port,
         "database_url": database,
         "secrets_dir": secrets_dir,
-        "catalogue_dir": catalog,
+        "catalog_dir": catalog,
         "stop_instances": stop_instances,
         "insecure_http": insecure_http,
         "open_metrics": open_metrics,

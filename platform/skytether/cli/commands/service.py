@@ -13,7 +13,7 @@ app = typer.Typer(help="What robots can ask for.", no_args_is_help=True)
 
 @app.command("list")
 def list_services(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
-    """List the catalogue."""
+    """List the catalog."""
     with connected(url, token_file) as client:
         found = client.services()
     if json:

@@ -166,11 +166,11 @@ class Quotas(Group):
     robots have more than they would have if all had the same."""
 
 
-class Catalog(Group):
+class CatalogScope(Group):
     """What a token with the scope `catalog` may have run; the one in the state folder may name anything."""
 
     modules: tuple[str, ...] = ()
-    """Python modules beside those of installed services and of `catalogue_dir`. At a site of processes they run on the
+    """Python modules beside those of installed services and of `catalog_dir`. At a site of processes they run on the
     orchestrator's machine; `skytether.service.ros1` starts whatever a launch file says."""
     images: tuple[str, ...] = ("*",)
     """Patterns of images, such as `registry.example/*`; each site may narrow them (its `images`)."""
@@ -271,7 +271,7 @@ class Settings(Group):
     secrets_dir: Path | None = None
     """Folder of `secret.key` and `operator.token`, the same for all orchestrators over one database; made (0700) where
     it is not there. None: the state folder. A token in a file `metrics.token` there has the scope `metrics`."""
-    catalogue_dir: Path | None = None
+    catalog_dir: Path | None = None
     """Folder of manifests (`*.yaml`, `*.yml`) beside the built-in ones."""
     sites_file: Path | None = None
     """YAML file of sites by their names, each with `tier`, `runtime`, `options` and what else it has. At the start they
@@ -309,7 +309,7 @@ class Settings(Group):
     """Bounds of what is kept and taken."""
     quotas: Quotas = Quotas()
     """How much one robot, service or site may have."""
-    catalog: Catalog = Catalog()
+    catalog: CatalogScope = CatalogScope()
     """What scope `catalog` may name."""
     weights: Weights = Weights()
     """What placement weighs."""
@@ -339,7 +339,7 @@ class Settings(Group):
             raise ValueError(f"write http://HOST:PORT or https://HOST:PORT, at most {MAX_ADDRESS} characters")
         return address
 
-    @field_validator("state_dir", "secrets_dir", "catalogue_dir", "sites_file")
+    @field_validator("state_dir", "secrets_dir", "catalog_dir", "sites_file")
     @classmethod
     def _anywhere(cls, path: Path | None) -> Path | None:
         return path.expanduser().absolute() if path else None

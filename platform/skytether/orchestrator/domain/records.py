@@ -54,7 +54,7 @@ class Record:
     service: str
     session_id: str
     manifest: dict[str, Any]
-    """As it was when the robot asked: a later change of the catalogue does not touch what runs."""
+    """As it was when the robot asked: a later change of the catalog does not touch what runs."""
     created_at: float
     lease_s: float
     lease_expires_at: float

@@ -39,7 +39,7 @@ from ..runtimes.containers import least_memory_mb
 from ..store.store import KeyReusedError, Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.reports import Reports
-from .catalogue import Catalogue
+from .catalog import Catalog
 from .moves import Moves, told
 from .placement import Decision
 from .reconcile import Reconciler
@@ -57,7 +57,7 @@ class Instances:
     def __init__(
         self,
         store: Store,
-        catalogue: Catalogue,
+        catalog: Catalog,
         sites: Sites,
         reconciler: Reconciler,
         moves: Moves,
@@ -71,7 +71,7 @@ class Instances:
     ) -> None:
         self._quotas = quotas
         self._store = store
-        self._catalogue = catalogue
+        self._catalog = catalog
         self._sites = sites
         self._reconciler = reconciler
         self._moves = moves
@@ -112,7 +112,7 @@ class Instances:
             self._wake_placer()
 
     def _new(self, asked: InstanceCreate) -> Record:
-        manifest = self._catalogue.get(asked.service)
+        manifest = self._catalog.get(asked.service)
         check_params(asked.params, manifest.spec.params, asked.service)
         now = self._clock()
         record = new_record(

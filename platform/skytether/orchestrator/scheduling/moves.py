@@ -21,7 +21,7 @@ from ..domain.errors import InvalidError
 from ..domain.records import Record, new_record
 from ..domain.validation import check_params
 from ..store.store import Store
-from .catalogue import Catalogue
+from .catalog import Catalog
 from .placement import UNSTARTED, Decision
 from .promises import Sums
 from .sites import Sites
@@ -54,7 +54,7 @@ class Moves:
     def __init__(
         self,
         store: Store,
-        catalogue: Catalogue,
+        catalog: Catalog,
         sites: Callable[[], Sites],
         weigh: Weigh,
         promised: Promised,
@@ -64,7 +64,7 @@ class Moves:
     ) -> None:
         """``clock`` gives seconds since the epoch."""
         self._store = store
-        self._catalogue = catalogue
+        self._catalog = catalog
         self._sites = sites
         self._weigh = weigh
         self._promised = promised
@@ -119,13 +119,13 @@ class Moves:
         """Start the spares that are missing, and end those that nobody would get."""
         now = self._clock()
         kept: dict[str, int] = {}
-        catalogue = {manifest.metadata.name: manifest for manifest in self._catalogue.all()}
+        catalog = {manifest.metadata.name: manifest for manifest in self._catalog.all()}
         spares = self._store.live_spares()
-        self.warms = bool(spares) or any(manifest.spec.needs.standby for manifest in catalogue.values())
+        self.warms = bool(spares) or any(manifest.spec.needs.standby for manifest in catalog.values())
         for spare in spares:
             if spare.state is State.STOPPING:
                 continue
-            manifest = catalogue.get(spare.service)
+            manifest = catalog.get(spare.service)
             wanted = manifest.spec.needs.standby if manifest else 0
             current = manifest is not None and _document(manifest) == spare.manifest
             if current and (self._stale(spare, now) or self._drains(spare) or self._leaving(spare)):
@@ -134,7 +134,7 @@ class Moves:
                 kept[spare.service] = kept.get(spare.service, 0) + 1
             else:
                 self._end(spare, now)
-        for name, manifest in catalogue.items():
+        for name, manifest in catalog.items():
             if kept.get(name, 0) < manifest.spec.needs.standby and now >= self._not_before.get(name, 0.0):
                 self._add_spare(manifest, now)
 

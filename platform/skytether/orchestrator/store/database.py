@@ -209,7 +209,7 @@ class Database:
         with self._reader.connect() as connection:
             connection.execute(text("SELECT 1"))
 
-    # Catalogue
+    # Catalog
 
     def services(self) -> dict[str, dict[str, Any]]:
         """Manifests that were put, by name."""

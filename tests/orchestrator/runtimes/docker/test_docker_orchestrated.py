@@ -45,7 +45,7 @@ class House:
         self.core.sites.delete("local")
         toy = {"image": docker.images.toy, "params": {"type": "object", "additionalProperties": True}}
         document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "toy"}, "spec": toy}
-        self.core.catalogue.put("toy", Manifest.model_validate(document))
+        self.core.catalog.put("toy", Manifest.model_validate(document))
 
     def _open(self) -> Orchestrator:
         core = Orchestrator(Settings(state_dir=self.folder), find_runtime=find)
@@ -58,9 +58,9 @@ class House:
 
     def needs_device(self, path: str) -> None:
         """From now on the toy, which any kind of site can run, needs one."""
-        toy = self.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
+        toy = self.core.catalog.get("toy").model_dump(mode="json", by_alias=True)
         toy["spec"] |= {"entrypoint": "skytether.testing.toy_service", "needs": {"devices": [path]}}
-        self.core.catalogue.put("toy", Manifest.model_validate(toy))
+        self.core.catalog.put("toy", Manifest.model_validate(toy))
 
     def end(self, instance: str) -> None:
         self.core.instances.delete(OPERATOR, instance)

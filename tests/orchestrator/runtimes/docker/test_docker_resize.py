@@ -76,7 +76,7 @@ class House:
         toy = {"image": docker.images.toy, "params": {"type": "object", "additionalProperties": True}}
         toy |= {"needs": {"cpu": 0.5, "memory_mb": 128}}
         document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "toy"}, "spec": toy}
-        self.core.catalogue.put("toy", Manifest.model_validate(document))
+        self.core.catalog.put("toy", Manifest.model_validate(document))
 
     def _open(self) -> Orchestrator:
         core = Orchestrator(Settings(state_dir=self.folder), find_runtime=find)
@@ -190,10 +190,10 @@ def test_a_change_by_somebody_else_is_overruled(house: House) -> None:
 
 
 def test_an_instance_that_is_busy_gets_more_within_its_bounds(house: House) -> None:
-    toy = house.core.catalogue.get("toy").model_dump(mode="json", by_alias=True)
+    toy = house.core.catalog.get("toy").model_dump(mode="json", by_alias=True)
     # Little, for the machine may be busy with other things: what a container does not get it does not use.
     toy["spec"]["needs"] |= {"cpu": 0.05, "scaling": {"cpu": {"min": 0.05, "max": 0.2}}}
-    house.core.catalogue.put("toy", Manifest.model_validate(toy))
+    house.core.catalog.put("toy", Manifest.model_validate(toy))
     instance = house.ask()
     (container,) = house.docker.containers()
     docker("exec", "-d", container, "sh", "-c", "while :; do :; done & while :; do :; done")

@@ -9,20 +9,20 @@ from skytether.api.rest import CHANGE, Change
 
 from .deps import PREFIX, Caller, CatalogOperator, Core, says
 
-router = APIRouter(prefix=f"{PREFIX}/catalog", tags=["catalogue"], responses=says(401))
+router = APIRouter(prefix=f"{PREFIX}/catalog", tags=["catalog"], responses=says(401))
 
 
 @router.get("")
 def list_services(core: Core, caller: Caller) -> list[Manifest]:
     """All services; a robot sees those that it may ask for."""
-    return [manifest for manifest in core.catalogue.all() if caller.may_use(manifest.metadata.name)]
+    return [manifest for manifest in core.catalog.all() if caller.may_use(manifest.metadata.name)]
 
 
 @router.get("/{service}", responses=says(403, 404))
 def get_service(core: Core, caller: Caller, service: str) -> Manifest:
     """One service's manifest."""
     caller.require(caller.robot or "", service)
-    return core.catalogue.get(service)
+    return core.catalog.get(service)
 
 
 @router.put("/{service}", responses={201: {"model": Manifest, "description": "It is new"}, **says(403, 422)})
@@ -33,7 +33,7 @@ def put_service(
 
     With `dry_run` it is only looked at: the answer is the same, but the status is never 201.
     """
-    change = core.catalogue.put(service, manifest, dry_run=dry_run, by_owner=caller.owns_state)
+    change = core.catalog.put(service, manifest, dry_run=dry_run, by_owner=caller.owns_state)
     response.headers[CHANGE] = change
     if change is Change.CREATED and not dry_run:
         response.status_code = 201
@@ -43,5 +43,5 @@ def put_service(
 @router.delete("/{service}", status_code=204, responses=says(403, 409))
 def delete_service(core: Core, _: CatalogOperator, service: str) -> None:
     """Remove a service that was put; its instances run on."""
-    core.catalogue.delete(service)
+    core.catalog.delete(service)
     core.metrics.forget_service(service)

@@ -10,7 +10,7 @@ import yaml
 
 from skytether.api.rest import Change
 from skytether.orchestrator.domain.errors import ConflictError, InvalidError, NotFoundError
-from skytether.orchestrator.scheduling.catalogue import Catalogue, parse_manifest, read_builtin, read_folder
+from skytether.orchestrator.scheduling.catalog import Catalog, parse_manifest, read_builtin, read_folder
 from skytether.orchestrator.store.store import Store
 
 
@@ -89,31 +89,31 @@ def test_what_was_put_goes_before_the_folder_and_uncovers_it_when_deleted(
     tmp_path: Path, store: Store, manifest: Any
 ) -> None:
     (tmp_path / "a.yaml").write_text(yaml.safe_dump(manifest("a", entrypoint="folder")))
-    catalogue = Catalogue(store)
-    catalogue.load(tmp_path)
-    assert catalogue.put("a", parse_manifest(manifest("a", entrypoint="folder"))) is Change.UNCHANGED
+    catalog = Catalog(store)
+    catalog.load(tmp_path)
+    assert catalog.put("a", parse_manifest(manifest("a", entrypoint="folder"))) is Change.UNCHANGED
     changed = parse_manifest(manifest("a", entrypoint="put"))
-    assert catalogue.put("a", changed, dry_run=True) is Change.CHANGED
-    assert catalogue.get("a").spec.entrypoint == "folder"
-    assert catalogue.put("a", changed) is Change.CHANGED
-    assert catalogue.put("a", changed) is Change.UNCHANGED
-    assert catalogue.put("b", parse_manifest(manifest("b")), dry_run=True) is Change.CREATED
-    assert catalogue.put("b", parse_manifest(manifest("b"))) is Change.CREATED
-    assert catalogue.get("a").spec.entrypoint == "put"
-    assert {"a", "b"} <= {m.metadata.name for m in catalogue.all()}
-    catalogue.delete("a")
-    assert catalogue.get("a").spec.entrypoint == "folder"
-    with pytest.raises(ConflictError, match="built in or comes from the catalogue folder"):
-        catalogue.delete("a")
-    catalogue.delete("b")
-    catalogue.delete("b")
+    assert catalog.put("a", changed, dry_run=True) is Change.CHANGED
+    assert catalog.get("a").spec.entrypoint == "folder"
+    assert catalog.put("a", changed) is Change.CHANGED
+    assert catalog.put("a", changed) is Change.UNCHANGED
+    assert catalog.put("b", parse_manifest(manifest("b")), dry_run=True) is Change.CREATED
+    assert catalog.put("b", parse_manifest(manifest("b"))) is Change.CREATED
+    assert catalog.get("a").spec.entrypoint == "put"
+    assert {"a", "b"} <= {m.metadata.name for m in catalog.all()}
+    catalog.delete("a")
+    assert catalog.get("a").spec.entrypoint == "folder"
+    with pytest.raises(ConflictError, match="built in or comes from the catalog folder"):
+        catalog.delete("a")
+    catalog.delete("b")
+    catalog.delete("b")
     with pytest.raises(NotFoundError, match="there is no service 'b'; known are: a, "):
-        catalogue.get("b")
+        catalog.get("b")
 
 
 def test_a_service_is_put_under_its_own_name_with_a_schema_that_is_one(store: Store, manifest: Any) -> None:
-    catalogue = Catalogue(store)
+    catalog = Catalog(store)
     with pytest.raises(InvalidError, match=r"metadata\.name: is 'a', but the address says 'b'"):
-        catalogue.put("b", parse_manifest(manifest("a")))
+        catalog.put("b", parse_manifest(manifest("a")))
     with pytest.raises(InvalidError, match=r"spec\.params\.type"):
         parse_manifest(manifest("a", params={"type": "objekt"}))

@@ -15,7 +15,7 @@ from skytether.api.manifest import Manifest
 from skytether.api.rest import Change
 from skytether.api.yaml import YamlError, read_yaml
 
-from ..config.settings import Catalog as Allowed
+from ..config.settings import CatalogScope as Allowed
 from ..domain.errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from ..domain.validation import check_schema, parse
 from ..store.store import Store
@@ -103,7 +103,7 @@ def _manifest_path(point: EntryPoint) -> Path:
     return Path(next(iter(spec.submodule_search_locations))) / MANIFEST
 
 
-class Catalogue:
+class Catalog:
     """All services by name."""
 
     def __init__(self, store: Store, allowed: Allowed | None = None) -> None:
@@ -207,4 +207,4 @@ class Catalogue:
         if name in self._store.services():
             self._store.delete_service(name)
         elif name in self._fixed:
-            raise ConflictError(f"service '{name}' is built in or comes from the catalogue folder: it is removed there")
+            raise ConflictError(f"service '{name}' is built in or comes from the catalog folder: it is removed there")
