@@ -21,7 +21,7 @@ from .access.stored import Stored
 from .config.declared import read_groups, read_sites
 from .config.settings import Settings
 from .domain.accounts import Account
-from .domain.clocks import SharedClock
+from .domain.clock_jump import SharedClock
 from .domain.discovery import advertised, named, targets
 from .domain.errors import OutdatedError
 from .domain.security import SecretFileError, Secrets, close_folder

@@ -14,7 +14,7 @@ from reconcile_bench import Bench, add
 from sqlalchemy import text
 
 from skytether.api.rest import State
-from skytether.orchestrator.domain.clocks import SharedClock
+from skytether.orchestrator.domain.clock_jump import SharedClock
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.store.db import make_engine, migrate
 from skytether.orchestrator.store.leader import LEASE, Leadership, LeadLostError, Lock, fenced

@@ -19,7 +19,7 @@ from skytether.api.rest import Measurement, Refusal, Size, State
 from ..access.stored import Stored
 from ..config.settings import Limits, Timing, Weights
 from ..domain.accounts import of_instance, of_run
-from ..domain.clocks import SetClock
+from ..domain.clock_jump import ClockJump
 from ..domain.records import Change, Record
 from ..domain.security import SecretFileError, Secrets
 from ..domain.strain import Strain
@@ -117,7 +117,7 @@ class Reconciler:
         self._lead = lead
         self._steady = steady
         self._clock_lock = threading.Lock()
-        self._set_clock = SetClock(clock(), steady())
+        self._clock_jump = ClockJump(clock(), steady())
         self._times_set = 0
         """How often the clock was set: what was read before the last time is dated by another one."""
         self._settles_at = -math.inf
@@ -210,7 +210,7 @@ class Reconciler:
         """The time. Was the clock set, all leases count anew first: nobody can say how old they are."""
         with self._clock_lock:
             now, steady = self._clock(), self._steady()
-            by = self._set_clock.set_by(now, steady)
+            by = self._clock_jump.set_by(now, steady)
             if by:
                 if self._leads():
                     self._store.extend_leases(now)
@@ -231,7 +231,7 @@ class Reconciler:
                 self._store.extend_leases(now)
                 self._times_set += 1
                 log.warning("robots could not renew for a while, for want of room or of time: leases count anew")
-            self._set_clock.accept(now, steady)
+            self._clock_jump.accept(now, steady)
             return now
 
     # What has no site yet

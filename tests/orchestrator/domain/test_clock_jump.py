@@ -15,7 +15,7 @@ from reconcile_bench import Bench, add
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
 from skytether.orchestrator.config.settings import Limits
-from skytether.orchestrator.domain.clocks import SetClock, SharedClock
+from skytether.orchestrator.domain.clock_jump import ClockJump, SharedClock
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.store.store import Store
 from skytether.testing.runtimes import CrashingRuntime, NeverReadyRuntime
@@ -27,7 +27,7 @@ either_way = pytest.mark.parametrize("by", [HOURS, -HOURS], ids=["forward", "bac
 
 
 def test_a_clock_that_was_set_is_told_from_one_that_goes_by() -> None:
-    clock = SetClock(1000, 10)
+    clock = ClockJump(1000, 10)
     assert clock.set_by(2000, 1010) == 0
     clock.accept(2000, 1010)
     assert clock.set_by(2005.9, 1015) == 0, "slewed"

@@ -11,7 +11,7 @@ _SET = 1.0
 """Seconds: a clock that is off by more since the last look was set, or its machine slept; slewing stays below."""
 
 
-class SetClock:
+class ClockJump:
     """Tells by how much the wall clock was set."""
 
     def __init__(self, wall: float, steady: float) -> None:
@@ -47,7 +47,7 @@ class SharedClock:
         self._steady = steady
         self._own = own
         self._offset = own() - steady()
-        self._told = SetClock(0.0, 0.0)
+        self._told = ClockJump(0.0, 0.0)
 
     def __call__(self) -> float:
         """Seconds since the epoch."""
