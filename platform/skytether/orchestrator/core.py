@@ -20,8 +20,8 @@ from .access.rotation import Rotation
 from .access.stored import Stored
 from .config.declared import read_groups, read_sites
 from .config.settings import Settings
-from .domain.accounts import Account
 from .domain.clock_jump import SharedClock
+from .domain.counter_totals import CounterTotals
 from .domain.discovery import advertised, named, targets
 from .domain.errors import OutdatedError
 from .domain.security import SecretFileError, Secrets, close_folder
@@ -411,7 +411,7 @@ class Orchestrator:
     def _gates(self) -> dict[str, GateReport]:
         return self.gates.fresh() if self.leadership.leads else {}
 
-    def _accounts(self) -> dict[Owner, Account]:
+    def _accounts(self) -> dict[Owner, CounterTotals]:
         return self.store.accounts() if self.leadership.leads else {}
 
     def _site_gauges(self) -> list[SiteGauges]:

@@ -12,7 +12,7 @@ from skytether.api.groups import Stage
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import Refusal, Report, Size, TopicReport
 from skytether.api.service_report import ServiceReport
-from skytether.orchestrator.domain.accounts import Account, of_robot, of_run
+from skytether.orchestrator.domain.counter_totals import CounterTotals, of_robot, of_run
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.runtimes.base import Capacity, Observation, Phase
 from skytether.orchestrator.telemetry.metrics import GroupGauges, Metrics, Running, SiteGauges
@@ -43,12 +43,12 @@ def record_with(new_record: NewRecord, manifest: Any, *topics: str, **changes: A
 def reported(running: list[Running], max_topics: int = 64) -> tuple[Metrics, Callable[[Record, Report], None]]:
     """Metrics, and what takes a robot's report as the orchestrator does."""
     reports: dict[str, Report] = {}
-    accounts: dict[tuple[str, str], Account] = {}
+    accounts: dict[tuple[str, str], CounterTotals] = {}
     metrics = Metrics(lambda: running, max_topics, reports=lambda: reports, accounts=lambda: deepcopy(accounts))
 
     def report(record: Record, told: Report) -> None:
         kept = reports[record.id] = metrics.bounded(record, told)
-        accounts.setdefault((record.robot, record.service), Account()).merge(of_robot(told), counts_of(kept))
+        accounts.setdefault((record.robot, record.service), CounterTotals()).merge(of_robot(told), counts_of(kept))
 
     return metrics, report
 
@@ -259,7 +259,7 @@ def test_calls_are_reported_by_their_two_topics(new_record: NewRecord, manifest:
 
 def test_what_runs_used_and_how_often_they_began_anew_goes_on_over_restarts(new_record: NewRecord) -> None:
     where = 'robot="walker",service="toy",site="lab"'
-    account = Account()
+    account = CounterTotals()
     running = [Running(new_record(site="lab"), Observation(1, Phase.RUNNING, cpu_s=5.0))]
     metrics = Metrics(lambda: running, 64, accounts=lambda: {("walker", "toy"): deepcopy(account)})
 

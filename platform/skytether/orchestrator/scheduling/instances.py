@@ -28,7 +28,7 @@ from skytether.api.rest import (
 
 from ..access.access import Principal
 from ..access.quotas import Quotas
-from ..domain.accounts import of_robot
+from ..domain.counter_totals import of_robot
 from ..domain.errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from ..domain.records import Record, new_record
 from ..domain.security import SecretFileError, Secrets

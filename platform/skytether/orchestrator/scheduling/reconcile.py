@@ -18,8 +18,8 @@ from skytether.api.rest import Measurement, Refusal, Size, State
 
 from ..access.stored import Stored
 from ..config.settings import Limits, Timing, Weights
-from ..domain.accounts import of_instance, of_run
 from ..domain.clock_jump import ClockJump
+from ..domain.counter_totals import of_instance, of_run
 from ..domain.records import Change, Record
 from ..domain.security import SecretFileError, Secrets
 from ..domain.strain import Strain

@@ -39,7 +39,7 @@ from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import State
 from skytether.api.service_report import ServiceReport
 
-from ..domain.accounts import MOST_NAMES, Account, merge
+from ..domain.counter_totals import MOST_NAMES, CounterTotals, merge
 from ..domain.discovery import NAME
 from ..domain.records import Change, Record
 from .group_store import GroupStore
@@ -494,10 +494,12 @@ class Store(GroupStore):
         connection.execute(_KEEP_ACCOUNT, rows)
         return beyond
 
-    def accounts(self) -> dict[tuple[str, str], Account]:
+    def accounts(self) -> dict[tuple[str, str], CounterTotals]:
         """What is known, by robot and service."""
         with self._reader.connect() as connection:
-            return {(row.robot, row.service): Account(row.account) for row in connection.execute(select(accounts))}
+            return {
+                (row.robot, row.service): CounterTotals(row.account) for row in connection.execute(select(accounts))
+            }
 
     def extend_leases(self, now: float, *, at_least: bool = False) -> None:
         """Give every live instance its whole lease from now, no less and no more; spares keep theirs, which never ends.

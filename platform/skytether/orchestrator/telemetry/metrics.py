@@ -19,7 +19,7 @@ from skytether.api.report_metrics import INSTANCE, Counts, Described, Owner, cou
 from skytether.api.rest import GateReport, Refusal, Report, Size
 
 from ..access.quotas import Quotas, use_by_robot
-from ..domain.accounts import Account, of_instance, of_run
+from ..domain.counter_totals import CounterTotals, of_instance, of_run
 from ..domain.records import Record
 from ..runtimes.base import Capacity, Observation
 
@@ -74,7 +74,7 @@ class Metrics:
         max_topics: int,
         sites: Callable[[], Iterable[SiteGauges]] = tuple,
         reports: Callable[[], Mapping[str, Report]] = dict,
-        accounts: Callable[[], Mapping[Owner, Account]] = dict,
+        accounts: Callable[[], Mapping[Owner, CounterTotals]] = dict,
         gates: Callable[[], Mapping[str, GateReport]] = dict,
         quotas: Quotas | None = None,
         epoch: Callable[[], int] = int,
@@ -206,11 +206,11 @@ class Metrics:
         running = list(self._running())
         # After the look at what runs: a run's use is in the account before the run is seen no more.
         accounts, known = dict(self._accounts()), self._reports()
-        counted: dict[Owner, Account] = {}
+        counted: dict[Owner, CounterTotals] = {}
         places = set()
         for one in running:
             owner = (one.record.robot, one.record.service)
-            account = counted.setdefault(owner, accounts.get(owner) or Account())
+            account = counted.setdefault(owner, accounts.get(owner) or CounterTotals())
             account.merge(*of_instance(one.record))
             if one.observation:
                 account.merge(*of_run(one.record, one.observation))
@@ -249,7 +249,7 @@ def _known_topics(report: Report, counted: Counts) -> Report:
     return report.model_copy(update={"topics": tuple(topics)})
 
 
-def _names(accounts: Mapping[Owner, Account], robots: Container[str]) -> Family:
+def _names(accounts: Mapping[Owner, CounterTotals], robots: Container[str]) -> Family:
     names = Sums()
     for (robot, _), account in accounts.items():
         if robot in robots:

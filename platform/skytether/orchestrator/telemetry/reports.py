@@ -51,7 +51,7 @@ class Reports:
             now: Seconds since the epoch.
             report: Instead of the one before.
             life: Whose counting it is.
-            counts: What is counted by now: see `accounts.Account.merge`.
+            counts: What is counted by now: see `accounts.CounterTotals.merge`.
         """
         with self._taking:
             before = self._heard.get(record.id)

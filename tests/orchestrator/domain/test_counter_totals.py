@@ -8,25 +8,25 @@ from random import Random
 from typing import Any
 
 from skytether.api.rest import State
-from skytether.orchestrator.domain.accounts import Account
+from skytether.orchestrator.domain.counter_totals import CounterTotals
 from skytether.orchestrator.store.store import Store
 
 KEY = ("topic_messages", "scan", "64", "in", "sent")
 
 
-def sent(account: Account) -> float:
+def sent(account: CounterTotals) -> float:
     return account.sums().get(KEY, 0)
 
 
 def test_a_report_that_comes_twice_or_late_changes_nothing() -> None:
-    account = Account()
+    account = CounterTotals()
     for value in (10, 20, 20, 10, 30, 20):
         account.merge("robot:a", {KEY: value})
     assert sent(account) == 30
 
 
 def test_a_program_that_is_started_anew_adds_to_what_was_counted_before() -> None:
-    account = Account()
+    account = CounterTotals()
     account.merge("robot:a", {KEY: 1000})
     account.merge("robot:b", {KEY: 1500})  # more than the one before at its first report: no reset to be seen
     account.merge("robot:a", {KEY: 1010})  # a report that was on its way
@@ -35,7 +35,7 @@ def test_a_program_that_is_started_anew_adds_to_what_was_counted_before() -> Non
 
 def test_no_sum_ever_goes_down_and_in_the_end_it_is_that_of_the_lives() -> None:
     random = Random(1)
-    account, truth, before = Account(), {}, 0.0
+    account, truth, before = CounterTotals(), {}, 0.0
     for life in range(30):
         counting = [random.randrange(1, 50) for _ in range(20)]
         told = [sum(counting[: n + 1]) for n in range(20)]
@@ -44,7 +44,7 @@ def test_no_sum_ever_goes_down_and_in_the_end_it_is_that_of_the_lives() -> None:
         last = [told[-1]]
         for value in [*told[:-1:3], *late, *last, *late]:
             account.merge(f"robot:{life}", {KEY: value})
-            account = Account(json.loads(json.dumps(account.document())))
+            account = CounterTotals(json.loads(json.dumps(account.document())))
             assert sent(account) >= before
             before = sent(account)
     assert sent(account) == sum(truth.values())
@@ -52,7 +52,7 @@ def test_no_sum_ever_goes_down_and_in_the_end_it_is_that_of_the_lives() -> None:
 
 
 def test_names_beyond_the_room_are_refused_and_old_ones_go_on() -> None:
-    account = Account()
+    account = CounterTotals()
     account.merge("robot:a", {KEY: 1})
     refused = [account.merge("robot:a", {("fallback_transitions", f"r{n}"): 1, KEY: n}) for n in range(600)]
     assert refused == [0] * 255 + [1] * 345

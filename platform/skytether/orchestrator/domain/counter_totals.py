@@ -1,6 +1,6 @@
 """What was counted of one robot and service, over all programs and runs that counted it. Pure.
 
-Each of them counts from zero; an account keeps the highest value of each counter of each life, and its sum over lives
+Each of them counts from zero; a total keeps the highest value of each counter of each life, and its sum over lives
 is what is exported. So a report that comes twice, late or after a newer one changes nothing, a robot or service that is
 restarted adds to what was counted before, and no sum goes down (a grow-only counter: Shapiro et al., INRIA 2011).
 """
@@ -29,7 +29,7 @@ _OF_REASONS = ("fallback_transitions", "control_objections")
 Name = tuple[str, ...]
 
 
-class Account:
+class CounterTotals:
     """The counters of one robot and service."""
 
     def __init__(self, kept: Mapping[str, Any] | None = None) -> None:
@@ -98,7 +98,7 @@ class Account:
 
 def merge(
     kept: Mapping[Owner, Mapping[str, Any]], counted: Mapping[Owner, Iterable[tuple[str, Counts]]], names: int
-) -> tuple[dict[Owner, Account], Counter[str]]:
+) -> tuple[dict[Owner, CounterTotals], Counter[str]]:
     """Take what robots have counted by now.
 
     Args:
@@ -109,12 +109,12 @@ def merge(
     Returns:
         The accounts of ``counted``, and by robot how many names were beyond that.
     """
-    merged = {owner: Account(kept[owner]) for owner in counted}
+    merged = {owner: CounterTotals(kept[owner]) for owner in counted}
     beyond: Counter[str] = Counter()
 
     def room(owner: Owner) -> int:
         others = [other for other in kept if other[0] == owner[0] and other != owner]
-        return names - sum(len((merged.get(other) or Account(kept[other])).names()) for other in others)
+        return names - sum(len((merged.get(other) or CounterTotals(kept[other])).names()) for other in others)
 
     for owner, account in merged.items():
         for life, counts in counted[owner]:
