@@ -15,9 +15,9 @@ from skytether.api.rest import GateReport, Report, ScrapeTargets
 from skytether.guard.clock import now as boottime
 
 from .access.access import Access, Principal
+from .access.disk_usage import DiskUsage
 from .access.quotas import Quotas
 from .access.rotation import Rotation
-from .access.stored import Stored
 from .config.declared import read_groups, read_sites
 from .config.settings import Settings
 from .domain.clock_jump import SharedClock
@@ -94,8 +94,8 @@ class Orchestrator:
         self.store.key_id = lambda: secrets.fingerprint
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
-        self.stored = Stored(lambda: self.sites.stored(), settings.quotas, lambda site: self.sites.hosted(site))
-        self.quotas = Quotas(self.store, settings.quotas, self.stored)
+        self.disk_usage = DiskUsage(lambda: self.sites.stored(), settings.quotas, lambda site: self.sites.hosted(site))
+        self.quotas = Quotas(self.store, settings.quotas, self.disk_usage)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.exchange = Exchange(self.store, clock)
@@ -130,7 +130,7 @@ class Orchestrator:
             self.leadership,
             strain=self.strain,
             site_instances=settings.quotas.site_instances,
-            stored=self.stored,
+            disk_usage=self.disk_usage,
             left=self.quotas.left,
         )
         self.sites = Sites(

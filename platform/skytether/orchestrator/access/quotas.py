@@ -16,7 +16,7 @@ from ..domain.errors import Fault, InvalidError, QuotaError, TooManyError
 from ..domain.records import Record
 from ..store.store import Store
 from .access import Principal
-from .stored import Stored, mb
+from .disk_usage import DiskUsage, mb
 
 log = logging.getLogger(__name__)
 
@@ -59,9 +59,9 @@ def use_by_robot(records: Iterable[Record]) -> dict[str, RobotUse]:
 class Quotas:
     """Refuses what is too much. Safe from any thread."""
 
-    def __init__(self, store: Store, settings: Settings, stored: Stored | None = None) -> None:
+    def __init__(self, store: Store, settings: Settings, disk_usage: DiskUsage | None = None) -> None:
         self.settings = settings
-        self._stored = stored
+        self._disk_usage = disk_usage
         self._store = store
         self._admitting = threading.Lock()
         self._counting = threading.Lock()
@@ -118,7 +118,7 @@ class Quotas:
         yield Bound("robot_instances", whose, "instances", use.instances + 1, most.robot_instances)
         yield Bound("robot_cpu", whose, "cores", use.cpu + needs.cpu, most.robot_cpu)
         yield Bound("robot_memory_mb", whose, "MiB of memory", use.memory_mb + needs.memory_mb, most.robot_memory_mb)
-        data = mb(self._stored.of(record.robot)) if self._stored is not None else 0
+        data = mb(self._disk_usage.of(record.robot)) if self._disk_usage is not None else 0
         advice = "delete what is not needed"
         yield Bound("robot_data_mb", whose, "MiB of data", data, most.robot_data_mb, advice)
         there = self._store.count_live(record.service) + 1
@@ -178,11 +178,11 @@ class Quotas:
 
     def data(self) -> Mapping[str, int]:
         """Bytes on disk by robot, at all sites, as far as they are known."""
-        return self._stored.by_robot() if self._stored is not None else {}
+        return self._disk_usage.by_robot() if self._disk_usage is not None else {}
 
     def data_at(self) -> Mapping[str, int]:
         """The same by site."""
-        return self._stored.by_site() if self._stored is not None else {}
+        return self._disk_usage.by_site() if self._disk_usage is not None else {}
 
     def streams(self) -> dict[str, int]:
         """Logs and events that robots follow here, by robot."""

@@ -16,7 +16,7 @@ from typing import Any
 from skytether.api.grant import Grant
 from skytether.api.rest import Measurement, Refusal, Size, State
 
-from ..access.stored import Stored
+from ..access.disk_usage import DiskUsage
 from ..config.settings import Limits, Timing, Weights
 from ..domain.clock_jump import ClockJump
 from ..domain.counter_totals import of_instance, of_run
@@ -93,17 +93,17 @@ class Reconciler:
         steady: Callable[[], float] = time.monotonic,
         strain: Strain | None = None,
         site_instances: int = sys.maxsize,
-        stored: Stored | None = None,
+        disk_usage: DiskUsage | None = None,
         left: Callable[[str], Size] = lambda _: _PLENTY,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
         While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``, and
-        nothing more where ``stored`` says that it is full. ``left``: what a robot may have beside what it has.
+        nothing more where ``disk_usage`` says that it is full. ``left``: what a robot may have beside what it has.
         """
         self._resizing = Resizing(store, metrics, lambda: self.moves, self._room, left, self.note, steady)
         self._site_instances = site_instances
-        self._stored = stored
+        self._disk_usage = disk_usage
         self._strain = strain or Strain(steady)
         self._service_events = ServiceEvents(store, steady)
         self._store = store
@@ -336,8 +336,8 @@ class Reconciler:
             for site in allowed
         ]
         most = self._site_instances
-        if self._stored is not None:
-            full = self._stored.full()
+        if self._disk_usage is not None:
+            full = self._disk_usage.full()
             sites = [replace(s, full=full[s.name]) if s.name in full else s for s in sites]
         sites = [
             replace(s, full=f"{there} instances are there, and {most} may be (quotas.site_instances)")
@@ -518,9 +518,9 @@ class Reconciler:
         self, site: Site, live: Sequence[Record], looked: Mapping[str, Observation]
     ) -> Mapping[str, Observation]:
         """What was seen, with those marked that belong to a robot with too much data."""
-        if self._stored is None:
+        if self._disk_usage is None:
             return looked
-        too_much = self._stored.too_much(site.name)
+        too_much = self._disk_usage.too_much(site.name)
         marked = {
             r.id: replace(looked[r.id], exceeds=too_much[r.robot])
             for r in live

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from ..config.settings import Quotas
 
 
-class Stored:
+class DiskUsage:
     """Data on disk by site and robot. Pure but for what it asks."""
 
     def __init__(

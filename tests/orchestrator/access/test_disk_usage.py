@@ -10,7 +10,7 @@ import pytest
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, RobotCreate, State
-from skytether.orchestrator.access.stored import Stored
+from skytether.orchestrator.access.disk_usage import DiskUsage
 from skytether.orchestrator.config.settings import Quotas
 from skytether.orchestrator.runtimes.docker.objects import stored_by_robot
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
@@ -22,7 +22,7 @@ ASK = InstanceCreate(robot="walker", service="toy", lease_s=60)
 
 def test_a_robot_is_bounded_over_all_sites_and_the_first_byte_beyond_is_one() -> None:
     weighed = {"edge": {"walker": 6 * MB, "runner": MB}, "cloud": {"walker": 4 * MB}}
-    stored = Stored(lambda: weighed, Quotas(robot_data_mb=10, site_data_mb=100))
+    stored = DiskUsage(lambda: weighed, Quotas(robot_data_mb=10, site_data_mb=100))
     assert stored.by_robot() == {"walker": 10 * MB, "runner": MB}
     assert stored.by_site() == {"edge": 7 * MB, "cloud": 4 * MB}
     assert stored.too_much("edge") == stored.too_much("none") == stored.full() == {}
@@ -33,7 +33,7 @@ def test_a_robot_is_bounded_over_all_sites_and_the_first_byte_beyond_is_one() ->
 
 def test_at_a_full_site_those_end_who_have_more_than_their_share() -> None:
     weighed = {"edge": {"walker": 7 * MB, "runner": 4 * MB, "sitter": MB}}
-    stored = Stored(lambda: weighed, Quotas(site_data_mb=12))
+    stored = DiskUsage(lambda: weighed, Quotas(site_data_mb=12))
     assert stored.full() == stored.too_much("edge") == {}
     weighed["edge"]["sitter"] += MB
     assert stored.full() == {"edge": "13 MiB of data are there, and 12 may be (quotas.site_data_mb)"}
@@ -44,7 +44,7 @@ def test_at_a_full_site_those_end_who_have_more_than_their_share() -> None:
 def test_of_robots_that_had_nothing_there_the_word_of_a_machine_that_joined_counts_nowhere_else() -> None:
     """It says of a robot that never was there that it has written too much: wherever that ran, it was ended."""
     weighed = {"ours": {"walker": 6 * MB}, "theirs": {"walker": 1000 * MB, "runner": 11 * MB, "made-up": MB}}
-    stored = Stored(
+    stored = DiskUsage(
         lambda: weighed,
         Quotas(robot_data_mb=10, site_data_mb=10_000),
         lambda site: frozenset({"runner"}) if site == "theirs" else None,
@@ -63,7 +63,7 @@ def test_however_many_robots_there_are_sites_are_asked_once() -> None:
         asked.append(1)
         return {site: {f"r{n}": 3 * MB for n in range(100)} for site in ("edge", "cloud", "fog")}
 
-    stored = Stored(weighed, Quotas(robot_data_mb=8, site_data_mb=200))
+    stored = DiskUsage(weighed, Quotas(robot_data_mb=8, site_data_mb=200))
     assert (len(stored.too_much("edge")), len(asked)) == (100, 1)
     assert (len(stored.full()), len(asked)) == (3, 2)
 
@@ -73,8 +73,8 @@ def test_robots_are_listed_by_one_look(served_with: Any, monkeypatch: pytest.Mon
     for n in range(5):
         served.operator.create_robot(RobotCreate(name=f"r{n}"))
     looks = []
-    monkeypatch.setattr(Stored, "by_robot", lambda _: looks.append(1) or {"r3": MB})
-    monkeypatch.setattr(Stored, "of", None)
+    monkeypatch.setattr(DiskUsage, "by_robot", lambda _: looks.append(1) or {"r3": MB})
+    monkeypatch.setattr(DiskUsage, "of", None)
     assert {one.name: one.use.data_mb for one in served.operator.robots()}["r3"] == 1
     assert len(looks) == 1
 
