@@ -15,9 +15,9 @@ from referencing.jsonschema import DRAFT202012
 
 from skytether.api.faults import MAX_FAULTS, Fault, explain, unknown
 
-from .effort import UNUSABLE, EffortError, Validator, bounded
 from .errors import InvalidError
 from .patterns import PatternError, wrong_with
+from .validation_budget import UNUSABLE, BudgetError, Validator, bounded
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -123,7 +123,7 @@ def check_params(params: Mapping[str, Any], schema: Mapping[str, Any], service: 
         raise InvalidError([Fault("spec.params", f"{error}: correct the manifest")], service) from None
     except ValueError:
         raise InvalidError([Fault("spec.params", f"{_NO_ADDRESS}: correct the manifest")], service) from None
-    except EffortError as error:
+    except BudgetError as error:
         text = f"{error}: give fewer of them, or let the manifest's schema say less"
         raise InvalidError([Fault("params", text)], f"service '{service}'") from None
     except RecursionError:

@@ -42,11 +42,11 @@ UNUSABLE = {"unevaluatedProperties": "additionalProperties", "unevaluatedItems":
 _Check = Callable[[Any, Any, Any, Any], Iterator[ValidationError] | None]
 
 
-class EffortError(Exception):
+class BudgetError(Exception):
     """A check would take more steps than it may."""
 
 
-class _Effort:
+class _Budget:
     """Steps that are left to one check."""
 
     def __init__(self, document: Any) -> None:
@@ -57,7 +57,7 @@ class _Effort:
     def take(self, steps: int) -> None:
         self.left -= steps
         if self.left < 0:
-            raise EffortError(f"take more than {self.steps} steps to check")
+            raise BudgetError(f"take more than {self.steps} steps to check")
 
     def size(self, value: Any) -> int:
         """Of a part of the document."""
@@ -72,7 +72,7 @@ class _Effort:
         return size
 
 
-_effort: ContextVar[_Effort | None] = ContextVar("_effort", default=None)
+_budget: ContextVar[_Budget | None] = ContextVar("_budget", default=None)
 """Of the check that runs; none: it is one of ours, with as many steps as it needs."""
 
 
@@ -81,13 +81,13 @@ def bounded(document: Any) -> Iterator[None]:
     """Within, a check of this document, or a part of it, ends.
 
     Raises:
-        EffortError: It would have taken too many steps.
+        BudgetError: It would have taken too many steps.
     """
-    before = _effort.set(_Effort(document))
+    before = _budget.set(_Budget(document))
     try:
         yield
     finally:
-        _effort.reset(before)
+        _budget.reset(before)
 
 
 def _parts(value: Any) -> Iterator[Any]:
@@ -104,16 +104,16 @@ def _all_in(value: Any) -> int:
 
 def _counted(keyword: str, check: _Check) -> _Check:
     def counting(validator: Any, value: Any, instance: Any, schema: Any) -> Iterator[ValidationError] | None:
-        effort = _effort.get()
-        if effort is not None:
-            effort.take(_steps(keyword, value, instance, schema, effort))
+        budget = _budget.get()
+        if budget is not None:
+            budget.take(_steps(keyword, value, instance, schema, budget))
         return check(validator, value, instance, schema)
 
     return counting
 
 
-def _steps(keyword: str, value: Any, instance: Any, schema: Any, effort: _Effort) -> int:
-    size = effort.size(instance)
+def _steps(keyword: str, value: Any, instance: Any, schema: Any, budget: _Budget) -> int:
+    size = budget.size(instance)
     steps = 1 + size // _TOLD
     if keyword in _COMPARES:
         steps += _all_in(value) // _TOLD

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from skytether.orchestrator.domain.effort import EffortError, bounded
 from skytether.orchestrator.domain.errors import InvalidError
 from skytether.orchestrator.domain.validation import check_params, check_schema
+from skytether.orchestrator.domain.validation_budget import BudgetError, bounded
 
 LEVELS = 16
 """2 ** 16 steps and more: a second without a bound. An attacker takes 30."""
@@ -160,6 +160,6 @@ def test_what_is_no_address_is_said(schema: dict[str, Any]) -> None:
 
 def test_a_bound_ends_with_what_it_is_for() -> None:
     large = {"allOf": [{"type": "object"}] * 1_000}
-    with pytest.raises(EffortError), bounded({}):
+    with pytest.raises(BudgetError), bounded({}):
         check_schema(large, "spec.params")
     check_schema(large, "spec.params")
