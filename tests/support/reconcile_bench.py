@@ -7,9 +7,9 @@ from typing import Any
 
 from skytether.api.rest import SiteCreate
 from skytether.orchestrator.config.settings import Limits, Timing, Weights
+from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import Secrets
-from skytether.orchestrator.domain.strain import Strain
 from skytether.orchestrator.scheduling.catalog import Catalog
 from skytether.orchestrator.scheduling.moves import Moves
 from skytether.orchestrator.scheduling.reconcile import Reconciler
@@ -45,7 +45,7 @@ class Bench:
         self.store, self.clock = store, clock
         self.woken = 0
         self.metrics = Metrics(list, 64)
-        self.strain = Strain(clock.steady)
+        self.overload = Overload(clock.steady)
         self.reconciler = self._reconciler(folder)
         self.runtime = kind("lab", folder, FakeOptions(**options))
         self.site = self._site()
@@ -61,7 +61,7 @@ class Bench:
             self.clock,
             self._wake,
             steady=self.clock.steady,
-            strain=self.strain,
+            overload=self.overload,
         )
 
     def _site(self) -> Site:
@@ -92,7 +92,7 @@ class Bench:
     def restart(self, folder: Path) -> None:
         """The orchestrator is killed and comes back; what runs runs on."""
         self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
-        self.strain = Strain(self.clock.steady)
+        self.overload = Overload(self.clock.steady)
         self.reconciler = self._reconciler(folder)
         self.site = self._site()
 

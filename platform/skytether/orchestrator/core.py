@@ -24,8 +24,8 @@ from .domain.clock_jump import SharedClock
 from .domain.counter_totals import CounterTotals
 from .domain.discovery import advertised, named, targets
 from .domain.errors import OutdatedError
+from .domain.overload import Overload
 from .domain.security import SecretFileError, Secrets, close_folder
-from .domain.strain import Strain
 from .domain.throttle import Throttle
 from .groups.demand import Demand
 from .groups.groups import Groups, load_provider
@@ -114,7 +114,7 @@ class Orchestrator:
         )
         self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
         self.catalog = Catalog(self.store, settings.catalog)
-        self.strain = Strain()
+        self.overload = Overload()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
         self.stops = Stops(self.store, clock)
@@ -128,7 +128,7 @@ class Orchestrator:
             clock,
             self._wake_placer,
             self.leadership,
-            strain=self.strain,
+            overload=self.overload,
             site_instances=settings.quotas.site_instances,
             disk_usage=self.disk_usage,
             left=self.quotas.left,
@@ -279,7 +279,7 @@ class Orchestrator:
         with contextlib.suppress(*GONE):  # they are kept until it answers
             self._write()
             # Another one leads, and cannot know whom this one refused.
-            if not self.leadership.leads and (self.strain.felt() or self.strain.owed()):
+            if not self.leadership.leads and (self.overload.felt() or self.overload.owed()):
                 self.store.extend_leases(self.clock(), at_least=True)
         return PERIOD
 

@@ -21,7 +21,7 @@ from uvicorn.server import ServerState
 
 from skytether.api.splice import closed
 from skytether.orchestrator.config.settings import Limits
-from skytether.orchestrator.domain.strain import Strain
+from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.http.door import Book, Door, GuardedProtocol, Guest, place_of
 
 
@@ -145,7 +145,7 @@ async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtoco
             Limits(idle_s=0.5),
             100,
             (),
-            Strain(),
+            Overload(),
         )
         try:
             reader, writer = await asyncio.open_connection(*listener.getsockname())
@@ -251,7 +251,7 @@ async def fail_a_handshake(tls: ssl.SSLContext) -> None:
     """Somebody begins to agree upon TLS, and leaves."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         context: Any = SimpleNamespace(context=tls)
-        door = Door(listener, Plain, context, Limits(), 100, (), Strain())
+        door = Door(listener, Plain, context, Limits(), 100, (), Overload())
         try:
             with socket.create_connection(listener.getsockname()) as stranger:
                 stranger.send(b"\x16\x03\x01\x02\x00\x01\x00")

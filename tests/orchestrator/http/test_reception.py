@@ -14,7 +14,7 @@ import pytest
 from skytether.orchestrator.access.access import Principal
 from skytether.orchestrator.config.settings import Limits
 from skytether.orchestrator.domain.errors import UnauthenticatedError
-from skytether.orchestrator.domain.strain import Strain
+from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.http.pause import Pause
 from skytether.orchestrator.http.problems import GivenUp
 from skytether.orchestrator.http.reception import RUN, Reception
@@ -57,11 +57,11 @@ class Scene:
         self.go = asyncio.Event()
         self.read: list[bytes] = []
         self.now = 0.0
-        self.strain = Strain(lambda: self.now)
+        self.overload = Overload(lambda: self.now)
         self.knows = Knows()
         self.renewed: list[float] = []
         self.reception = Reception(
-            self.app, self.knows, Limits(**limits), self.strain, Pause(pause_s), self.renewed.append
+            self.app, self.knows, Limits(**limits), self.overload, Pause(pause_s), self.renewed.append
         )
 
     async def app(self, scope: Any, receive: Any, send: Any) -> None:
@@ -114,11 +114,11 @@ def test_beyond_the_bound_they_are_told_to_come_again_and_renewals_have_room_of_
         await settle()
         status, headers = await at.ask()
         assert (status, headers[b"retry-after"]) == (503, b"1")
-        assert not at.strain.felt()
+        assert not at.overload.felt()
         renewing = asyncio.create_task(at.ask(RENEWAL, "walker"))
         await settle()
         assert (await at.ask(RENEWAL, "runner"))[0] == 503
-        assert at.strain.felt()
+        assert at.overload.felt()
         free = asyncio.create_task(at.ask("/healthz", ""))
         at.go.set()
         assert (await renewing)[0] == (await free)[0] == 200
@@ -279,9 +279,9 @@ def test_a_renewal_for_which_there_is_no_room_is_felt_as_strain() -> None:
         at = Scene()
         assert at.reception.hold(64 << 20)
         assert (await at.ask(body=[b"whole"]))[0] == 503
-        assert not at.strain.felt()
+        assert not at.overload.felt()
         assert (await at.ask(RENEWAL, "walker", body=[b"whole"]))[0] == 503
-        assert at.strain.felt()
+        assert at.overload.felt()
 
     run(scene)
 

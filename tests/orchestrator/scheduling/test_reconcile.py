@@ -11,8 +11,8 @@ from reconcile_bench import add
 
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Timing
+from skytether.orchestrator.domain.overload import HOLD
 from skytether.orchestrator.domain.records import Change, Record
-from skytether.orchestrator.domain.strain import HOLD
 from skytether.orchestrator.runtimes.base import Phase, SiteSilentError
 from skytether.orchestrator.store.store import Store
 from skytether.testing.runtimes import (
@@ -574,7 +574,7 @@ def test_while_robots_are_refused_no_lease_runs_out_and_then_all_count_anew(
     b.step(2)
     state = b.record("i0").state
     for _ in range(60):  # four leases long
-        b.strain.note()
+        b.overload.note()
         b.clock.forward(1)
         b.step()
         assert b.record("i0").state is state

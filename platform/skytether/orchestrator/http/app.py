@@ -41,7 +41,7 @@ def create_app(core: Orchestrator) -> FastAPI:
         Reception,
         doorman=core,
         limits=core.settings.limits,
-        strain=core.strain,
+        overload=core.overload,
         pause=pause,
         on_renewed=core.metrics.renewed,
     )

@@ -22,7 +22,7 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from ..config.settings import Limits
-from ..domain.strain import Strain
+from ..domain.overload import Overload
 from .certificate import LiveCertificate
 
 log = logging.getLogger(__name__)
@@ -316,7 +316,7 @@ class Door:
         limits: Limits,
         most: int,
         proxies: Iterable[str],
-        strain: Strain,
+        overload: Overload,
     ) -> None:
         """Begin to take connections, in the running loop.
 
@@ -327,14 +327,14 @@ class Door:
             limits: How many, and how long.
             most: Connections in all, by what the system lets us have.
             proxies: Addresses and networks whose connections are many people's.
-            strain: Told when somebody was refused for want of room.
+            overload: Told when somebody was refused for want of room.
         """
         self._listener = listener
         self._make = make
         self._tls = tls
         self._limits = limits
         self._proxies = tuple(ipaddress.ip_network(proxy, strict=False) for proxy in proxies)
-        self._strain = strain
+        self._overload = overload
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._told_at = -math.inf
@@ -380,11 +380,11 @@ class Door:
         has_room, gives_way = self.book.room(address, free=proxy)
         if gives_way is not None:
             if self.book.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
-                self._strain.note()
+                self._overload.note()
             self._end(gives_way)
         if not has_room:
             taken.close()
-            self._strain.note()
+            self._overload.note()
             self._tell("no room for a connection from %s: all that are open have shown a token", address)
             return
         guest = Guest(address, self._loop.time() + self._limits.head_s, self._know)
@@ -424,7 +424,7 @@ class Door:
 
     def _without_files(self, error: OSError) -> None:
         """Robots that would come in now cannot: a stranger gives way, and the next attempt is a moment later."""
-        self._strain.note()
+        self._overload.note()
         self._tell("a connection cannot be taken: %s", error.strerror)
         gives_way = self.book.stranger()
         if gives_way is not None:
@@ -438,7 +438,7 @@ class Door:
 
     async def _sweep(self) -> None:
         while True:
-            self._strain.beat()
+            self._overload.beat()
             now = self._loop.time()
             for guest in self.book.late(now):
                 self._end(guest)

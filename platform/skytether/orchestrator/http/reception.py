@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ..access.access import Principal
 from ..config.settings import Limits
 from ..domain.errors import TooManyError, UnauthenticatedError
-from ..domain.strain import Strain
+from ..domain.overload import Overload
 from .door import GUEST
 from .pause import Pause
 from .problems import answer, answer_to
@@ -89,7 +89,7 @@ class Reception:
         app: ASGIApp,
         doorman: Doorman,
         limits: Limits,
-        strain: Strain,
+        overload: Overload,
         pause: Pause,
         on_renewed: Callable[[float], None] = lambda _: None,
     ) -> None:
@@ -99,14 +99,14 @@ class Reception:
             app: Serves.
             doorman: Knows tokens.
             limits: How much and how many.
-            strain: Told when a robot that wants to renew is refused.
+            overload: Told when a robot that wants to renew is refused.
             pause: Before some refusals.
             on_renewed: Told how long a renewal took [s].
         """
         self._app = app
         self._doorman = doorman
         self._limits = limits
-        self._strain = strain
+        self._overload = overload
         self._places, self._strangers = _Places(), _Places()
         self._of: Counter[str] = Counter()
         self._held = 0
@@ -150,7 +150,7 @@ class Reception:
                     await body.read(scope, receive)
                 except _RefusedError as why:
                     if renewal and why.busy:
-                        self._strain.note()
+                        self._overload.note()
                     return await why.answer(Request(scope))(scope, receive, send)
                 except _LeftError:
                     return None
@@ -227,7 +227,7 @@ class Reception:
         counts, most = (self._places, self._most(renewal)) if receive is not None else (self._strangers, _STRANGERS)
         if counts.taken >= most:
             if renewal:
-                self._strain.note()
+                self._overload.note()
             text = f"{most} requests are under way already: try again in a second"
             refusal = answer(Request(scope), 503, "Too busy", text, headers={"Retry-After": "1"})
             await refusal(scope, _nothing, send)
@@ -235,7 +235,7 @@ class Reception:
         with until_answered or contextlib.ExitStack() as held:
             held.enter_context(counts.one())
             if renewal:
-                held.enter_context(self._strain.renewing())
+                held.enter_context(self._overload.renewing())
 
             async def noting(message: Message) -> None:
                 if message["type"] == "http.response.start":

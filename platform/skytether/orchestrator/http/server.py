@@ -214,8 +214,10 @@ class _Server(uvicorn.Server):
         limits, proxies = self._core.settings.limits, self._core.settings.proxies
         most = min(limits.connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
         make = partial(GuardedProtocol, config=self.config, server_state=self.server_state, app_state={})
-        strain = self._core.strain
-        doors: list[Any] = [Door(one, make, self._certificate, limits, most, proxies, strain) for one in sockets or ()]
+        overload = self._core.overload
+        doors: list[Any] = [
+            Door(one, make, self._certificate, limits, most, proxies, overload) for one in sockets or ()
+        ]
         self.servers = doors
         self.started = True
         draft = self._address.with_name("address.new")
@@ -232,7 +234,7 @@ class _Server(uvicorn.Server):
         self._address.unlink(missing_ok=True)
         self._core.broker.close()
         await super().shutdown(sockets)
-        self._core.strain.rest()
+        self._core.overload.rest()
 
 
 @contextmanager

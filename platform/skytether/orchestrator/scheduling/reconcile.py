@@ -20,9 +20,9 @@ from ..access.disk_usage import DiskUsage
 from ..config.settings import Limits, Timing, Weights
 from ..domain.clock_jump import ClockJump
 from ..domain.counter_totals import of_instance, of_run
+from ..domain.overload import Overload
 from ..domain.records import Change, Record
 from ..domain.security import SecretFileError, Secrets
-from ..domain.strain import Strain
 from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from ..store.db import GONE
 from ..store.leader import ALONE, Lead, LeadLostError, fence, fenced
@@ -91,20 +91,20 @@ class Reconciler:
         wake_placer: Callable[[], None],
         lead: Lead = ALONE,
         steady: Callable[[], float] = time.monotonic,
-        strain: Strain | None = None,
+        overload: Overload | None = None,
         site_instances: int = sys.maxsize,
         disk_usage: DiskUsage | None = None,
         left: Callable[[str], Size] = lambda _: _PLENTY,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
-        While ``strain`` is felt no lease runs out. A site gets no more than ``site_instances``, and
+        While ``overload`` is felt no lease runs out. A site gets no more than ``site_instances``, and
         nothing more where ``disk_usage`` says that it is full. ``left``: what a robot may have beside what it has.
         """
         self._resizing = Resizing(store, metrics, lambda: self.moves, self._room, left, self.note, steady)
         self._site_instances = site_instances
         self._disk_usage = disk_usage
-        self._strain = strain or Strain(steady)
+        self._overload = overload or Overload(steady)
         self._service_events = ServiceEvents(store, steady)
         self._store = store
         self._secrets = secrets
@@ -227,7 +227,7 @@ class Reconciler:
                 self._owes_leases = False  # first: it may be owed again meanwhile
                 self._store.extend_leases(now)
                 self._times_set += 1
-            if self._strain.owed() and self._leads():
+            if self._overload.owed() and self._leads():
                 self._store.extend_leases(now)
                 self._times_set += 1
                 log.warning("robots could not renew for a while, for want of room or of time: leases count anew")
@@ -685,7 +685,7 @@ class Reconciler:
         }
 
     def _expire(self, record: Record) -> None:
-        if self._strain.felt() or self._steady() < self._settles_at:
+        if self._overload.felt() or self._steady() < self._settles_at:
             return  # its robot may have been refused, or wait for its answer; or it was dated by another clock
         now = self._clock()
         reason = f"the robot did not renew its lease of {record.lease_s:g} s"

@@ -17,7 +17,7 @@ LATE = 1.0
 """Seconds after which a renewal that is not answered, or a loop that does not turn, counts as a refusal."""
 
 
-class Strain:
+class Overload:
     """Notes what keeps robots from renewing. Safe from any thread."""
 
     def __init__(self, steady: Callable[[], float] = time.monotonic) -> None:
