@@ -17,8 +17,8 @@ from value_sets import CASES, SETS, UPSTREAM
 
 from skytether.api.rest import SiteCreate
 from skytether.bridge.relay_config import RelayConfig
-from skytether.orchestrator.config.declared import read_sites, stored_as
 from skytether.orchestrator.config.settings import Settings
+from skytether.orchestrator.config.sites_file import read_sites, stored_as
 from skytether.orchestrator.config.sources import load
 from skytether.orchestrator.domain.security import Secrets, new_token
 from skytether.orchestrator.nodes.authority import Authority

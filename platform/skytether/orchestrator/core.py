@@ -18,8 +18,8 @@ from .access.access import Access, Principal
 from .access.disk_usage import DiskUsage
 from .access.quotas import Quotas
 from .access.rotation import Rotation
-from .config.declared import read_groups, read_sites
 from .config.settings import Settings
+from .config.sites_file import read_groups, read_sites
 from .domain.clock_jump import SharedClock
 from .domain.counter_totals import CounterTotals
 from .domain.discovery import advertised, named, targets

@@ -203,8 +203,8 @@ def dismantle_sites(
 
     For when their orchestrators are gone for good: whatever runs there ends.
     """
-    from skytether.orchestrator.config.declared import read_groups, read_sites
     from skytether.orchestrator.config.defaults import default_state_dir
+    from skytether.orchestrator.config.sites_file import read_groups, read_sites
     from skytether.orchestrator.domain.errors import ConflictError, InvalidError
     from skytether.orchestrator.groups.group_end import end_groups
     from skytether.orchestrator.runtimes.base import RuntimeFailure

@@ -17,8 +17,8 @@ from skytether.api.faults import known
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 
-from ..config.declared import stored_as
 from ..config.settings import Timing
+from ..config.sites_file import stored_as
 from ..domain.errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from ..domain.validation import parse
 from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Runtime, RuntimeFailure
@@ -505,7 +505,7 @@ def dismantle(
     """End and remove all that is at declared sites, whose orchestrators are gone for good.
 
     Args:
-        declared: As `declared.read_sites` gives them.
+        declared: As `sites_file.read_sites` gives them.
         folder: Where the runtimes keep what they note.
         find_runtime: Gives a runtime by its name.
         erase: And what services wrote there.

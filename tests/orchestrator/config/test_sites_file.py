@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from skytether.api.rest import SiteCreate
 from skytether.cli.app import app
 from skytether.orchestrator.access.access import Principal
-from skytether.orchestrator.config.declared import read_sites
 from skytether.orchestrator.config.settings import Settings
+from skytether.orchestrator.config.sites_file import read_sites
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.errors import ForbiddenError, InvalidError
 from skytether.orchestrator.domain.security import new_token
@@ -53,7 +53,7 @@ def test_a_declared_site_is_made_changed_and_otherwise_left(start: Start) -> Non
 
 def test_what_was_made_up_once_stays(tmp_path: Path) -> None:
     """The name by which a Docker site finds its containers again."""
-    from skytether.orchestrator.config.declared import stored_as
+    from skytether.orchestrator.config.sites_file import stored_as
 
     asked = SiteCreate(name="edge", tier="edge", runtime="docker", options={"pull": "never"})
     first = stored_as(asked, None, DockerRuntime)
