@@ -31,7 +31,7 @@ from skytether.lab.bench.migrate import Commands, instance_of
 from skytether.lab.demo import WalkerHardware
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.orchestrator.store import db
+from skytether.orchestrator.store.engine import make_engine, migrate
 from skytether.robot.agent.agent import Agent, AgentConfig
 from skytether.robot.control.command import Source
 
@@ -153,8 +153,8 @@ def free_ports(count: int) -> list[int]:
 @pytest.fixture
 def newer(tmp_path: Path, postgres: str) -> Path:
     """A later version of all of it, with another schema of the database."""
-    engine = db.make_engine(postgres)
-    root = newer_code(tmp_path / "newer", db.migrate(engine))
+    engine = make_engine(postgres)
+    root = newer_code(tmp_path / "newer", migrate(engine))
     engine.dispose()
     file = root / "skytether/__init__.py"
     file.write_text(re.sub(r'__version__ = ".*"', f'__version__ = "{NEWER}"', file.read_text()))

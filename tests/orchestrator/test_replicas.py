@@ -24,7 +24,7 @@ from skytether.api.rest import InstanceCreate, Renew, Report, SiteCreate, State
 from skytether.orchestrator.access.quotas import Quotas
 from skytether.orchestrator.config.settings import Quotas as Settings
 from skytether.orchestrator.domain.errors import QuotaError
-from skytether.orchestrator.store.db import make_engine
+from skytether.orchestrator.store.engine import make_engine
 from skytether.orchestrator.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.postgres]

@@ -20,7 +20,7 @@ from orchestrator_program import PATIENCE, Program, environment, until, with_toy
 from skytether.api.client import ApiError, Client, Unreachable
 from skytether.api.rest import InstanceCreate, SiteCreate, State
 from skytether.orchestrator.config.settings import Timing
-from skytether.orchestrator.store import db
+from skytether.orchestrator.store.engine import make_engine, migrate
 
 pytestmark = pytest.mark.slow
 
@@ -109,8 +109,8 @@ def retried(call: Callable[[], Any]) -> Any:
 @pytest.fixture
 def newer(tmp_path: Path, postgres: str) -> Path:
     """A source root with this very code and one migration more."""
-    engine = db.make_engine(postgres)
-    head = db.migrate(engine)
+    engine = make_engine(postgres)
+    head = migrate(engine)
     engine.dispose()
     return newer_code(tmp_path / "newer", head)
 
@@ -263,14 +263,14 @@ def test_what_a_newer_one_has_changed_the_database_of_refuses_and_does_nothing(
     served = served_with(database_url=postgres, timing=Timing(outdated_grace=0))
     operator, core = served.operator, served.core
     until(lambda: core.leadership.leads)
-    engine = db.make_engine(postgres)
+    engine = make_engine(postgres)
 
     def schema(*statements: str) -> None:
         with engine.begin() as connection:
             for statement in statements:
                 connection.exec_driver_sql(statement)
 
-    head = db.migrate(engine)
+    head = migrate(engine)
     schema("ALTER TABLE services RENAME manifest TO later", "UPDATE alembic_version SET version_num = '9001'")
     sentence = "a newer orchestrator has brought the database to its schema: ask that one"
     with pytest.raises(ApiError, match=sentence) as caught:

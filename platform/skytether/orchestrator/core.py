@@ -46,7 +46,7 @@ from .scheduling.loops import Loop
 from .scheduling.moves import Moves
 from .scheduling.reconcile import Reconciler
 from .scheduling.sites import Sites, load_runtime
-from .store.db import GONE
+from .store.engine import GONE
 from .store.leader import Leadership
 from .store.store import Store
 from .telemetry.metrics import GroupGauges, Metrics, Running, SiteGauges

@@ -16,7 +16,7 @@ from sqlalchemy import text
 from skytether.api.rest import State
 from skytether.orchestrator.domain.clock_jump import SharedClock
 from skytether.orchestrator.domain.records import Record
-from skytether.orchestrator.store.db import make_engine, migrate
+from skytether.orchestrator.store.engine import make_engine, migrate
 from skytether.orchestrator.store.leader import LEASE, Leadership, LeadLostError, Lock, fenced
 from skytether.orchestrator.store.postgres import Connection
 from skytether.orchestrator.store.store import Store

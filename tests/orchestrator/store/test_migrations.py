@@ -16,7 +16,7 @@ from skytether.api.groups import Stage
 from skytether.api.rest import State
 from skytether.orchestrator.domain.security import TokenHash
 from skytether.orchestrator.store import migrations
-from skytether.orchestrator.store.db import make_engine, migrate
+from skytether.orchestrator.store.engine import make_engine, migrate
 from skytether.orchestrator.store.models import metadata
 from skytether.orchestrator.store.store import Store
 

@@ -18,7 +18,7 @@ from skytether.orchestrator.domain.records import Change, IllegalMoveError, Reco
 from skytether.orchestrator.domain.security import TokenHash
 from skytether.orchestrator.scheduling.moves import FOREVER
 from skytether.orchestrator.store.database import RobotRow, TokenRow
-from skytether.orchestrator.store.db import AddressError, make_engine, migrate
+from skytether.orchestrator.store.engine import AddressError, make_engine, migrate
 from skytether.orchestrator.store.models import metadata
 from skytether.orchestrator.store.store import KeyReusedError, Store
 

@@ -236,7 +236,7 @@ def _store(address: str) -> Iterator[Store]:
     from sqlalchemy.exc import SQLAlchemyError
 
     from skytether.orchestrator.domain.errors import OutdatedError
-    from skytether.orchestrator.store.db import AddressError
+    from skytether.orchestrator.store.engine import AddressError
     from skytether.orchestrator.store.store import Store
 
     try:

@@ -22,7 +22,7 @@ from ..domain.validation import parse
 from ..providers.base import Found, Order, Provider, ProviderFailure, ProviderSilentError
 from ..runtimes.base import Capacity
 from ..scheduling.loops import Loop
-from ..store.db import GONE
+from ..store.engine import GONE
 from ..store.group_store import GroupRow
 from ..store.store import Store
 

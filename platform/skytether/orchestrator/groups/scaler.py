@@ -20,7 +20,7 @@ from ..domain.errors import DomainError, NotFoundError
 from ..providers.base import Condition, Found, Invitation, Order, ProviderFailure, ProviderSilentError
 from ..scheduling.moves import Moves
 from ..scheduling.sites import Site, Sites
-from ..store.db import GONE
+from ..store.engine import GONE
 from ..store.group_store import GroupRow, MachineRow
 from ..store.leader import Lead, LeadLostError, fence, fenced
 from ..store.store import Store

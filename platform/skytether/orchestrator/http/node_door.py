@@ -52,7 +52,7 @@ from ..domain.throttle import Throttle
 from ..nodes.authority import LiveContext, name_in, serial_of
 from ..nodes.enrolment import Enrolment, Known, RemovedError
 from ..nodes.ways import LinkedNode, Ways
-from ..store.db import GONE
+from ..store.engine import GONE
 from ..telemetry.logs import AUDIT
 from .door import Book, Guest, forget_frames, place_of
 

@@ -30,7 +30,7 @@ from ..domain.errors import (
     TooManyError,
     UnauthenticatedError,
 )
-from ..store.db import GONE
+from ..store.engine import GONE
 
 if TYPE_CHECKING:
     from ..core import Orchestrator

@@ -28,7 +28,7 @@ from ..config.settings import Settings
 from ..core import Orchestrator
 from ..domain.errors import InvalidError, OutdatedError
 from ..domain.security import SecretFileError
-from ..store.db import AddressError
+from ..store.engine import AddressError
 from ..telemetry import logs
 from .app import create_app
 from .certificate import LiveCertificate

@@ -24,7 +24,7 @@ from ..domain.overload import Overload
 from ..domain.records import Change, Record
 from ..domain.security import SecretFileError, Secrets
 from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
-from ..store.db import GONE
+from ..store.engine import GONE
 from ..store.leader import ALONE, Lead, LeadLostError, fence, fenced
 from ..store.store import Store
 from ..telemetry.metrics import Metrics

@@ -22,7 +22,7 @@ from ..config.sites_file import stored_as
 from ..domain.errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from ..domain.validation import parse
 from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Runtime, RuntimeFailure
-from ..store.db import GONE
+from ..store.engine import GONE
 from ..store.leader import LeadLostError, fence, fenced
 from ..store.store import Store
 from .fitness import Fitness

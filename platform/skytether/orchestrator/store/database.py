@@ -15,7 +15,7 @@ from skytether.api.rest import GateReport, Scope, SiteCreate
 
 from ..domain.discovery import NAME
 from ..domain.security import TokenHash
-from .db import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
+from .engine import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
 from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
 from .models import facts, gates, robots, services, shared, sites, stops, tokens
 from .node_rows import NodeRows

@@ -26,7 +26,7 @@ from sqlalchemy import Connection, Engine, select, text
 from skytether.guard.clock import now as boottime
 
 from ..domain.throttle import Throttle
-from .db import GONE
+from .engine import GONE
 from .models import leadership
 
 log = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ from ...core import Orchestrator
 from ...domain.records import Record
 from ...runtimes.base import LogStream
 from ...scheduling.instances import utc
-from ...store.db import GONE
+from ...store.engine import GONE
 from ...store.store import EventRow
 from .deps import PREFIX, Actor, Caller, Core, InstancesOperator, InThread, KeyHolder, made, says
 
