@@ -35,8 +35,8 @@ from .nodes.authority import Authority
 from .nodes.enrolment import Enrolment
 from .nodes.machines import MachineInvites
 from .providers.base import Provider
-from .robots.exchange import Exchange
 from .robots.gates import Gates
+from .robots.shared_topics import SharedTopics
 from .robots.stops import Stops
 from .runtimes.base import Runtime
 from .scheduling.catalog import Catalog
@@ -98,7 +98,7 @@ class Orchestrator:
         self.quotas = Quotas(self.store, settings.quotas, self.disk_usage)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
-        self.exchange = Exchange(self.store, clock)
+        self.shared_topics = SharedTopics(self.store, clock)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -286,7 +286,7 @@ class Orchestrator:
     def _write(self) -> None:
         self.reports.write()
         self.gates.write()
-        self.exchange.sync()
+        self.shared_topics.sync()
 
     def _elect(self) -> float:
         if self.look_outdated():

@@ -111,7 +111,7 @@ async def renew(core: Core, caller: Actor, run: InThread, instance: str, asked: 
 @router.post("/{instance}/share", responses=says(403, 404, 409, 422))
 def share(core: Core, caller: Actor, instance: str, asked: Share) -> Neighbours:
     """Tell what the instance's service shares with the robot's group, and hear what others do; of its robot only."""
-    return core.exchange.share(caller, core.instances.get(caller, instance), asked)
+    return core.shared_topics.share(caller, core.instances.get(caller, instance), asked)
 
 
 @router.post("/{instance}/session", responses=says(403, 404, 409, 422))

@@ -68,7 +68,7 @@ def list_robots(core: Core, _: Reader) -> list[Robot]:
 def add_robot(core: Core, _: RobotsOperator, asked: RobotCreate, response: Response) -> RobotCreated:
     """Register a robot. Its token is in the answer and cannot be shown again."""
     row, token = core.access.register(asked.name, asked.services, asked.token_ttl_s, asked.group)
-    core.exchange.learn_groups()
+    core.shared_topics.learn_groups()
     made(response, "robots", row.name)
     return RobotCreated(**_show(core, row, core.quotas.data()).model_dump(), token=token)
 
@@ -83,7 +83,7 @@ def delete_robot(core: Core, _: RobotsOperator, robot: str) -> None:
 @router.put("/{robot}/group", status_code=204, responses=says(404, 422))
 def set_group(core: Core, _: RobotsOperator, robot: str, asked: RobotGroup) -> None:
     """With whom a robot's services share what they see; it holds within a second."""
-    core.exchange.put(robot, asked.group)
+    core.shared_topics.put(robot, asked.group)
 
 
 @router.post("/stop", responses=says(422))

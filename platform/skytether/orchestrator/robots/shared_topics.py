@@ -23,7 +23,7 @@ KEPT_S = 60.0
 _Key = tuple[str, str]
 
 
-class Exchange:
+class SharedTopics:
     """Safe from any thread.
 
     Args:

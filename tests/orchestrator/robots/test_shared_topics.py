@@ -15,7 +15,7 @@ from skytether.orchestrator.access.access import Principal
 from skytether.orchestrator.domain.errors import ConflictError, ForbiddenError, NotFoundError
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import TokenHash, new_token
-from skytether.orchestrator.robots.exchange import KEPT_S, Exchange
+from skytether.orchestrator.robots.shared_topics import KEPT_S, SharedTopics
 from skytether.orchestrator.store.database import RobotRow, TokenRow
 from skytether.orchestrator.store.store import Store
 
@@ -33,10 +33,10 @@ def add(store: Store, robot: str, group: str | None) -> None:
 
 
 class Robots:
-    """Asks an exchange as robots do."""
+    """Asks an shared_topics as robots do."""
 
-    def __init__(self, exchange: Exchange, new_record: Any, manifest: Any) -> None:
-        self.exchange = exchange
+    def __init__(self, shared_topics: SharedTopics, new_record: Any, manifest: Any) -> None:
+        self.shared_topics = shared_topics
         self._record = new_record
         self._manifest = manifest
 
@@ -52,7 +52,7 @@ class Robots:
 
     def ask(self, robot: str, text: str | None = None, service: str = "toy", age: float = 0.0) -> Neighbours:
         share = Share(text=text, age_s=age)
-        return self.exchange.share(Principal(robot), self.record(robot, service), share)
+        return self.shared_topics.share(Principal(robot), self.record(robot, service), share)
 
     def heard(self, robot: str, service: str = "toy") -> dict[str, tuple[str, float]]:
         return {one.robot: (one.text, one.age_s) for one in self.ask(robot, service=service).others}
@@ -62,7 +62,7 @@ class Robots:
 def robots(store: Store, clock: Any, new_record: Any, manifest: Any) -> Robots:
     for robot, group in GROUPS.items():
         add(store, robot, group)
-    return Robots(Exchange(store, clock), new_record, manifest)
+    return Robots(SharedTopics(store, clock), new_record, manifest)
 
 
 def test_a_word_goes_to_the_same_service_of_the_groups_others(robots: Robots, clock: Any) -> None:
@@ -79,31 +79,31 @@ def test_a_word_goes_to_the_same_service_of_the_groups_others(robots: Robots, cl
 
 def test_who_is_in_no_group_tells_nobody_even_later(robots: Robots) -> None:
     robots.ask("d", "mine")
-    robots.exchange.put("d", "hall")
+    robots.shared_topics.put("d", "hall")
     assert robots.heard("a") == {}
 
 
 def test_who_changes_its_group_takes_nothing_along(robots: Robots) -> None:
     robots.ask("a", "in the hall")
-    robots.exchange.put("a", "yard")
+    robots.shared_topics.put("a", "yard")
     assert robots.heard("b") == {}
     assert robots.heard("c") == {}
     robots.ask("a", "in the yard")
     assert robots.heard("c") == {"a": ("in the yard", 0.0)}
-    robots.exchange.put("a", None)
+    robots.shared_topics.put("a", None)
     assert robots.heard("c") == {}
     with pytest.raises(NotFoundError, match="there is no robot 'nobody'"):
-        robots.exchange.put("nobody", "hall")
+        robots.shared_topics.put("nobody", "hall")
 
 
 def test_a_word_is_forgotten_after_its_time(robots: Robots, store: Store, clock: Any) -> None:
     robots.ask("a", "a crate", age=10.0)
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     clock.forward(KEPT_S - 10.5)
     assert robots.heard("b") == {"a": ("a crate", KEPT_S - 0.5)}
     clock.forward(1.0)
     assert robots.heard("b") == {}
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     assert store.shared() == []
 
 
@@ -116,11 +116,11 @@ def test_a_clock_that_was_set_back_keeps_no_word(robots: Robots, clock: Any) -> 
 def test_only_the_robot_itself_shares_and_only_what_runs_and_shares(robots: Robots) -> None:
     for who in (Principal("b"), Principal(None)):
         with pytest.raises(ForbiddenError, match="only robot 'a' itself"):
-            robots.exchange.share(who, robots.record("a"), Share(text="a lie"))
+            robots.shared_topics.share(who, robots.record("a"), Share(text="a lie"))
     with pytest.raises(ConflictError, match="shares nothing"):
-        robots.exchange.share(Principal("a"), robots.record("a", topics=[]), Share(text="x"))
+        robots.shared_topics.share(Principal("a"), robots.record("a", topics=[]), Share(text="x"))
     with pytest.raises(ConflictError, match="is stopped"):
-        robots.exchange.share(Principal("a"), robots.record("a", state=State.STOPPED), Share(text="x"))
+        robots.shared_topics.share(Principal("a"), robots.record("a", state=State.STOPPED), Share(text="x"))
     assert robots.heard("b") == {}
 
 
@@ -128,7 +128,7 @@ def test_only_the_robot_itself_shares_and_only_what_runs_and_shares(robots: Robo
 def test_a_service_may_only_tell_or_only_hear(robots: Robots, kept: int, told: bool, hears: bool) -> None:
     robots.ask("b", "from b")
     one_way = robots.record("a", topics=[TOPICS[kept]])
-    answer = robots.exchange.share(Principal("a"), one_way, Share(text="from a"))
+    answer = robots.shared_topics.share(Principal("a"), one_way, Share(text="from a"))
     assert bool(answer.others) == hears
     assert ("a" in robots.heard("b")) == told
 
@@ -137,7 +137,7 @@ def test_of_a_crowd_those_heard_last_are_told(robots: Robots, store: Store, cloc
     names = [f"r{n:02}" for n in range(MOST_NEIGHBOURS + 5)]
     for name in names:
         add(store, name, "hall")
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     for name in names:
         robots.ask(name, name)
         clock.forward(0.1)
@@ -145,19 +145,19 @@ def test_of_a_crowd_those_heard_last_are_told(robots: Robots, store: Store, cloc
 
 
 def test_any_of_several_orchestrators_may_be_asked(robots: Robots, store: Store, clock: Any) -> None:
-    here, there = robots.exchange, Exchange(store, clock)
+    here, there = robots.shared_topics, SharedTopics(store, clock)
     robots.ask("a", "from a")
     here.sync()
-    robots.exchange = there
+    robots.shared_topics = there
     robots.ask("b", "from b")
     there.sync()
     assert robots.heard("b") == {"a": ("from a", 0.0)}
-    robots.exchange = here
+    robots.shared_topics = here
     here.sync()
     assert robots.heard("a") == {"b": ("from b", 0.0)}
-    robots.exchange = there
+    robots.shared_topics = there
     there.put("b", None)
-    robots.exchange = here
+    robots.shared_topics = here
     here.sync()
     assert robots.heard("a") == {}
 
@@ -172,17 +172,17 @@ def test_what_cannot_be_written_is_kept_for_the_next_time(
     with monkeypatch.context() as patch:
         patch.setattr(store, "hear_shared", away)
         with pytest.raises(OperationalError):
-            robots.exchange.sync()
+            robots.shared_topics.sync()
     assert robots.heard("b") == {"a": ("a crate", 0.0)}
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     assert [(row.robot, row.group, row.text) for row in store.shared()] == [("a", "hall", "a crate")]
 
 
 def test_words_go_with_their_robot(robots: Robots, store: Store) -> None:
     robots.ask("a", "a crate")
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     store.delete_robot("a")
-    robots.exchange.sync()
+    robots.shared_topics.sync()
     assert store.shared() == []
     assert robots.heard("b") == {}
 
