@@ -37,7 +37,7 @@ from .nodes.machines import MachineInvites
 from .providers.base import Provider
 from .robots.gates import Gates
 from .robots.shared_topics import SharedTopics
-from .robots.stops import Stops
+from .robots.stop_orders import StopOrders
 from .runtimes.base import Runtime
 from .scheduling.catalog import Catalog
 from .scheduling.events import Broker
@@ -117,7 +117,7 @@ class Orchestrator:
         self.overload = Overload()
         throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
-        self.stops = Stops(self.store, clock)
+        self.stop_orders = StopOrders(self.store, clock)
         self.reconciler = Reconciler(
             self.store,
             secrets,

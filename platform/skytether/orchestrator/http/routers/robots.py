@@ -89,7 +89,7 @@ def set_group(core: Core, _: RobotsOperator, robot: str, asked: RobotGroup) -> N
 @router.post("/stop", responses=says(422))
 def stop_robots(core: Core, caller: RobotsOperator, asked: StopRobot) -> list[StopOrder]:
     """Order all robots to stop. One that has not acknowledged an order yet keeps that one."""
-    rows = core.stops.order(caller, [row.name for row in core.store.robots()], asked.reason)
+    rows = core.stop_orders.order(caller, [row.name for row in core.store.robots()], asked.reason)
     return [_order(row) for row in rows.values()]
 
 
@@ -100,20 +100,20 @@ def stop_robot(core: Core, caller: RobotsOperator, robot: str, asked: StopRobot)
     It obeys if its own configuration allows it, within some seconds of hearing of it, and acknowledges. While it has
     not, asking again changes nothing.
     """
-    return _order(core.stops.order(caller, [robot], asked.reason)[robot])
+    return _order(core.stop_orders.order(caller, [robot], asked.reason)[robot])
 
 
 @router.get("/{robot}/stop", responses=says(404))
 def get_stop(core: Core, caller: Caller, robot: str) -> StopOrder | None:
     """The last order to a robot to stop. Robots ask for their own, every two seconds if they obey such orders."""
-    row = core.stops.last(caller, robot)
+    row = core.stop_orders.last(caller, robot)
     return None if row is None else _order(row)
 
 
 @router.post("/{robot}/stop/{order}/acknowledge", responses=says(404))
 def acknowledge_stop(core: Core, caller: Caller, robot: str, order: str) -> StopOrder:
     """The robot says that it stands. With the robot's own token only; the first time counts."""
-    return _order(core.stops.acknowledge(caller, robot, order))
+    return _order(core.stop_orders.acknowledge(caller, robot, order))
 
 
 @router.put("/{robot}/gate", status_code=204, responses=says(404, 422))

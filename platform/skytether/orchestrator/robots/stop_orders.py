@@ -11,7 +11,7 @@ from ..store.database import StopRow
 from ..store.store import Store
 
 
-class Stops:
+class StopOrders:
     """The last order to each robot; kept until the next, over restarts too.
 
     Args:
