@@ -24,7 +24,7 @@ from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.http import app
 from skytether.orchestrator.http.app import create_app
-from skytether.orchestrator.http.pause import Pause
+from skytether.orchestrator.http.refusal_delay import RefusalDelay
 from skytether.orchestrator.http.server import listening
 from skytether.orchestrator.scheduling import catalog as catalog
 from skytether.orchestrator.scheduling import sites
@@ -118,9 +118,9 @@ def installed_services_are_read_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def refusals_are_not_waited_for() -> Iterator[None]:
-    """Hundreds of tests ask what they may not; those of `Pause` have their own."""
+    """Hundreds of tests ask what they may not; those of `RefusalDelay` have their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "Pause", partial(Pause, 0.0))
+        patch.setattr(app, "RefusalDelay", partial(RefusalDelay, 0.0))
         yield
 
 

@@ -15,9 +15,9 @@ from skytether.orchestrator.access.access import Principal
 from skytether.orchestrator.config.settings import Limits
 from skytether.orchestrator.domain.errors import UnauthenticatedError
 from skytether.orchestrator.domain.overload import Overload
-from skytether.orchestrator.http.pause import Pause
 from skytether.orchestrator.http.problems import GivenUp
 from skytether.orchestrator.http.reception import RUN, Reception
+from skytether.orchestrator.http.refusal_delay import RefusalDelay
 
 RENEWAL = "/api/v1/instances/i1/renew"
 OTHER = "/api/v1/instances"
@@ -61,7 +61,7 @@ class Scene:
         self.knows = Knows()
         self.renewed: list[float] = []
         self.reception = Reception(
-            self.app, self.knows, Limits(**limits), self.overload, Pause(pause_s), self.renewed.append
+            self.app, self.knows, Limits(**limits), self.overload, RefusalDelay(pause_s), self.renewed.append
         )
 
     async def app(self, scope: Any, receive: Any, send: Any) -> None:
@@ -170,7 +170,7 @@ def test_who_is_a_stranger_or_asks_too_often_waits_for_the_answer_and_nobody_els
 
 def test_however_many_connections_are_refused_at_once_some_hundred_are_in_a_second() -> None:
     async def scene() -> None:
-        pause = Pause(0.25)
+        pause = RefusalDelay(0.25)
         assert pause.next_s == 0.25
         refused = [asyncio.create_task(pause.wait()) for _ in range(640)]
         await asyncio.sleep(0)

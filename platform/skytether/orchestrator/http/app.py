@@ -11,8 +11,8 @@ from ..core import Orchestrator
 from ..telemetry.logs import Audit
 from . import docs_page, problems
 from .hosts import Hosts, own_names
-from .pause import Pause
 from .reception import Reception
+from .refusal_delay import RefusalDelay
 from .routers import catalog, groups, health, instances, invitations, robots, sites, tokens
 from .routers.deps import plain_request
 
@@ -36,16 +36,16 @@ def create_app(core: Orchestrator) -> FastAPI:
     problems.install(app)
     for part in (catalog, sites, groups, invitations, instances, robots, tokens, health, docs_page):
         app.include_router(part.router)
-    pause = Pause()
+    refusal_delay = RefusalDelay()
     app.add_middleware(
         Reception,
         doorman=core,
         limits=core.settings.limits,
         overload=core.overload,
-        pause=pause,
+        refusal_delay=refusal_delay,
         on_renewed=core.metrics.renewed,
     )
     app.add_middleware(problems.GivenUp)
     app.add_middleware(Audit)
-    app.add_middleware(Hosts, names=own_names(core.settings), pause=pause)
+    app.add_middleware(Hosts, names=own_names(core.settings), refusal_delay=refusal_delay)
     return app

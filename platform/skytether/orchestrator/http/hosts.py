@@ -12,8 +12,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from skytether.api.hosts import is_own
 
 from ..config.settings import Settings
-from .pause import Pause
 from .problems import answer
+from .refusal_delay import RefusalDelay
 
 _SHOWN = 80
 """Characters of a strange name that are told."""
@@ -22,10 +22,10 @@ _SHOWN = 80
 class Hosts:
     """ASGI middleware: 421 for whoever asks somebody else."""
 
-    def __init__(self, app: ASGIApp, names: tuple[str, ...], pause: Pause) -> None:
-        """``names``: see ``own_names``; ``pause``: before it is refused."""
+    def __init__(self, app: ASGIApp, names: tuple[str, ...], refusal_delay: RefusalDelay) -> None:
+        """``names``: see ``own_names``; ``refusal_delay``: before it is refused."""
         self._app = app
-        self._pause = pause
+        self._refusal_delay = refusal_delay
         self._names = names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -34,7 +34,7 @@ class Hosts:
         if strange is None:
             await self._app(scope, receive, send)
             return
-        await self._pause.wait()
+        await self._refusal_delay.wait()
         text = (
             f"this orchestrator is not known as {strange[:_SHOWN]!r}: ask it by its address, or add the name to "
             "'hosts' in its configuration (SKYTETHER_HOSTS)"

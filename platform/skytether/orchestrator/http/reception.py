@@ -25,8 +25,8 @@ from ..config.settings import Limits
 from ..domain.errors import TooManyError, UnauthenticatedError
 from ..domain.overload import Overload
 from .door import GUEST
-from .pause import Pause
 from .problems import answer, answer_to
+from .refusal_delay import RefusalDelay
 
 PRINCIPAL = "principal"
 """Key of who asks in the state of a request."""
@@ -90,7 +90,7 @@ class Reception:
         doorman: Doorman,
         limits: Limits,
         overload: Overload,
-        pause: Pause,
+        refusal_delay: RefusalDelay,
         on_renewed: Callable[[float], None] = lambda _: None,
     ) -> None:
         """Bounds are those of ``limits``.
@@ -100,7 +100,7 @@ class Reception:
             doorman: Knows tokens.
             limits: How much and how many.
             overload: Told when a robot that wants to renew is refused.
-            pause: Before some refusals.
+            refusal_delay: Before some refusals.
             on_renewed: Told how long a renewal took [s].
         """
         self._app = app
@@ -110,7 +110,7 @@ class Reception:
         self._places, self._strangers = _Places(), _Places()
         self._of: Counter[str] = Counter()
         self._held = 0
-        self._pause = pause
+        self._refusal_delay = refusal_delay
         self._on_renewed = on_renewed
         self._for_renewals = _Threads(_THREADS)
         self._for_strangers = _Threads(_THREADS_OF_STRANGERS)
@@ -126,7 +126,7 @@ class Reception:
             return await self._place(scope, b"", send, renewal=False)
         if _ASTRAY.search(scope["path"]):
             text = "a path goes down, by names: none of them is empty or made of dots"
-            await self._pause.wait()
+            await self._refusal_delay.wait()
             return await answer(Request(scope), 404, "Not found", text)(scope, receive, send)
         renewal = scope["method"] == "POST" and _RENEWAL.fullmatch(scope["path"]) is not None
         try:
@@ -135,13 +135,13 @@ class Reception:
             if isinstance(error, TooManyError) and error.who:
                 scope.setdefault("state", {})["who"] = error.who  # for the audit: a good token was shown
             if isinstance(error, UnauthenticatedError | TooManyError):
-                await self._pause.wait()
+                await self._refusal_delay.wait()
             return await (await answer_to(Request(scope), error))(scope, receive, send)
         with contextlib.ExitStack() as until_answered:
             if not until_answered.enter_context(self._one_of(caller)):
                 most = self._limits.robot_requests_at_once
                 text = f"{most} requests of this robot are under way: wait for their answers"
-                await self._pause.wait()
+                await self._refusal_delay.wait()
                 return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
             with _Body(
                 self, self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
@@ -241,7 +241,7 @@ class Reception:
                 if message["type"] == "http.response.start":
                     held.close()
                     if receive is None and message["status"] == _NOT_FOUND:
-                        await self._pause.wait()
+                        await self._refusal_delay.wait()
                 await send(message)
 
             await self._app(scope, _replaying(body, receive), noting)

@@ -12,7 +12,7 @@ _AT_ONCE = 64
 256 are refused in a second, until all wait the longest."""
 
 
-class Pause:
+class RefusalDelay:
     """Of who waits for a refusal; each has a connection, which is what bounds their number."""
 
     def __init__(self, first_s: float = _FIRST_S) -> None:
