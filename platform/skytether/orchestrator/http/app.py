@@ -10,11 +10,11 @@ import skytether
 from ..core import Orchestrator
 from ..telemetry.logs import Audit
 from . import docs_page, problems
-from .hosts import Hosts, own_names
 from .reception import Reception
 from .refusal_delay import RefusalDelay
 from .routers import catalog, groups, health, instances, invitations, robots, sites, tokens
 from .routers.deps import plain_request
+from .trusted_hosts import TrustedHosts, own_names
 
 _NO_TELEMETRY: TelemetryConfig = {"tracing": False, "metrics": False, "logs": False}
 """FastAPI's own (OpenTelemetry) costs each request a twentieth, even where nobody exports it."""
@@ -47,5 +47,5 @@ def create_app(core: Orchestrator) -> FastAPI:
     )
     app.add_middleware(problems.GivenUp)
     app.add_middleware(Audit)
-    app.add_middleware(Hosts, names=own_names(core.settings), refusal_delay=refusal_delay)
+    app.add_middleware(TrustedHosts, names=own_names(core.settings), refusal_delay=refusal_delay)
     return app

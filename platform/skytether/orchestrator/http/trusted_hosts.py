@@ -19,7 +19,7 @@ _SHOWN = 80
 """Characters of a strange name that are told."""
 
 
-class Hosts:
+class TrustedHosts:
     """ASGI middleware: 421 for whoever asks somebody else."""
 
     def __init__(self, app: ASGIApp, names: tuple[str, ...], refusal_delay: RefusalDelay) -> None:

@@ -17,7 +17,7 @@ from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.errors import InvalidError
 from skytether.orchestrator.domain.validation import parse
-from skytether.orchestrator.http.hosts import own_names
+from skytether.orchestrator.http.trusted_hosts import own_names
 
 ALWAYS = (
     "127.0.0.1",
