@@ -10,7 +10,7 @@ import skytether
 from ..core import Orchestrator
 from ..telemetry.logs import Audit
 from . import docs_page, problems
-from .reception import Reception
+from .admission import Admission
 from .refusal_delay import RefusalDelay
 from .routers import catalog, groups, health, instances, invitations, robots, sites, tokens
 from .routers.deps import plain_request
@@ -38,8 +38,8 @@ def create_app(core: Orchestrator) -> FastAPI:
         app.include_router(part.router)
     refusal_delay = RefusalDelay()
     app.add_middleware(
-        Reception,
-        doorman=core,
+        Admission,
+        authenticator=core,
         limits=core.settings.limits,
         overload=core.overload,
         refusal_delay=refusal_delay,

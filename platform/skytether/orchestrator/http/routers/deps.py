@@ -15,7 +15,7 @@ from skytether.api.rest import PATH_NAME, Problem, Scope
 from ...access.access import Principal
 from ...core import Orchestrator
 from ...domain.errors import InvalidError, NotFoundError
-from ..reception import PRINCIPAL, RUN
+from ..admission import PRINCIPAL, RUN
 
 PREFIX = "/api/v1"
 _LARGE = 16_384
@@ -36,7 +36,7 @@ Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 
 
 async def _asker(request: Request, _: Bearer) -> Principal:
-    known: Principal = getattr(request.state, PRINCIPAL)  # the reception has asked
+    known: Principal = getattr(request.state, PRINCIPAL)  # the admission has asked
     return known
 
 

@@ -50,7 +50,7 @@ _THREADS_OF_STRANGERS = 4
 """To look tokens up that nobody has shown lately: made-up ones take no thread of those who are known."""
 
 
-class Doorman(Protocol):
+class Authenticator(Protocol):
     """Knows tokens."""
 
     def authenticate(self, token: str | None, address: str) -> Principal:
@@ -81,13 +81,13 @@ class Doorman(Protocol):
         """Reckon what a body of this length costs whoever sent it."""
 
 
-class Reception:
+class Admission:
     """ASGI middleware: authenticates, reads the body, and bounds the requests under way."""
 
     def __init__(
         self,
         app: ASGIApp,
-        doorman: Doorman,
+        authenticator: Authenticator,
         limits: Limits,
         overload: Overload,
         refusal_delay: RefusalDelay,
@@ -97,14 +97,14 @@ class Reception:
 
         Args:
             app: Serves.
-            doorman: Knows tokens.
+            authenticator: Knows tokens.
             limits: How much and how many.
             overload: Told when a robot that wants to renew is refused.
             refusal_delay: Before some refusals.
             on_renewed: Told how long a renewal took [s].
         """
         self._app = app
-        self._doorman = doorman
+        self._doorman = authenticator
         self._limits = limits
         self._overload = overload
         self._places, self._strangers = _Places(), _Places()
@@ -288,8 +288,8 @@ def _tried(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Exceptio
         return None, error
 
 
-def _verified(doorman: Doorman, token: str | None, function: Callable[..., Any], *arguments: Any) -> Any:
-    doorman.verify(token)
+def _verified(authenticator: Authenticator, token: str | None, function: Callable[..., Any], *arguments: Any) -> Any:
+    authenticator.verify(token)
     return function(*arguments)
 
 
@@ -328,8 +328,8 @@ class _RefusedError(Exception):
 class _Body:
     """One that arrives; what it holds is given back at the end."""
 
-    def __init__(self, reception: Reception, limit: int) -> None:
-        self._reception = reception
+    def __init__(self, admission: Admission, limit: int) -> None:
+        self._reception = admission
         self._limit = limit
         self.data = bytearray()
 

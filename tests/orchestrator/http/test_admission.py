@@ -15,8 +15,8 @@ from skytether.orchestrator.access.access import Principal
 from skytether.orchestrator.config.settings import Limits
 from skytether.orchestrator.domain.errors import UnauthenticatedError
 from skytether.orchestrator.domain.overload import Overload
+from skytether.orchestrator.http.admission import RUN, Admission
 from skytether.orchestrator.http.problems import GivenUp
-from skytether.orchestrator.http.reception import RUN, Reception
 from skytether.orchestrator.http.refusal_delay import RefusalDelay
 
 RENEWAL = "/api/v1/instances/i1/renew"
@@ -51,7 +51,7 @@ class Knows:
 
 
 class Scene:
-    """A reception before an app that answers when it is told to."""
+    """A admission before an app that answers when it is told to."""
 
     def __init__(self, pause_s: float = 0.0, **limits: Any) -> None:
         self.go = asyncio.Event()
@@ -60,7 +60,7 @@ class Scene:
         self.overload = Overload(lambda: self.now)
         self.knows = Knows()
         self.renewed: list[float] = []
-        self.reception = Reception(
+        self.admission = Admission(
             self.app, self.knows, Limits(**limits), self.overload, RefusalDelay(pause_s), self.renewed.append
         )
 
@@ -94,7 +94,7 @@ class Scene:
         headers = [(b"authorization", f"Bearer {token}".encode())] if token else []
         headers += [(b"content-length", str(declares).encode())] if declares else []
         scope = {"type": "http", "path": path, "method": "POST", "headers": headers, "query_string": b""}
-        await self.reception(scope, whole if body is None else receive, send)
+        await self.admission(scope, whole if body is None else receive, send)
         return next((m["status"], dict(m["headers"])) for m in told if "status" in m)
 
 
@@ -277,7 +277,7 @@ def test_a_renewal_for_which_there_is_no_room_is_felt_as_strain() -> None:
 
     async def scene() -> None:
         at = Scene()
-        assert at.reception.hold(64 << 20)
+        assert at.admission.hold(64 << 20)
         assert (await at.ask(body=[b"whole"]))[0] == 503
         assert not at.overload.felt()
         assert (await at.ask(RENEWAL, "walker", body=[b"whole"]))[0] == 503
