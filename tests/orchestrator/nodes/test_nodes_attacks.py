@@ -46,7 +46,7 @@ from skytether.node import calls, join
 from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.machine import machine_id
 from skytether.node.store import NodeError, new_key, request_for
-from skytether.orchestrator.http import node_door as door
+from skytether.orchestrator.http import node_listener as door
 from skytether.orchestrator.nodes import ways
 from skytether.orchestrator.nodes.authority import Authority
 

@@ -23,7 +23,7 @@ from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.store import NodeError, new_key, request_for
 from skytether.orchestrator.config.settings import Settings, Timing
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.http import node_door as door
+from skytether.orchestrator.http import node_listener as door
 from skytether.orchestrator.http.app import create_app
 from skytether.orchestrator.nodes import ways
 from skytether.orchestrator.nodes.authority import Authority

@@ -12,7 +12,7 @@ from ..core import Orchestrator
 from ..domain.errors import ConflictError, NotFoundError
 from ..nodes.authority import LiveContext
 from ..nodes.ways import Ways
-from .node_door import NodeDoor
+from .node_listener import NodeListener
 
 ADDRESS = "nodes.address"
 """In the state folder: where nodes connect."""
@@ -24,7 +24,7 @@ def serving_nodes(core: Orchestrator, listener: socket.socket | None) -> Iterato
     if listener is None or core.authority is None or core.nodes is None:
         yield
         return
-    door = NodeDoor(
+    door = NodeListener(
         listener,
         LiveContext(core.authority, core.clock),
         core.nodes,

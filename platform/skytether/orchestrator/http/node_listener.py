@@ -87,7 +87,7 @@ class _Guest(Guest):
     """Whose connection it is; ``address`` is what of it counts as one."""
 
 
-class NodeDoor:
+class NodeListener:
     """Serves nodes until `close`."""
 
     def __init__(
@@ -147,7 +147,7 @@ class NodeDoor:
             self._loop.call_soon_threadsafe(self._stop)
             self._thread.join()
 
-    def __enter__(self) -> NodeDoor:
+    def __enter__(self) -> NodeListener:
         self.start()
         return self
 
