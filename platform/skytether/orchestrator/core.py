@@ -25,8 +25,8 @@ from .domain.counter_totals import CounterTotals
 from .domain.discovery import advertised, named, targets
 from .domain.errors import OutdatedError
 from .domain.overload import Overload
+from .domain.rate_limit import RateLimiter
 from .domain.security import SecretFileError, Secrets, close_folder
-from .domain.throttle import Throttle
 from .groups.demand import Demand
 from .groups.groups import Groups, load_provider
 from .groups.scaler import Scaler
@@ -115,7 +115,7 @@ class Orchestrator:
         self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
         self.catalog = Catalog(self.store, settings.catalog)
         self.overload = Overload()
-        throttle = Throttle(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
+        throttle = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, throttle)
         self.stop_orders = StopOrders(self.store, clock)
         self.reconciler = Reconciler(

@@ -15,8 +15,8 @@ from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, SiteCreate, 
 from skytether.orchestrator.access import access as accesses
 from skytether.orchestrator.access.access import Access
 from skytether.orchestrator.domain.errors import TooManyError, UnauthenticatedError
+from skytether.orchestrator.domain.rate_limit import RateLimiter
 from skytether.orchestrator.domain.security import Secrets
-from skytether.orchestrator.domain.throttle import Throttle
 from skytether.orchestrator.store.store import Store
 
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
@@ -139,7 +139,7 @@ def test_the_operators_own_token_is_renewed_at_the_machine(served: Any) -> None:
 
 def test_a_token_ends_at_its_time_and_use_is_noted(store: Store, tmp_path: Any) -> None:
     now = [1000.0]
-    access = Access(store, Secrets(tmp_path), lambda: now[0], Throttle(100, 100, lambda: 0.0))
+    access = Access(store, Secrets(tmp_path), lambda: now[0], RateLimiter(100, 100, lambda: 0.0))
     _, token = access.register("walker", ("*",), ttl_s=60)
     assert access.authenticate(token).robot == "walker"
     now[0] += 59.9
@@ -156,7 +156,7 @@ def test_tokens_that_a_robot_makes_and_uses_again_and_again_cost_no_memory(
     """Fifteen a second were 250 MB a day: when each was used last was never forgotten."""
     now = [1000.0]
     monkeypatch.setattr(accesses, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    access = Access(store, Secrets(tmp_path), lambda: now[0], Throttle(100, 100, lambda: 0.0))
+    access = Access(store, Secrets(tmp_path), lambda: now[0], RateLimiter(100, 100, lambda: 0.0))
     _, token = access.register("walker", ("*",), ttl_s=None)
     for _ in range(60):
         now[0] += 1.0
@@ -172,7 +172,7 @@ def test_tokens_that_a_robot_makes_and_uses_again_and_again_cost_no_memory(
 
 
 def test_what_was_refused_a_moment_ago_is_refused_again_at_once_and_counted(store: Store, tmp_path: Any) -> None:
-    throttle = Throttle(0.001, 3, lambda: 0.0)
+    throttle = RateLimiter(0.001, 3, lambda: 0.0)
     access = Access(store, Secrets(tmp_path), lambda: 1000.0, throttle)
     assert access.recent("made-up", "10.0.0.1") is None
     with pytest.raises(UnauthenticatedError, match="not known here"):
@@ -193,7 +193,7 @@ def test_what_was_refused_a_moment_ago_is_refused_again_at_once_and_counted(stor
 def test_a_token_that_expired_by_a_clock_set_wrong_is_good_as_soon_as_the_clock_is_right(
     store: Store, tmp_path: Any, clock: Any
 ) -> None:
-    access = Access(store, Secrets(tmp_path), clock, Throttle(100, 100, lambda: 0.0))
+    access = Access(store, Secrets(tmp_path), clock, RateLimiter(100, 100, lambda: 0.0))
     _, token = access.register("walker", ("*",), ttl_s=60)
     clock.set_by(3600)
     with pytest.raises(UnauthenticatedError, match="expired"):

@@ -30,8 +30,8 @@ from ..domain.errors import (
     UnauthenticatedError,
     UnknownTokenError,
 )
+from ..domain.rate_limit import RateLimiter
 from ..domain.security import PREFIX_LENGTH, Secrets, TokenHash, new_token
-from ..domain.throttle import Throttle
 from ..store.database import RobotRow, TokenRow
 from ..store.store import Store
 
@@ -109,7 +109,7 @@ class Principal:
 class Access:
     """Robots and tokens."""
 
-    def __init__(self, store: Store, secrets: Secrets, clock: Callable[[], float], throttle: Throttle) -> None:
+    def __init__(self, store: Store, secrets: Secrets, clock: Callable[[], float], throttle: RateLimiter) -> None:
         """``clock`` gives seconds since the epoch."""
         self._store = store
         self._secrets = secrets

@@ -48,7 +48,7 @@ from skytether.bridge.echo import EchoClient
 
 from ..config.settings import Limits
 from ..domain.errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
-from ..domain.throttle import Throttle
+from ..domain.rate_limit import RateLimiter
 from ..nodes.authority import LiveContext, name_in, serial_of
 from ..nodes.enrolment import Enrolment, Known, RemovedError
 from ..nodes.ways import LinkedNode, Ways
@@ -124,10 +124,10 @@ class NodeListener:
         self._leave = leave
         self._clock = clock
         self._book = Book(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
-        self._guesses = Throttle(_GUESSES_PER_S, _GUESSES, time.monotonic)
-        self._requests = Throttle(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
-        self._links = Throttle(_LINKS_PER_S, _LINKS, time.monotonic)
-        self._told = Throttle(0.2, 20, time.monotonic)
+        self._guesses = RateLimiter(_GUESSES_PER_S, _GUESSES, time.monotonic)
+        self._requests = RateLimiter(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
+        self._links = RateLimiter(_LINKS_PER_S, _LINKS, time.monotonic)
+        self._told = RateLimiter(0.2, 20, time.monotonic)
         self._busy: Counter[str] = Counter()
         self._tasks: set[asyncio.Task[None]] = set()
         self._gone: dict[str, float] = {}

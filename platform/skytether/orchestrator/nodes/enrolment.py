@@ -21,8 +21,8 @@ from skytether.api.node import Address, Issued, Join, Machine
 from skytether.api.rest import SiteCreate
 
 from ..domain.errors import ConflictError, NotFoundError, UnauthenticatedError, UnknownTokenError
+from ..domain.rate_limit import RateLimiter
 from ..domain.security import PREFIX_LENGTH, TokenHash, new_token
-from ..domain.throttle import Throttle
 from ..scheduling.sites import NODE, Sites
 from ..store.database import Database
 from ..store.node_rows import Invitation, Node
@@ -87,7 +87,7 @@ class Enrolment:
         self._clock = clock
         self._days = days
         self._renew_s = renew_days * _DAY
-        self._moves = Throttle(_MOVES_PER_S, _MOVES, time.monotonic)
+        self._moves = RateLimiter(_MOVES_PER_S, _MOVES, time.monotonic)
         self.urls = urls
 
     # Invitations

@@ -21,7 +21,7 @@ from pathlib import Path
 from skytether.api.node import ANSWER_S, GO, MOST_WAYS, PING_S, SILENT_S, Said, Told, line_of
 from skytether.api.splice import PIECE, Stream, splice
 
-from ..domain.throttle import Throttle
+from ..domain.rate_limit import RateLimiter
 from ..runtimes.docker.engine import ENGINE_AWAY, ENGINE_SOCKET
 
 log = logging.getLogger(__name__)
@@ -83,9 +83,9 @@ class Ways:
         self._nodes: dict[str, LinkedNode] = {}
         self._all: set[asyncio.Task[None]] = set()
         """Of all nodes, also of links that have ended."""
-        self._lines = Throttle(_LINES_PER_S, _LINES, time.monotonic)
-        self._turns = Throttle(_TURNS_PER_S, _TURNS, time.monotonic)
-        self._bytes = Throttle(_BYTES_PER_S, _BYTES, time.monotonic)
+        self._lines = RateLimiter(_LINES_PER_S, _LINES, time.monotonic)
+        self._turns = RateLimiter(_TURNS_PER_S, _TURNS, time.monotonic)
+        self._bytes = RateLimiter(_BYTES_PER_S, _BYTES, time.monotonic)
 
     def linked(self) -> dict[str, str]:
         """Those that are, each with the address that it is seen as."""
@@ -317,7 +317,7 @@ class Ways:
             raise
 
 
-async def _until_free(throttle: Throttle, name: str) -> None:
+async def _until_free(throttle: RateLimiter, name: str) -> None:
     """Take one of what a node may, and wait for it: meanwhile nothing of it is read, so it waits, too."""
     while wait := throttle.wait(name):
         await asyncio.sleep(wait)

@@ -25,7 +25,7 @@ from sqlalchemy import Connection, Engine, select, text
 
 from skytether.guard.clock import now as boottime
 
-from ..domain.throttle import Throttle
+from ..domain.rate_limit import RateLimiter
 from .engine import GONE
 from .models import leadership
 
@@ -238,7 +238,7 @@ class Leadership:
         self._lock = lock
         self._on_elected = on_elected
         self._steady = steady
-        self._rises = Throttle(_RISES_PER_S, _RISES, steady)
+        self._rises = RateLimiter(_RISES_PER_S, _RISES, steady)
         self._held = _NOT_HELD
         """Epoch, and until when it takes itself for the leader; both at once, for other threads read them."""
         self._above = 0

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from skytether.api.printable import printable
 
 from ..config.settings import Logs, syslog_address
-from ..domain.throttle import Throttle
+from ..domain.rate_limit import RateLimiter
 from .audit import ChainFile, Journal, Sink
 
 AUDIT = "skytether.audit"
@@ -164,7 +164,7 @@ class _Few:
     """So many lines of each, and how many were left out before the next."""
 
     def __init__(self, per_s: float, at_once: int, clock: Callable[[], float]) -> None:
-        self._throttle = Throttle(per_s, at_once, clock)
+        self._throttle = RateLimiter(per_s, at_once, clock)
         self._left_out: Counter[str] = Counter()
 
     def take(self, who: str) -> int | None:

@@ -10,7 +10,7 @@ _BUCKETS = 4096
 """Callers that are remembered; of more, the one that was quiet for the longest begins anew."""
 
 
-class Throttle:
+class RateLimiter:
     """A bucket for each caller: a rate that holds on average, and a burst; safe from any thread."""
 
     def __init__(self, rate: float, burst: int, clock: Callable[[], float]) -> None:

@@ -1,4 +1,4 @@
-from skytether.orchestrator.domain.throttle import _BUCKETS, Throttle
+from skytether.orchestrator.domain.rate_limit import _BUCKETS, RateLimiter
 
 
 class Clock:
@@ -16,7 +16,7 @@ class Clock:
 
 def test_a_burst_then_the_rate_and_each_caller_alone() -> None:
     clock = Clock()
-    throttle = Throttle(rate=10, burst=3, clock=clock)
+    throttle = RateLimiter(rate=10, burst=3, clock=clock)
     assert [throttle.wait("a") for _ in range(3)] == [0, 0, 0]
     assert throttle.wait("a") == 0.1
     assert throttle.wait("b") == 0
@@ -29,7 +29,7 @@ def test_a_burst_then_the_rate_and_each_caller_alone() -> None:
 
 def test_a_clock_that_jumps_back_gives_nothing() -> None:
     clock = Clock(100)
-    throttle = Throttle(rate=10, burst=1, clock=clock)
+    throttle = RateLimiter(rate=10, burst=1, clock=clock)
     assert throttle.wait("a") == 0
     clock.advance(-50)
     assert throttle.wait("a") > 0
@@ -37,7 +37,7 @@ def test_a_clock_that_jumps_back_gives_nothing() -> None:
 
 def test_a_large_request_counts_as_several_and_looking_takes_nothing() -> None:
     clock = Clock()
-    throttle = Throttle(rate=10, burst=4, clock=clock)
+    throttle = RateLimiter(rate=10, burst=4, clock=clock)
     assert [throttle.empty("a") for _ in range(9)] == [0.0] * 9
     assert throttle.wait("a") == 0
     throttle.charge("a", 5)  # 3 were left
@@ -51,7 +51,7 @@ def test_a_large_request_counts_as_several_and_looking_takes_nothing() -> None:
 
 def test_callers_are_bounded_in_number() -> None:
     clock = Clock()
-    throttle = Throttle(rate=0.001, burst=1, clock=clock)
+    throttle = RateLimiter(rate=0.001, burst=1, clock=clock)
     for n in range(_BUCKETS + 10):
         throttle.wait(str(n))
     assert len(throttle._buckets) == _BUCKETS
