@@ -24,7 +24,7 @@ from ..access.access import Principal
 from ..config.settings import Limits
 from ..domain.errors import TooManyError, UnauthenticatedError
 from ..domain.overload import Overload
-from .door import GUEST
+from .connections import GUEST
 from .problems import answer, answer_to
 from .refusal_delay import RefusalDelay
 
@@ -182,8 +182,8 @@ class Admission:
         else:
             caller = await run(self._doorman.authenticate, given, address)
         scope.setdefault("state", {}).update({PRINCIPAL: caller, "who": caller.owner, RUN: run})
-        if (guest := scope.get(GUEST)) is not None:
-            guest.know(caller.owner)
+        if (connection := scope.get(GUEST)) is not None:
+            connection.know(caller.owner)
         return caller
 
     @contextlib.contextmanager

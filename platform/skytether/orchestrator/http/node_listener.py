@@ -54,7 +54,7 @@ from ..nodes.enrolment import Enrolment, Known, RemovedError
 from ..nodes.ways import LinkedNode, Ways
 from ..store.engine import GONE
 from ..telemetry.logs import AUDIT
-from .door import Book, Guest, forget_frames, place_of
+from .connections import Connection, ConnectionTable, forget_frames, place_of
 
 log = logging.getLogger(__name__)
 audit = logging.getLogger(AUDIT)
@@ -82,7 +82,7 @@ _ECHOES, _ECHO_PATIENCE_S = 8, 3.0
 """Looks for echoes at once, of all nodes, and how long a node waits for one."""
 
 
-class _Guest(Guest):
+class _NodeConnection(Connection):
     host = ""
     """Whose connection it is; ``address`` is what of it counts as one."""
 
@@ -123,7 +123,7 @@ class NodeListener:
         """Looks for echoes that are under way."""
         self._leave = leave
         self._clock = clock
-        self._book = Book(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
+        self._table = ConnectionTable(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
         self._guesses = RateLimiter(_GUESSES_PER_S, _GUESSES, time.monotonic)
         self._requests = RateLimiter(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
         self._links = RateLimiter(_LINKS_PER_S, _LINKS, time.monotonic)
@@ -202,7 +202,7 @@ class NodeListener:
                 taken, peer = await self._loop.sock_accept(self._listener)
             except OSError as error:  # no file for another one
                 log.warning("a node's connection cannot be taken: %s", error.strerror)
-                gives_way = self._book.stranger()
+                gives_way = self._table.stranger()
                 if gives_way is not None:
                     self._end(gives_way)
                 await asyncio.sleep(0.1)
@@ -214,37 +214,37 @@ class NodeListener:
         address = place_of(host)
         with contextlib.suppress(OSError):  # it is gone already
             keep_alive(taken)
-        has_room, gives_way = self._book.room(address)
+        has_room, gives_way = self._table.room(address)
         if gives_way is not None:
             self._end(gives_way)
         if not has_room:
             taken.close()
             return
-        guest = _Guest(address, self._loop.time() + ANSWER_S, self._know)
-        guest.host = host
-        guest.socket = taken
-        self._book.come(guest)
-        task = self._loop.create_task(self._greet(taken, guest))
+        connection = _NodeConnection(address, self._loop.time() + ANSWER_S, self._know)
+        connection.host = host
+        connection.socket = taken
+        self._table.come(connection)
+        task = self._loop.create_task(self._greet(taken, connection))
         self._tasks.add(task)
 
         def over(done: asyncio.Task[None]) -> None:
             self._tasks.discard(done)
-            if guest.socket is taken:  # it was cancelled before it began
+            if connection.socket is taken:  # it was cancelled before it began
                 taken.close()
 
         task.add_done_callback(over)
 
-    def _know(self, guest: Guest, owner: str) -> None:
-        self._book.know(guest, owner)
+    def _know(self, connection: Connection, owner: str) -> None:
+        self._table.know(connection, owner)
 
-    def _end(self, guest: Guest) -> None:
-        self._book.leave(guest)
-        guest.end()
+    def _end(self, connection: Connection) -> None:
+        self._table.leave(connection)
+        connection.end()
 
     async def _sweep(self) -> None:
         while True:
-            for guest in self._book.late(self._loop.time()):
-                self._end(guest)
+            for connection in self._table.late(self._loop.time()):
+                self._end(connection)
             await asyncio.sleep(0.5)
 
     async def _look(self) -> None:
@@ -264,7 +264,7 @@ class NodeListener:
 
     # One connection
 
-    async def _greet(self, taken: socket.socket, guest: _Guest) -> None:
+    async def _greet(self, taken: socket.socket, connection: _NodeConnection) -> None:
         taken.setblocking(False)
         reader = asyncio.StreamReader(limit=MOST_LINE, loop=self._loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=self._loop)
@@ -274,19 +274,21 @@ class NodeListener:
                 lambda: protocol, taken, ssl=self._context.context, ssl_handshake_timeout=ANSWER_S
             )
             writer = asyncio.StreamWriter(transport, protocol, reader, self._loop)
-            await self._converse(reader, writer, guest)
+            await self._converse(reader, writer, connection)
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError) as error:
             forget_frames(error)  # it left, was late, or speaks something else
         finally:
-            self._book.leave(guest)
-            guest.socket = None
+            self._table.leave(connection)
+            connection.socket = None
             if writer is None:
                 with contextlib.suppress(OSError):  # the loop has it, and closes it when it sees the end
                     taken.shutdown(socket.SHUT_RDWR)
             else:
                 writer.transport.abort()
 
-    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, guest: _Guest) -> None:
+    async def _converse(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, connection: _NodeConnection
+    ) -> None:
         agreed = writer.get_extra_info("ssl_object")
         if agreed.selected_alpn_protocol() != ALPN:
             return  # it wants something else
@@ -294,15 +296,15 @@ class NodeListener:
         request: Request | None = None
         try:
             line = await reader.readuntil(b"\n")
-            guest.deadline = math.inf  # it is our turn
+            connection.deadline = math.inf  # it is our turn
             try:
                 request = read_request(line)
             except ValueError as error:
                 answer: Strict | None = Refused(error=str(error))
             else:
-                answer = await self._answer(request, shown, guest, reader, writer)
+                answer = await self._answer(request, shown, connection, reader, writer)
         except DomainError as error:
-            self._note(request, guest, str(error))
+            self._note(request, connection, str(error))
             final = not isinstance(error, TooManyError)
             answer = Refused(error=str(error)[:2000], final=final)
         except GONE:
@@ -317,7 +319,7 @@ class NodeListener:
         self,
         request: Request,
         shown: bytes | None,
-        guest: _Guest,
+        connection: _NodeConnection,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> Strict | None:
@@ -326,13 +328,13 @@ class NodeListener:
             case Hello():
                 return Welcome(time=self._clock(), authority=self._context.authority)
             case Look() | Join():
-                return await self._let_join(request, guest)
+                return await self._let_join(request, connection)
         if shown is None:
             raise UnauthenticatedError("this takes the certificate of a node that joined")
         certificate = x509.load_der_x509_certificate(shown)
         name = name_in(certificate)
         if isinstance(request, Way):
-            await self._bring(request, name, certificate, guest, (reader, writer))
+            await self._bring(request, name, certificate, connection, (reader, writer))
             return None
         wait = self._requests.wait(name)
         if isinstance(request, Link | Renew):
@@ -348,10 +350,10 @@ class NodeListener:
                 if self._ways.get(name) is None:
                     return Stands(state="gone")
                 return Stands(state="blocked", reason="what is left here is being removed", draining=True)
-            guest.know(f"node:{name}")
+            connection.know(f"node:{name}")
             if isinstance(request, Renew):
                 issued = await asyncio.to_thread(self._enrolment.renew, known, request.request)
-                self._note(request, guest, "", name)
+                self._note(request, connection, "", name)
                 return issued
             if known.ended:
                 text = "this certificate is over: it may be renewed, and nothing else"
@@ -359,12 +361,12 @@ class NodeListener:
             if isinstance(request, Standing):
                 stands = await asyncio.to_thread(self._standing, name)
                 echo = None if stands.state == "gone" else await self._echo_answers(name)
-                return stands.model_copy(update={"seen_as": guest.host, "echo": echo})
+                return stands.model_copy(update={"seen_as": connection.host, "echo": echo})
             if isinstance(request, Leave):
                 stands = await asyncio.to_thread(self._leave, name, request.force)
-                self._note(request, guest, "", name)
+                self._note(request, connection, "", name)
                 return stands
-            node = await self._link(request, known, guest, writer)
+            node = await self._link(request, known, connection, writer)
         if isinstance(node, Refused):
             return node
         why = "the orchestrator ended the link"
@@ -414,8 +416,8 @@ class NodeListener:
             if not self._busy[name]:
                 del self._busy[name]
 
-    async def _let_join(self, request: Look | Join, guest: _Guest) -> Strict:
-        if wait := self._guesses.empty(guest.address):
+    async def _let_join(self, request: Look | Join, connection: _NodeConnection) -> Strict:
+        if wait := self._guesses.empty(connection.address):
             raise TooManyError(wait)
         try:
             if isinstance(request, Look):
@@ -423,15 +425,15 @@ class NodeListener:
                 site = invitation.site
                 urls = self._enrolment.urls
                 return Invited(name=site.name, tier=site.tier, ends_at=invitation.expires_at, urls=urls)
-            node, issued = await asyncio.to_thread(self._enrolment.join, request, guest.host)
+            node, issued = await asyncio.to_thread(self._enrolment.join, request, connection.host)
         except UnauthenticatedError:
-            self._guesses.wait(guest.address)
+            self._guesses.wait(connection.address)
             raise
-        self._note(request, guest, "", node.site)
+        self._note(request, connection, "", node.site)
         return issued
 
     async def _link(
-        self, request: Link, known: Known, guest: _Guest, writer: asyncio.StreamWriter
+        self, request: Link, known: Known, connection: _NodeConnection, writer: asyncio.StreamWriter
     ) -> LinkedNode | Refused:
         """Begin a node's link, unless one is alive: another machine's, or of a program with a copy of its key."""
         name, machine = known.name, request.machine
@@ -443,9 +445,9 @@ class NodeListener:
                 "`skytether site leave --force` on the one that is to be no site, and invite it under another name",
                 final=False,
             )
-        await asyncio.to_thread(self._enrolment.linked, known, machine, request.address, guest.host)
+        await asyncio.to_thread(self._enrolment.linked, known, machine, request.address, connection.host)
         now = asyncio.get_running_loop().time()
-        node = LinkedNode(name, known.node.serial, machine.id, guest.host, writer, heard_at=now)
+        node = LinkedNode(name, known.node.serial, machine.id, connection.host, writer, heard_at=now)
         writer.write(
             line_of(
                 Linked(
@@ -465,7 +467,7 @@ class NodeListener:
         request: Way,
         name: str,
         certificate: x509.Certificate,
-        guest: _Guest,
+        connection: _NodeConnection,
         stream: tuple[asyncio.StreamReader, asyncio.StreamWriter],
     ) -> None:
         """A way to the engine of the node whose certificate it is, and of no other."""
@@ -478,17 +480,17 @@ class NodeListener:
             with self._one_of(name):
                 await asyncio.to_thread(self._enrolment.admit, certificate)
             node.serial = serial_of(certificate)  # it was renewed
-        guest.know(f"node:{name}")
+        connection.know(f"node:{name}")
         if not await self._ways.bring(node, stream):
             raise ForbiddenError("nobody asked for this way")
 
-    def _note(self, request: Request | None, guest: _Guest, refused: str, name: str = "") -> None:
+    def _note(self, request: Request | None, connection: _NodeConnection, refused: str, name: str = "") -> None:
         """In the audit what somebody did whom we know; strangers are told of elsewhere, a few of them."""
         if request is None or isinstance(request, Way):
             return
         fields: dict[str, Any] = {
             "who": f"node:{name}" if name else "nobody",
-            "address": guest.host,
+            "address": connection.host,
             "method": request.do.upper(),
             "path": f"/nodes/{name}" if name else "/nodes",
             "status": 403 if refused else 200,

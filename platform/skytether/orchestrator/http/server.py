@@ -32,7 +32,7 @@ from ..store.engine import AddressError
 from ..telemetry import logs
 from .app import create_app
 from .certificate import LiveCertificate
-from .door import Door, GuardedProtocol
+from .connections import Acceptor, GuardedProtocol
 from .node_serving import serving_nodes
 
 log = logging.getLogger(__name__)
@@ -215,10 +215,10 @@ class _Server(uvicorn.Server):
         most = min(limits.connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
         make = partial(GuardedProtocol, config=self.config, server_state=self.server_state, app_state={})
         overload = self._core.overload
-        doors: list[Any] = [
-            Door(one, make, self._certificate, limits, most, proxies, overload) for one in sockets or ()
+        acceptors: list[Any] = [
+            Acceptor(one, make, self._certificate, limits, most, proxies, overload) for one in sockets or ()
         ]
-        self.servers = doors
+        self.servers = acceptors
         self.started = True
         draft = self._address.with_name("address.new")
         draft.write_text(f"{self._url}\n")

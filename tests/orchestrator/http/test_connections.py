@@ -22,23 +22,23 @@ from uvicorn.server import ServerState
 from skytether.api.splice import closed
 from skytether.orchestrator.config.settings import Limits
 from skytether.orchestrator.domain.overload import Overload
-from skytether.orchestrator.http.door import Book, Door, GuardedProtocol, Guest, place_of
+from skytether.orchestrator.http.connections import Acceptor, Connection, ConnectionTable, GuardedProtocol, place_of
 
 
-def book(most: int = 100, **limits: int) -> Book:
-    return Book(Limits(**limits), most)
+def table(most: int = 100, **limits: int) -> ConnectionTable:
+    return ConnectionTable(Limits(**limits), most)
 
 
-def came(at: Book, address: str = "a", owner: str = "", deadline: float = math.inf) -> Guest:
-    guest = Guest(address, deadline, lambda *_: None)
-    at.come(guest)
+def came(at: ConnectionTable, address: str = "a", owner: str = "", deadline: float = math.inf) -> Connection:
+    connection = Connection(address, deadline, lambda *_: None)
+    at.come(connection)
     if owner:
-        at.know(guest, owner)
-    return guest
+        at.know(connection, owner)
+    return connection
 
 
 def test_of_all_the_oldest_without_a_token_gives_way_and_nobody_with_one() -> None:
-    at = book(most=3)
+    at = table(most=3)
     came(at, owner="robot:a")
     old = came(at, "b")
     came(at, "c")
@@ -54,19 +54,19 @@ def test_of_all_the_oldest_without_a_token_gives_way_and_nobody_with_one() -> No
 
 
 def test_one_address_has_its_share_unless_it_is_a_proxys() -> None:
-    at = book(connections_per_address=2)
+    at = table(connections_per_address=2)
     first = came(at, "a")
     came(at, "a")
     assert at.room("a") == (True, first)
     assert at.room("b") == (True, None)
     assert at.room("a", free=True) == (True, None)
-    for guest in list(at.guests):
-        at.know(guest, "robot:x")
+    for connection in list(at.connections):
+        at.know(connection, "robot:x")
     assert at.room("a") == (False, None)
 
 
 def test_of_a_robots_connections_the_one_that_was_quiet_for_longest_gives_way() -> None:
-    at = book(connections_per_robot=2)
+    at = table(connections_per_robot=2)
     first, second = came(at, owner="robot:a"), came(at, owner="robot:a")
     at.know(first, "robot:a")
     third = came(at)
@@ -80,17 +80,17 @@ def test_of_a_robots_connections_the_one_that_was_quiet_for_longest_gives_way() 
 
 
 def test_those_who_left_are_forgotten() -> None:
-    at = book()
-    guests = [came(at, "a"), came(at, "b", "robot:b"), came(at, "b", "robot:c")]
-    at.know(guests[2], "robot:b")
-    for guest in [*guests, *guests]:
-        at.leave(guest)
-    at.know(guests[0], "robot:a")
-    assert (at.guests, at._at, at._of, at._strangers, at._strange) == (set(), {}, {}, {}, 0)
+    at = table()
+    connections = [came(at, "a"), came(at, "b", "robot:b"), came(at, "b", "robot:c")]
+    at.know(connections[2], "robot:b")
+    for connection in [*connections, *connections]:
+        at.leave(connection)
+    at.know(connections[0], "robot:a")
+    assert (at.connections, at._at, at._of, at._strangers, at._strange) == (set(), {}, {}, {}, 0)
 
 
 def test_of_strangers_the_oldest_of_the_largest_crowd_gives_way() -> None:
-    at = book(strangers=4)
+    at = table(strangers=4)
     robot = came(at, "robot")
     crowd = [came(at, "crowd") for _ in range(3)]
     assert [at.is_alone(one) for one in (robot, *crowd)] == [True, False, False, False]
@@ -105,7 +105,7 @@ def test_of_strangers_the_oldest_of_the_largest_crowd_gives_way() -> None:
 
 
 def test_late_is_who_owes_something_or_does_not_take_what_it_was_sent() -> None:
-    at = book()
+    at = table()
     owes, takes, waits = came(at, deadline=5), came(at), came(at)
     takes.takes_by = 7
     assert at.late(4.9) == []
@@ -138,7 +138,7 @@ async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtoco
     config = Config(app, http=GuardedProtocol, log_config=None, lifespan="off")
     config.load()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        door = Door(
+        door = Acceptor(
             listener,
             lambda: make(config, ServerState(), {}),
             None,
@@ -251,13 +251,13 @@ async def fail_a_handshake(tls: ssl.SSLContext) -> None:
     """Somebody begins to agree upon TLS, and leaves."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         context: Any = SimpleNamespace(context=tls)
-        door = Door(listener, Plain, context, Limits(), 100, (), Overload())
+        door = Acceptor(listener, Plain, context, Limits(), 100, (), Overload())
         try:
             with socket.create_connection(listener.getsockname()) as stranger:
                 stranger.send(b"\x16\x03\x01\x02\x00\x01\x00")
-                while not door.book.guests:
+                while not door.table.connections:
                     await asyncio.sleep(0.005)
-            while door.book.guests:
+            while door.table.connections:
                 await asyncio.sleep(0.005)
         finally:
             door.close()

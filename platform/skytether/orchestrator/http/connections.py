@@ -27,8 +27,8 @@ from .certificate import LiveCertificate
 
 log = logging.getLogger(__name__)
 
-GUEST = "skytether.guest"
-"""Key of the connection's guest in an ASGI scope."""
+GUEST = "skytether.connection"
+"""Key of the connection's connection in an ASGI scope."""
 _SWEEP = 0.5
 """Seconds between two looks for connections that are late."""
 _AT_ONCE = 8
@@ -49,10 +49,10 @@ _PIECE = 1 << 14
 """Bytes that the parser gets at once: what it has of a header that goes on is not told before the next ones."""
 
 
-class Guest:
+class Connection:
     """One connection."""
 
-    def __init__(self, address: str, deadline: float, known: Callable[[Guest, str], None]) -> None:
+    def __init__(self, address: str, deadline: float, known: Callable[[Connection, str], None]) -> None:
         """``deadline`` by the loop's clock: of what it owes us now; ``known`` is called when it shows a token."""
         self._known = known
         self.address = address
@@ -81,25 +81,25 @@ class Guest:
                 self.socket.shutdown(socket.SHUT_RDWR)
 
 
-class Book:
+class ConnectionTable:
     """Who is here. Decides who else may come in, and who gives way: of all, and of each address and owner. Pure."""
 
     def __init__(self, limits: Limits, most: int) -> None:
         """``most``: connections in all."""
         self._limits = limits
         self._most = most
-        self.guests: set[Guest] = set()
+        self.connections: set[Connection] = set()
         self._at: Counter[str] = Counter()
-        self._strangers: dict[str, OrderedDict[Guest, None]] = {}
+        self._strangers: dict[str, OrderedDict[Connection, None]] = {}
         """Without a token so far, by address, the oldest first."""
         self._strange = 0
         """How many these are."""
-        self._of: dict[str, OrderedDict[Guest, None]] = {}
+        self._of: dict[str, OrderedDict[Connection, None]] = {}
         """By owner, the one that was quiet for the longest first."""
 
-    def room(self, address: str, *, free: bool = False) -> tuple[bool, Guest | None]:
+    def room(self, address: str, *, free: bool = False) -> tuple[bool, Connection | None]:
         """Whether another one may come in, and who has to give way for it; ``free``: an address without a bound."""
-        if len(self.guests) >= self._most or self._strange >= self._limits.strangers:
+        if len(self.connections) >= self._most or self._strange >= self._limits.strangers:
             gives_way = self.stranger()
             return gives_way is not None, gives_way
         if not free and self._at[address] >= self._limits.connections_per_address:
@@ -107,66 +107,68 @@ class Book:
             return gives_way is not None, gives_way
         return True, None
 
-    def stranger(self) -> Guest | None:
+    def stranger(self) -> Connection | None:
         """Of the address with most connections without a token, the one that has been here for the longest."""
         crowd = max(self._strangers.values(), key=len, default=None)
         return next(iter(crowd)) if crowd else None
 
-    def is_alone(self, guest: Guest) -> bool:
+    def is_alone(self, connection: Connection) -> bool:
         """Whether its address has no other connection."""
-        return self._at[guest.address] == 1
+        return self._at[connection.address] == 1
 
-    def come(self, guest: Guest) -> None:
+    def come(self, connection: Connection) -> None:
         """It is here now."""
-        self.guests.add(guest)
-        self._at[guest.address] += 1
-        self._strangers.setdefault(guest.address, OrderedDict())[guest] = None
+        self.connections.add(connection)
+        self._at[connection.address] += 1
+        self._strangers.setdefault(connection.address, OrderedDict())[connection] = None
         self._strange += 1
 
-    def know(self, guest: Guest, owner: str) -> Guest | None:
+    def know(self, connection: Connection, owner: str) -> Connection | None:
         """It has shown a good token; perhaps another one of the same owner gives way."""
-        if guest not in self.guests:
+        if connection not in self.connections:
             return None
-        if guest.owner != owner:
-            self._forget_stranger(guest)
-            self._forget_owner(guest)
-            guest.owner = owner
+        if connection.owner != owner:
+            self._forget_stranger(connection)
+            self._forget_owner(connection)
+            connection.owner = owner
         mine = self._of.setdefault(owner, OrderedDict())
-        mine[guest] = None
-        mine.move_to_end(guest)
+        mine[connection] = None
+        mine.move_to_end(connection)
         if owner.startswith("robot:") and len(mine) > self._limits.connections_per_robot:
             return next((one for one in mine if not one.busy), next(iter(mine)))
         return None
 
-    def leave(self, guest: Guest) -> None:
+    def leave(self, connection: Connection) -> None:
         """It is here no more."""
-        if guest not in self.guests:
+        if connection not in self.connections:
             return
-        self.guests.discard(guest)
-        self._forget_stranger(guest)
-        self._forget_owner(guest)
-        self._at[guest.address] -= 1
-        if not self._at[guest.address]:
-            del self._at[guest.address]
+        self.connections.discard(connection)
+        self._forget_stranger(connection)
+        self._forget_owner(connection)
+        self._at[connection.address] -= 1
+        if not self._at[connection.address]:
+            del self._at[connection.address]
 
-    def _forget_stranger(self, guest: Guest) -> None:
-        crowd = self._strangers.get(guest.address)
-        if crowd is not None and guest in crowd:
-            del crowd[guest]
+    def _forget_stranger(self, connection: Connection) -> None:
+        crowd = self._strangers.get(connection.address)
+        if crowd is not None and connection in crowd:
+            del crowd[connection]
             self._strange -= 1
             if not crowd:
-                del self._strangers[guest.address]
+                del self._strangers[connection.address]
 
-    def _forget_owner(self, guest: Guest) -> None:
-        mine = self._of.get(guest.owner)
+    def _forget_owner(self, connection: Connection) -> None:
+        mine = self._of.get(connection.owner)
         if mine is not None:
-            mine.pop(guest, None)
+            mine.pop(connection, None)
             if not mine:
-                del self._of[guest.owner]
+                del self._of[connection.owner]
 
-    def late(self, now: float) -> list[Guest]:
+    def late(self, now: float) -> list[Connection]:
         """Those who owe us something for too long."""
-        return [guest for guest in self.guests if now >= guest.deadline or now >= guest.takes_by]
+        return [
+            connection for connection in self.connections if now >= connection.deadline or now >= connection.takes_by
+        ]
 
 
 class _AheadError(Exception):
@@ -180,8 +182,8 @@ class _HeadError(Exception):
 class GuardedProtocol(HttpToolsProtocol):
     """Uvicorn's, with a deadline for each part of a request, a bound on what is not body, and one request at a time."""
 
-    guest: Guest
-    book: Book
+    connection: Connection
+    table: ConnectionTable
     limits: Limits
     _around = 0
     _head = 0
@@ -195,13 +197,13 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self.guest.protocol = self
+        self.connection.protocol = self
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.book.leave(self.guest)
+        self.table.leave(self.connection)
         super().connection_lost(exc)
         # They hold this, and it holds them: hundreds would wait for the collector, which holds up everybody.
-        self.guest.protocol = self.cycle = None  # type: ignore[assignment]
+        self.connection.protocol = self.cycle = None  # type: ignore[assignment]
 
     def data_received(self, data: bytes) -> None:
         for begin in range(0, len(data), _PIECE):
@@ -234,7 +236,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._around = self._head = 0
         self._reads_head = True
         super().on_message_begin()
-        self.scope[GUEST] = self.guest  # type: ignore[literal-required]
+        self.scope[GUEST] = self.connection  # type: ignore[literal-required]
         if self._idle:  # the first head is due from the moment when the connection was taken
             self._idle = False
             self._owes(self.limits.head_s)
@@ -264,7 +266,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._reads_head, self._reads_body = False, True
         self._owes(self.limits.body_s)
         super().on_headers_complete()
-        self.guest.busy = True
+        self.connection.busy = True
 
     def on_body(self, body: bytes) -> None:
         self._around -= len(body)
@@ -272,8 +274,8 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         self._reads_body = False
-        if self.guest.busy:
-            self.guest.deadline = math.inf  # now it is our turn
+        if self.connection.busy:
+            self.connection.deadline = math.inf  # now it is our turn
         else:
             self._rest()
         super().on_message_complete()
@@ -282,30 +284,30 @@ class GuardedProtocol(HttpToolsProtocol):
         super().on_response_complete()
         # Another request of the connection may wait already; one that was refused may still be sending its body, which
         # is read and thrown away, for who writes does not read an answer before a connection is cut off.
-        self.guest.busy = self.cycle is not None and not self.cycle.response_complete
-        if not self.guest.busy and not self._reads_body:
+        self.connection.busy = self.cycle is not None and not self.cycle.response_complete
+        if not self.connection.busy and not self._reads_body:
             self._rest()
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self.guest.takes_by = self._in(_TAKEN_S)
+        self.connection.takes_by = self._in(_TAKEN_S)
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self.guest.takes_by = math.inf
+        self.connection.takes_by = math.inf
 
     def _rest(self) -> None:
         self._idle = True
         self._owes(self.limits.idle_s)
 
     def _owes(self, seconds: float) -> None:
-        self.guest.deadline = self._in(seconds)
+        self.connection.deadline = self._in(seconds)
 
     def _in(self, seconds: float) -> float:
         return self.loop.time() + seconds
 
 
-class Door:
+class Acceptor:
     """Takes connections from a listener; to Uvicorn it is a server that can be closed."""
 
     def __init__(
@@ -340,7 +342,7 @@ class Door:
         self._told_at = -math.inf
         self._most_here = 0
         """Since memory was given back."""
-        self.book = Book(limits, most)
+        self.table = ConnectionTable(limits, most)
         listener.setblocking(False)
         self._open = True
         self._loop.add_reader(listener.fileno(), self._take)
@@ -359,8 +361,8 @@ class Door:
             task.cancel()
         await asyncio.gather(self._sweeping, *self._tasks, return_exceptions=True)
 
-    def _know(self, guest: Guest, owner: str) -> None:
-        gives_way = self.book.know(guest, owner)
+    def _know(self, connection: Connection, owner: str) -> None:
+        gives_way = self.table.know(connection, owner)
         if gives_way is not None:
             self._end(gives_way)
 
@@ -377,9 +379,9 @@ class Door:
 
     def _admit(self, taken: socket.socket, host: str) -> None:
         address, proxy = place_of(host), self._is_proxy(host)
-        has_room, gives_way = self.book.room(address, free=proxy)
+        has_room, gives_way = self.table.room(address, free=proxy)
         if gives_way is not None:
-            if self.book.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
+            if self.table.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
                 self._overload.note()
             self._end(gives_way)
         if not has_room:
@@ -387,23 +389,23 @@ class Door:
             self._overload.note()
             self._tell("no room for a connection from %s: all that are open have shown a token", address)
             return
-        guest = Guest(address, self._loop.time() + self._limits.head_s, self._know)
-        self.book.come(guest)
+        connection = Connection(address, self._loop.time() + self._limits.head_s, self._know)
+        self.table.come(connection)
         if proxy:
-            self.book.know(guest, f"proxy {address}")
-        task = self._loop.create_task(self._greet(taken, guest))
+            self.table.know(connection, f"proxy {address}")
+        task = self._loop.create_task(self._greet(taken, connection))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _greet(self, taken: socket.socket, guest: Guest) -> None:
+    async def _greet(self, taken: socket.socket, connection: Connection) -> None:
         taken.setblocking(False)
-        guest.socket = taken
+        connection.socket = taken
         protocol: Any = None
 
         def make() -> Any:
             nonlocal protocol
             protocol = self._make()
-            protocol.guest, protocol.book, protocol.limits = guest, self.book, self._limits
+            protocol.connection, protocol.table, protocol.limits = connection, self.table, self._limits
             return protocol
 
         agreed = {"ssl": self._tls.context, "ssl_handshake_timeout": self._limits.head_s} if self._tls else {}
@@ -411,22 +413,22 @@ class Door:
             await self._loop.connect_accepted_socket(make, taken, **agreed)  # type: ignore[arg-type]
         except (OSError, asyncio.CancelledError) as error:  # it left, or what it speaks is no TLS
             forget_frames(error)
-            self.book.leave(guest)
+            self.table.leave(connection)
             taken.close()
             if protocol is not None:
                 protocol.parser = None  # it holds the protocol, which holds it: thousands would wait for the collector
         finally:
-            guest.socket = None
+            connection.socket = None
 
-    def _end(self, guest: Guest) -> None:
-        self.book.leave(guest)
-        guest.end()
+    def _end(self, connection: Connection) -> None:
+        self.table.leave(connection)
+        connection.end()
 
     def _without_files(self, error: OSError) -> None:
         """Robots that would come in now cannot: a stranger gives way, and the next attempt is a moment later."""
         self._overload.note()
         self._tell("a connection cannot be taken: %s", error.strerror)
-        gives_way = self.book.stranger()
+        gives_way = self.table.stranger()
         if gives_way is not None:
             self._end(gives_way)
         self._loop.remove_reader(self._listener.fileno())
@@ -440,9 +442,9 @@ class Door:
         while True:
             self._overload.beat()
             now = self._loop.time()
-            for guest in self.book.late(now):
-                self._end(guest)
-            here = len(self.book.guests)
+            for connection in self.table.late(now):
+                self._end(connection)
+            here = len(self.table.connections)
             self._most_here = max(self._most_here, here)
             if self._most_here - here >= _CROWD:
                 self._most_here = here
