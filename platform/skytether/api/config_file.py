@@ -8,8 +8,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
-from skytether.api.faults import explain
 from skytether.api.manifest import Strict
+from skytether.api.validation_errors import explain
 from skytether.api.yaml import YamlError, parse_yaml, read_bounded
 
 _Model = TypeVar("_Model", bound=BaseModel)

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from .plain import oddity
+from .document_checks import oddity
 
 MAX_BYTES = 1 << 20
 _MAX_VALUES = 10_000

@@ -72,7 +72,7 @@ def need(kind: str, name: str, there: Callable[[], list[str]]) -> None:
     ``there`` asks for those there are; a token that may not see them does without.
     """
     from skytether.api.client import ApiError
-    from skytether.api.faults import known
+    from skytether.api.validation_errors import known
 
     try:
         found = there()

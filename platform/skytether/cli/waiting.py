@@ -78,7 +78,7 @@ class Lines:
 
     def line(self, event: InstanceEvent) -> str:
         """What to print; empty: nothing."""
-        from skytether.api.pull import read_pull
+        from skytether.api.pull_progress import read_pull
 
         line = f"{event.instance}: {event.state}" + (f": {event.reason}" if event.reason else "")
         pull = read_pull(event.reason)
@@ -114,7 +114,7 @@ class _Bar:
 
     def show(self, event: InstanceEvent) -> None:
         """Overwrite what was shown."""
-        from skytether.api.pull import read_pull
+        from skytether.api.pull_progress import read_pull
 
         pull = read_pull(event.reason)
         text = f"{event.state}: {event.reason}" if event.reason else str(event.state)

@@ -87,8 +87,8 @@ def add_group(
     """Add a group. It makes machines, so only the token in the orchestrator's state folder may."""
     from pydantic import ValidationError
 
-    from skytether.api.faults import explain
     from skytether.api.groups import GroupCreate
+    from skytether.api.validation_errors import explain
 
     given = {
         "name": name,

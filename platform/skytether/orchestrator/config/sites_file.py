@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from skytether.api.faults import Fault
 from skytether.api.groups import GroupCreate
 from skytether.api.rest import SiteCreate
+from skytether.api.validation_errors import Fault
 from skytether.api.yaml import YamlError, read_yaml
 
 from ..domain.errors import InvalidError

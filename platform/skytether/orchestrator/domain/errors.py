@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from skytether.api.faults import Fault as Fault
+from skytether.api.validation_errors import Fault as Fault
 
 
 class DomainError(Exception):

@@ -13,7 +13,7 @@ from referencing import Registry
 from referencing.exceptions import Unresolvable
 from referencing.jsonschema import DRAFT202012
 
-from skytether.api.faults import MAX_FAULTS, Fault, explain, unknown
+from skytether.api.validation_errors import MAX_FAULTS, Fault, explain, unknown
 
 from .errors import InvalidError
 from .patterns import PatternError, wrong_with

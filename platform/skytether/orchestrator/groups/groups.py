@@ -13,9 +13,9 @@ from pathlib import Path
 
 from typing_extensions import override
 
-from skytether.api.faults import Fault, known
 from skytether.api.groups import GroupCreate
 from skytether.api.manifest import Strict
+from skytether.api.validation_errors import Fault, known
 
 from ..domain.errors import ConflictError, ForbiddenError, InvalidError, NotFoundError
 from ..domain.validation import parse

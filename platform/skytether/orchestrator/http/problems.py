@@ -14,8 +14,8 @@ from sqlalchemy.exc import ProgrammingError
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skytether.api.faults import MAX_FAULTS, faults
 from skytether.api.rest import Problem
+from skytether.api.validation_errors import MAX_FAULTS, faults
 
 from ..domain.errors import (
     ConflictError,

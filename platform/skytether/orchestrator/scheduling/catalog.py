@@ -10,9 +10,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from skytether.api.faults import known
 from skytether.api.manifest import Manifest
 from skytether.api.rest import Change
+from skytether.api.validation_errors import known
 from skytether.api.yaml import YamlError, read_yaml
 
 from ..config.settings import CatalogScope as Allowed

@@ -13,9 +13,9 @@ from typing import Any
 
 from typing_extensions import override
 
-from skytether.api.faults import known
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
+from skytether.api.validation_errors import known
 
 from ..config.settings import Timing
 from ..config.sites_file import stored_as

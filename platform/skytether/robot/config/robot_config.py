@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from skytether.api.config_file import ConfigError, Endpoint, read_config
+from skytether.api.document_checks import oddity
 from skytether.api.manifest import Name, Strict
-from skytether.api.plain import oddity
 from skytether.api.plain_http import is_readable_on_the_way
 from skytether.bridge.local_network import LocalNetwork
 from skytether.messages import type_of

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
-from skytether.api.pull import Pull, read_pull
+from skytether.api.pull_progress import Pull, read_pull
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.containers import last_line
 from skytether.orchestrator.runtimes.docker import DockerRuntime

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from skytether.api.plain import oddity
+from skytether.api.document_checks import oddity
 from skytether.api.rest import PATH_NAME, Problem, Scope
 
 from ...access.access import Principal

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from docker.auth import AuthConfig, load_config, resolve_authconfig, resolve_repository_name
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
 
-from skytether.api.pull import Pull
+from skytether.api.pull_progress import Pull
 
 from ..base import RuntimeFailure
 from ..containers import is_pulled

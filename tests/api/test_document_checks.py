@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from skytether.api.document_checks import DEPTH, KEYS, LISTED_KEYS, oddity
 from skytether.api.manifest import ServiceSpec, TopicSpec
-from skytether.api.plain import DEPTH, KEYS, LISTED_KEYS, oddity
 from skytether.api.rest import MOST_TOPICS, Report, TopicReport
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from math import isfinite
 from typing import Any
 
-from .faults import Fault
+from .validation_errors import Fault
 
 DEPTH = 64
 """Levels of a document: what is deeper would exhaust the stack of some reader. People need ten."""
