@@ -91,7 +91,7 @@ TOGETHER = (
     "orchestrator/runtimes/kubernetes/test_kubernetes_storm.py",
     "orchestrator/runtimes/test_left_behind.py",
     "orchestrator/store/test_migrations.py",
-    "orchestrator/scheduling/test_moves.py",
+    "orchestrator/scheduling/test_successors.py",
     "orchestrator/test_navigation_image.py",
     "orchestrator/http/test_openapi.py",
     "orchestrator/scheduling/test_plan.py",

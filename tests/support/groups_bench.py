@@ -9,19 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from reconcile_bench import Passes
+
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Limits, Timing, Weights
 from skytether.orchestrator.domain.records import Record
-from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.groups.demand import Demand
 from skytether.orchestrator.groups.groups import Groups
 from skytether.orchestrator.groups.scaler import Scaler
 from skytether.orchestrator.providers.base import Invitation, Provider
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
-from skytether.orchestrator.scheduling.catalog import Catalog
-from skytether.orchestrator.scheduling.moves import Moves
-from skytether.orchestrator.scheduling.reconcile import Reconciler
+from skytether.orchestrator.scheduling.placer import Placer
 from skytether.orchestrator.scheduling.sites import Site, Sites
 from skytether.orchestrator.store.leader import ALONE, Lead
 from skytether.orchestrator.store.store import Store
@@ -58,52 +57,32 @@ class GroupsBench:
     def start(self) -> None:
         clock, store = self.clock, self.store
         self.metrics = Metrics(list, 64)
-        self.reconciler = Reconciler(
-            store,
-            Secrets(self.folder),
-            self.metrics,
-            Timing(),
-            Limits(),
-            Weights(),
-            clock,
-            lambda: None,
-            self.lead,
-            steady=clock.steady,
-        )
         self.sites = Sites(self.folder / "sites", store, _look, Timing(site_silent=1e9), self._runtime)
-        self.reconciler.sites = self.sites
-        self.moves = Moves(
+        self.placer = Placer(
             store,
-            Catalog(store),
-            lambda: self.sites,
-            self.reconciler.weigh,
-            self.reconciler.promised,
-            clock,
-            Timing(),
+            self.sites,
             Weights(),
+            self.lead,
+            clock.steady,
+            prospects=lambda record: self.demand.prospects(record),
         )
-        self.reconciler.moves = self.moves
-        self.demand = Demand(
-            store,
-            lambda: self.groups,
-            lambda: self.sites,
-            self.reconciler.promised,
-            clock,
-            Weights(),
-            steady=clock.steady,
+        self.passes = Passes(
+            self.folder, store, self.sites, self.placer, self.metrics, clock, lambda: None, Limits(), self.lead
+        )
+        self.demand: Demand = Demand(
+            store, lambda: self.groups, lambda: self.sites, self.placer.promised, clock, Weights(), steady=clock.steady
         )
         self.scaler = Scaler(
             store,
             lambda: self.groups,
             lambda: self.sites,
-            self.moves,
+            self.passes.successors,
             self.demand,
             self.lead,
             clock,
             lambda machine, group, options: Invitation("https://orchestrator", f"token-of-{machine}"),
             steady=clock.steady,
         )
-        self.reconciler.prospects = self.demand.prospects
         self.groups = Groups(self.folder / "groups", store, lambda _: 3600.0, self._provider)
         self.sites.refresh()
         for site in self.sites.all():
@@ -173,16 +152,16 @@ class GroupsBench:
         for _ in range(times):
             self.clock.forward(seconds)
             self.groups.refresh()
-            self.reconciler.place_step()
+            self.passes.placement.step()
             for site in self.sites.all():
                 if site.ender is not None:
                     site.ender.join()
             for site in self.sites.all():
-                self.reconciler.site_step(site)
+                self.passes.reconciler.site_step(site)
             for group in self.groups.all():
                 self.scaler.turn(group)
             for site in self.sites.all():
-                self.reconciler.site_step(site)
+                self.passes.reconciler.site_step(site)
 
     def stages(self) -> list[Stage]:
         return [machine.stage for machine in self.store.machines()]

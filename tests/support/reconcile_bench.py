@@ -1,29 +1,41 @@
-"""A reconciler of which a test makes the steps: made-up time, a real store, a runtime that runs nothing."""
+"""The passes of which a test makes the steps: made-up time, a real store, a runtime that runs nothing."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from skytether.api.rest import SiteCreate
+from skytether.api.rest import SiteCreate, Size
 from skytether.orchestrator.config.settings import Limits, Timing, Weights
 from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.scheduling.catalog import Catalog
-from skytether.orchestrator.scheduling.moves import Moves
+from skytether.orchestrator.scheduling.leases import Leases
+from skytether.orchestrator.scheduling.placement_pass import PlacementPass
+from skytether.orchestrator.scheduling.placer import Placer
 from skytether.orchestrator.scheduling.reconcile import Reconciler
-from skytether.orchestrator.scheduling.sites import Site
+from skytether.orchestrator.scheduling.sites import Site, Sites
+from skytether.orchestrator.scheduling.standbys import Standbys
+from skytether.orchestrator.scheduling.successors import Successors
+from skytether.orchestrator.store.leader import ALONE, Lead
 from skytether.orchestrator.store.store import Store
 from skytether.orchestrator.telemetry.metrics import Metrics
 from skytether.testing.runtimes import FakeOptions, FakeRuntime
+
+PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
 
 
 class FixedSites:
     """Sites whose threads never run: the test makes the steps."""
 
-    def __init__(self, *sites: Site) -> None:
-        self._sites = {site.name: site for site in sites}
+    def __init__(self) -> None:
+        self._sites: dict[str, Site] = {}
+
+    def add(self, site: Site) -> None:
+        """There is another one."""
+        self._sites[site.name] = site
 
     def all(self) -> list[Site]:
         return list(self._sites.values())
@@ -38,51 +50,88 @@ class FixedSites:
         """None is drained."""
 
 
+class Passes:
+    """The placement pass and the pass over a site, with what they share, over sites that are there."""
+
+    def __init__(
+        self,
+        folder: Path,
+        store: Store,
+        sites: Sites,
+        placer: Placer,
+        metrics: Metrics,
+        clock: Any,
+        wake_placer: Callable[[], None],
+        limits: Limits,
+        lead: Lead = ALONE,
+        overload: Overload | None = None,
+        left: Callable[[str], Size] = lambda _: PLENTY,
+    ) -> None:
+        timing, weights = Timing(), Weights()
+        self.standbys = Standbys(store, Catalog(store), sites, placer, clock, timing, weights)
+        self.successors = Successors(store, sites, placer, self.standbys, clock, timing, weights)
+        self.leases = Leases(store, clock, timing.place, self._forget, lead, clock.steady, overload)
+        both = self.leases, self.standbys, self.successors, metrics, timing
+        self.placement = PlacementPass(store, sites, placer, *both, limits, clock, clock.steady)
+        self.reconciler = Reconciler(
+            store, Secrets(folder), placer, *both, clock, wake_placer, lead, clock.steady, left=left
+        )
+
+    def _forget(self) -> None:
+        self.standbys.clock_was_set()
+        self.successors.clock_was_set()
+
+
 class Bench:
-    """A reconciler over one site, ``lab``; a test may add others."""
+    """Passes over one site, ``lab``; a test may add others."""
 
     def __init__(self, folder: Path, store: Store, clock: Any, kind: type[FakeRuntime] = FakeRuntime, **options: Any):
         self.store, self.clock = store, clock
+        self.folder = folder
         self.woken = 0
         self.metrics = Metrics(list, 64)
         self.overload = Overload(clock.steady)
-        self.reconciler = self._reconciler(folder)
+        self.limits = Limits(ended_count=1)
+        self.lead: Lead = ALONE
+        self.left: Callable[[str], Size] = lambda _: PLENTY
+        self.sites = FixedSites()
         self.runtime = kind("lab", folder, FakeOptions(**options))
-        self.site = self._site()
+        self._start()
+        self.site = self._site("lab", self.runtime)
 
-    def _reconciler(self, folder: Path) -> Reconciler:
-        return Reconciler(
+    def _start(self) -> None:
+        sites: Any = self.sites
+        self.placer = Placer(self.store, sites, Weights(), self.lead, self.clock.steady)
+        passes = Passes(
+            self.folder,
             self.store,
-            Secrets(folder),
+            sites,
+            self.placer,
             self.metrics,
-            Timing(),
-            Limits(ended_count=1),
-            Weights(),
             self.clock,
             self._wake,
-            steady=self.clock.steady,
-            overload=self.overload,
+            self.limits,
+            self.lead,
+            self.overload,
+            lambda robot: self.left(robot),
         )
+        self.placement, self.reconciler, self.leases = passes.placement, passes.reconciler, passes.leases
+        self.standbys, self.successors = passes.standbys, passes.successors
 
-    def _site(self) -> Site:
-        asked = SiteCreate(name="lab", tier="edge", runtime="fake")
-        site = Site(asked, self.runtime, self.reconciler.site_step, Timing(site_silent=1e9))
-        self._let_know(site)
-        reconciler, catalog, sites = self.reconciler, Catalog(self.store), self.reconciler.sites
-        reconciler.moves = Moves(
-            self.store, catalog, lambda: sites, reconciler.weigh, reconciler.promised, self.clock, Timing(), Weights()
-        )
+    def _site(self, name: str, runtime: FakeRuntime) -> Site:
+        asked = SiteCreate(name=name, tier="edge", runtime="fake")
+        site = Site(asked, runtime, lambda site: self.reconciler.site_step(site), Timing(site_silent=1e9))
+        self.sites.add(site)
         return site
 
-    def _let_know(self, *sites: Site) -> None:
-        self.reconciler.sites = FixedSites(*sites)  # type: ignore[assignment]
+    def led_by(self, lead: Lead, limits: Limits | None = None) -> None:
+        """Begin anew, over the same sites, as who leads by this."""
+        self.lead, self.limits = lead, limits or self.limits
+        self._start()
 
     def beside(self, folder: Path, kind: type[FakeRuntime] = FakeRuntime, **options: Any) -> Site:
         """Another site, ``other``; at equal scores it comes second."""
-        asked = SiteCreate(name="other", tier="edge", runtime="fake")
-        runtime = kind("other", folder, FakeOptions(**options))
-        other = Site(asked, runtime, self.reconciler.site_step, Timing(site_silent=1e9))
-        self._let_know(self.site, other)
+        other = self._site("other", kind("other", folder, FakeOptions(**options)))
         self.reconciler.site_step(other)
         return other
 
@@ -93,12 +142,13 @@ class Bench:
         """The orchestrator is killed and comes back; what runs runs on."""
         self.runtime = type(self.runtime)("lab", folder, FakeOptions(), self.runtime.world)
         self.overload = Overload(self.clock.steady)
-        self.reconciler = self._reconciler(folder)
-        self.site = self._site()
+        self.folder, self.sites = folder, FixedSites()
+        self._start()
+        self.site = self._site("lab", self.runtime)
 
     def step(self, times: int = 1) -> float:
         for _ in range(times):
-            self.reconciler.place_step()
+            self.placement.step()
             delay = self.reconciler.site_step(self.site)
         return delay
 

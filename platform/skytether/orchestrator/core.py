@@ -42,10 +42,14 @@ from .runtimes.base import Runtime
 from .scheduling.catalog import Catalog
 from .scheduling.events import Broker
 from .scheduling.instances import Instances
+from .scheduling.leases import Leases
 from .scheduling.loops import Loop
-from .scheduling.moves import Moves
+from .scheduling.placement_pass import PlacementPass
+from .scheduling.placer import Placer
 from .scheduling.reconcile import Reconciler
 from .scheduling.sites import Sites, load_runtime
+from .scheduling.standbys import Standbys
+from .scheduling.successors import Successors
 from .store.engine import GONE
 from .store.leader import Leadership
 from .store.store import Store
@@ -112,35 +116,65 @@ class Orchestrator:
             lambda: self.leadership.epoch,
             self._group_gauges,
         )
-        self.leadership = Leadership(self.store.lock(), lambda: self.reconciler.owe_leases())
+        self.leadership = Leadership(self.store.lock(), lambda: self._leases.owe())
         self.catalog = Catalog(self.store, settings.catalog)
         self.overload = Overload()
-        throttle = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
-        self.access = Access(self.store, secrets, clock, throttle)
+        limiter = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
+        self.access = Access(self.store, secrets, clock, limiter)
         self.stop_orders = StopOrders(self.store, clock)
-        self.reconciler = Reconciler(
-            self.store,
-            secrets,
-            self.metrics,
-            settings.timing,
-            settings.limits,
-            settings.weights,
-            clock,
-            self._wake_placer,
-            self.leadership,
-            overload=self.overload,
-            site_instances=settings.quotas.site_instances,
-            disk_usage=self.disk_usage,
-            left=self.quotas.left,
-        )
-        self.sites = Sites(
+        self.sites: Sites = Sites(
             settings.state_dir / "sites",
             self.store,
-            self._unless_outdated(self.reconciler.site_turn),
+            self._unless_outdated(lambda site: self.reconciler.site_turn(site)),
             settings.timing,
             find_runtime,
         )
-        self.reconciler.sites = self.sites
+        placer = Placer(
+            self.store,
+            self.sites,
+            settings.weights,
+            self.leadership,
+            site_instances=settings.quotas.site_instances,
+            disk_usage=self.disk_usage,
+            prospects=lambda record: demand.prospects(record),
+        )
+        standbys = Standbys(self.store, self.catalog, self.sites, placer, clock, settings.timing, settings.weights)
+        successors = Successors(self.store, self.sites, placer, standbys, clock, settings.timing, settings.weights)
+
+        def forget() -> None:
+            standbys.clock_was_set()
+            successors.clock_was_set()
+
+        self._leases: Leases = Leases(
+            self.store, clock, settings.timing.place, forget, self.leadership, overload=self.overload
+        )
+        placement = PlacementPass(
+            self.store,
+            self.sites,
+            placer,
+            self._leases,
+            standbys,
+            successors,
+            self.metrics,
+            settings.timing,
+            settings.limits,
+            clock,
+        )
+        self.reconciler: Reconciler = Reconciler(
+            self.store,
+            secrets,
+            placer,
+            self._leases,
+            standbys,
+            successors,
+            self.metrics,
+            settings.timing,
+            clock,
+            self._wake_placer,
+            self.leadership,
+            disk_usage=self.disk_usage,
+            left=self.quotas.left,
+        )
         self.authority: Authority | None = None
         self.nodes: Enrolment | None = None
         """Machines that joined; None: none can."""
@@ -152,23 +186,12 @@ class Orchestrator:
             self.nodes = Enrolment(
                 self.store, lambda: self.sites, self.authority, clock, days, renew_days, settings.nodes.urls
             )
-        moves = Moves(
-            self.store,
-            self.catalog,
-            lambda: self.sites,
-            self.reconciler.weigh,
-            self.reconciler.promised,
-            clock,
-            settings.timing,
-            settings.weights,
-        )
-        self.reconciler.moves = moves
         invites = MachineInvites(self.nodes, settings.nodes.urls)
-        demand = Demand(
+        demand: Demand = Demand(
             self.store,
             lambda: self.groups,
             lambda: self.sites,
-            self.reconciler.promised,
+            placer.promised,
             clock,
             settings.weights,
         )
@@ -176,7 +199,7 @@ class Orchestrator:
             self.store,
             lambda: self.groups,
             lambda: self.sites,
-            moves,
+            successors,
             demand,
             self.leadership,
             clock,
@@ -184,23 +207,23 @@ class Orchestrator:
             wake_placer=self._wake_placer,
             forget_site=self.metrics.forget_site,
         )
-        self.reconciler.prospects = demand.prospects
-        self.groups = Groups(
+        self.groups: Groups = Groups(
             settings.state_dir / "groups",
             self.store,
             self._unless_outdated(self.scaler.turn),
             find_provider,
             invites.lacks,
         )
-        self.placer = Loop("placer", self._unless_outdated(self.reconciler.place_turn), time.monotonic)
+        self.placer = Loop("placer", self._unless_outdated(placement.turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
         self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(
             self.store,
             self.catalog,
             self.sites,
-            self.reconciler,
-            moves,
+            placer,
+            standbys,
+            successors,
             self.metrics,
             self.reports,
             self.gates,

@@ -107,7 +107,7 @@ def test_ended_instances_are_kept_for_their_time_by_the_databases_clock_not_by_t
     shared.look()
     shared.steady = clock.steady
     b = Bench(tmp_path, store, shared)
-    b.reconciler._limits = Limits()
+    b.led_by(b.lead, Limits())
     add(b, new_record())
     add(b, new_record("elsewhere", state=State.STOPPED))
     b.step(2)

@@ -114,10 +114,10 @@ def test_who_waits_is_told_what_the_group_does(made: Made) -> None:
     assert reason("c").endswith("cloud: needs 5 cores, the site has 4")
     record = bench.store.get("b")
     assert record is not None
-    assert not bench.reconciler.weigh(record, {}).hopeless
+    assert not bench.placer.weigh(record, {}).hopeless
     record = bench.store.get("c")
     assert record is not None
-    assert bench.reconciler.weigh(record, {}).hopeless, "no site, and no machine, could take it"
+    assert bench.placer.weigh(record, {}).hopeless, "no site, and no machine, could take it"
     bench.groups.delete("cloud", drain=True)
     bench.groups.refresh()
     record = bench.store.get("b")

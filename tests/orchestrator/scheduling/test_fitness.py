@@ -147,9 +147,9 @@ def test_who_names_a_site_gets_it_and_one_that_runs_there_is_good_enough(bench: 
     b = bench()
     fail(b.site.fitness, new_record(), b.clock.steady())
     record = new_record()
-    assert b.reconciler.weigh(record).site is None
-    assert b.reconciler.weigh(record, {}, runs=True).site == "lab"
-    assert b.reconciler.weigh(new_record(pinned="lab")).site == "lab"
+    assert b.placer.weigh(record).site is None
+    assert b.placer.weigh(record, {}, runs=True).site == "lab"
+    assert b.placer.weigh(new_record(pinned="lab")).site == "lab"
 
 
 def test_who_leads_anew_holds_nothing_against_a_site(

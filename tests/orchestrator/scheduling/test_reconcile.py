@@ -56,7 +56,7 @@ def test_of_a_crowd_those_that_are_ready_do_not_wait_until_the_last_ones_are_sta
     names = [f"i{number}" for number in range(45)]
     for name in names:
         add(b, new_record(name, lease_expires_at=b.clock() + 1000.0))
-    b.reconciler.place_step()
+    b.placement.step()
     for _ in range(60):
         b.reconciler.site_step(b.site)
     assert {(b.record(name).state, b.record(name).attempt) for name in names} == {(State.RUNNING, 1)}
@@ -80,11 +80,11 @@ def test_a_crowd_is_placed_by_few_transactions_and_who_left_meanwhile_takes_no_r
         return change_all(asked, now)
 
     monkeypatch.setattr(b.store, "change_all", place)
-    b.reconciler.place_step()
+    b.placement.step()
     assert sizes == [16, 16, 8]
     states = [b.record(name).state for name in names]
     assert (states.count(State.STARTING), states.count(State.STOPPED)) == (39, 1)
-    assert b.reconciler.promised()["lab"].instances == 39
+    assert b.placer.promised()["lab"].instances == 39
 
 
 def test_looks_are_quick_while_something_changes_and_slow_when_not(bench: Any, new_record: NewRecord) -> None:
@@ -238,14 +238,14 @@ def test_what_is_moved_does_not_go_where_it_could_not_be_started(
     b.reconciler.site_step(other)
     b.reconciler.site_step(other)
     assert b.record().site == "other"
-    moves = b.reconciler.moves
+    successors = b.successors
     monkeypatch.setattr(b.store, "reports", lambda _: {"i1": {"control_source": "fallback", "rtt_s": 0.3}})
     for _ in range(3):
-        moves.watch(b.store.live())
+        successors.watch(b.store.live())
         b.clock.forward(100)
     assert b.store.successor("i1") is None
-    assert b.reconciler.weigh(moves.successor_of(b.record())).refused[0].reason == "start"
-    assert b.reconciler.weigh(moves.successor_of(b.record(), "lab")).site == "lab", "the operator wants it"
+    assert b.placer.weigh(successors.successor_of(b.record())).refused[0].reason == "start"
+    assert b.placer.weigh(successors.successor_of(b.record(), "lab")).site == "lab", "the operator wants it"
 
 
 def test_what_no_site_can_start_fails_with_all_reasons(bench: Any, new_record: NewRecord, tmp_path: Path) -> None:
@@ -282,7 +282,7 @@ def test_a_standby_that_cannot_be_started_waits_for_no_room(
 ) -> None:
     b = bench(RefusingRuntime)
     other = b.beside(tmp_path, cpu=1)
-    monkeypatch.setattr(b.reconciler.moves, "keep_spares", lambda: None)
+    monkeypatch.setattr(b.standbys, "keep", lambda: None)
     add(b, new_record("i0", pinned="other", lease_expires_at=b.clock() + 1000))
     b.step()
     b.reconciler.site_step(other)
@@ -348,21 +348,21 @@ def test_what_runs_at_a_site_that_is_blocked_stays_as_good_as_it_was(
 ) -> None:
     b = bench(BlockedRuntime)
     b.runtime.obstacle = ""
-    monkeypatch.setattr(b.reconciler.moves, "keep_spares", lambda: None)
+    monkeypatch.setattr(b.standbys, "keep", lambda: None)
     add(b, new_record("i1", robot="", spare=True, lease_expires_at=b.clock() + 1e9))
     near = {"lab": {"rtt_ms": 5.0}, "other": {"rtt_ms": 300.0}}
     add(b, new_record("i2", measurements=near, lease_expires_at=b.clock() + 1e9))
     b.step(2)
     b.runtime.obstacle = "the network is missing"
     b.beside(tmp_path)
-    moves = b.reconciler.moves
-    assert [spare.id for spare in moves.spares_for(new_record("i3", measurements=near))] == ["i1"]
+    successors = b.successors
+    assert [spare.id for spare in b.standbys.fitting(new_record("i3", measurements=near))] == ["i1"]
     report = {"control_source": "fallback", "rtt_s": 0.005}
     monkeypatch.setattr(b.store, "reports", lambda _: {"i2": report})
     for _ in range(2):
-        moves.watch(b.store.live())
+        successors.watch(b.store.live())
         b.clock.forward(100)
-    moves.watch(b.store.live())
+    successors.watch(b.store.live())
     assert b.store.successor("i2") is None, "the other one is worse"
 
 

@@ -80,12 +80,12 @@ def test_room_is_kept_from_when_it_is_asked_for_and_given_back_when_it_is_done(r
     assert b.record().holds == TWO
     assert use_of([b.record()]).cpu == 2
     b.step()
-    promised = b.reconciler.promised()["lab"]
+    promised = b.placer.promised()["lab"]
     assert (promised.cpu, promised.memory_mb) == (2, 512)
     want(b, Size(cpu=0.5, memory_mb=128))
     assert b.record().holds == TWO, "until it is done"
     b.step()
-    assert b.reconciler.promised()["lab"].cpu == 0.5
+    assert b.placer.promised()["lab"].cpu == 0.5
 
 
 def test_a_run_that_is_started_again_has_the_size_it_had(running: Any, tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_where_nothing_can_it_keeps_what_it_has_and_says_so(running: Any) -> Non
         "site lab does not give it 2 cores and 512 MiB: its nodes have no room, and nothing else takes"
     )
     assert text.endswith("it keeps 1 core and 256 MiB")
-    assert b.reconciler.promised()["lab"].cpu == 1
+    assert b.placer.promised()["lab"].cpu == 1
     assert sample(b.metrics.text().decode(), "skytether_instance_resize_failures_total", site="lab") == 1.0
 
 
@@ -251,7 +251,7 @@ def test_it_never_gets_more_than_its_site_has_left_and_then_moves_if_another_has
 
 def test_it_never_gets_more_than_its_robot_may_have(running: Any) -> None:
     b = running(SCALED)
-    b.reconciler._resizing._left = lambda robot: Size(cpu=3 - b.record().has.cpu, memory_mb=0)
+    b.left = lambda robot: Size(cpu=3 - b.record().has.cpu, memory_mb=0)
     play(b, 100, cores=10, mib=250)
     assert b.record().has == Size(cpu=3, memory_mb=256)
     assert told(b)[-1].endswith("its robot may have no more")

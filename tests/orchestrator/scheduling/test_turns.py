@@ -109,7 +109,7 @@ def test_a_crash_that_a_renewal_came_before_is_dealt_with_at_once(
 def test_what_comes_and_goes_is_looked_at_alone(running: Any, new_record: NewRecord) -> None:
     b, reads = running(SlowRuntime)
     add(b, new_record("i2", lease_s=1000, lease_expires_at=b.clock() + 1000))
-    b.reconciler.place_turn()
+    b.placement.turn()
     turn(b)
     turn(b)
     while b.record("i2").state is not State.RUNNING:
@@ -190,15 +190,15 @@ def test_a_woken_placer_places_what_waits_and_leaves_the_rest_to_its_period(
 ) -> None:
     b, _ = running()
     watched: list[int] = []
-    watch = b.reconciler.moves.watch
-    monkeypatch.setattr(b.reconciler.moves, "watch", lambda live: (watched.append(len(live)), watch(live)))
+    watch = b.successors.watch
+    monkeypatch.setattr(b.successors, "watch", lambda live: (watched.append(len(live)), watch(live)))
     add(b, new_record("i2"))
-    assert 0 < b.reconciler.place_turn() <= TIMING.place
+    assert 0 < b.placement.turn() <= TIMING.place
     assert b.record("i2").state is State.STARTING
-    b.reconciler.place_turn()
+    b.placement.turn()
     assert watched == []
     b.clock.forward(TIMING.place)
-    b.reconciler.place_turn()
+    b.placement.turn()
     assert watched == [2]
 
 
@@ -215,7 +215,7 @@ def test_a_site_that_answers_nothing_rests_though_others_call(
         raise SiteSilentError("the API server is busy or unwell")
 
     monkeypatch.setattr(b.runtime, "start", unwell)
-    b.reconciler.place_turn()
+    b.placement.turn()
     for _ in range(20):
         turn(b, 0.01)
         b.site.wake()

@@ -76,7 +76,7 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
     b.step(2)
     b.clock.forward(1000)  # nobody led, and nobody could renew
     one, lock = Led(), b.store.lock()
-    one.leadership = Leadership(one.lock, b.reconciler.owe_leases, lambda: one.now)
+    one.leadership = Leadership(one.lock, lambda: b.leases.owe(), lambda: one.now)
     one.lock.epoch = lock.hold()
     extend = b.store.extend_leases
 
@@ -88,7 +88,7 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
         extend(now)
 
     b.store.extend_leases = slow  # type: ignore[method-assign]
-    b.reconciler._lead = one.leadership
+    b.led_by(one.leadership)
     one.leadership.step()
     assert one.leadership.leads
     b.step(2)
@@ -157,7 +157,7 @@ def test_a_pass_that_began_before_its_orchestrator_led_does_nothing(bench: Any, 
     b: Bench = bench()
     add(b, new_record())
     one = Led()
-    b.reconciler._lead = one.leadership
+    b.led_by(one.leadership)
     led: list[int] = []
     b.runtime.lead = led.append  # type: ignore[method-assign]
 
@@ -166,8 +166,8 @@ def test_a_pass_that_began_before_its_orchestrator_led_does_nothing(bench: Any, 
         one.leadership.step()
 
     lock = b.store.lock()
-    b.reconciler.sites.refresh = elected_meanwhile  # type: ignore[method-assign]
-    b.reconciler.place_step()
+    b.sites.refresh = elected_meanwhile  # type: ignore[method-assign]
+    b.placement.step()
     assert (one.leadership.leads, b.record().state) == (True, State.PENDING)
     b.step(2)
     lock.release()
@@ -180,7 +180,7 @@ def test_a_leader_that_was_overtaken_in_the_middle_of_a_pass_leaves_it(
     b: Bench = bench()
     add(b, new_record())
     one = Led()
-    b.reconciler._lead = one.leadership
+    b.led_by(one.leadership)
     mine, other = (store.lock() for store in two)
     one.lock.epoch = mine.hold()
     one.leadership.step()
@@ -200,7 +200,8 @@ def test_a_site_that_has_heard_of_an_epoch_that_is_to_come_is_led_in_a_later_one
     lock = b.store.lock()
     first = lock.hold()
     b.clock.forward(first + 100 - b.clock())
-    b.reconciler._lead = leadership = Leadership(lock, b.reconciler.owe_leases, b.clock.steady)
+    leadership = Leadership(lock, lambda: b.leases.owe(), b.clock.steady)
+    b.led_by(leadership)
 
     def led_after_a_site_heard_of(epoch: int) -> int:
         b.runtime.world.epoch = epoch
@@ -336,7 +337,7 @@ def test_a_site_that_hears_of_ever_later_epochs_begins_no_new_one_each_time(
     """It may be a machine that lies: with each epoch all leases count anew, and all sites are looked at anew."""
     b: Bench = bench()
     lock = b.store.lock()
-    leadership = Leadership(lock, b.reconciler.owe_leases, b.clock.steady)
+    leadership = Leadership(lock, lambda: b.leases.owe(), b.clock.steady)
     epochs = set()
     for number in range(1, 100):
         leadership.step()

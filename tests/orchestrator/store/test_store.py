@@ -16,7 +16,7 @@ from skytether.api.rest import SiteCreate, State
 from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.domain.records import Change, IllegalMoveError, Record
 from skytether.orchestrator.domain.security import TokenHash
-from skytether.orchestrator.scheduling.moves import FOREVER
+from skytether.orchestrator.scheduling.standbys import FOREVER
 from skytether.orchestrator.store.database import RobotRow, TokenRow
 from skytether.orchestrator.store.engine import AddressError, make_engine, migrate
 from skytether.orchestrator.store.models import metadata

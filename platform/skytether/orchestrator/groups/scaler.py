@@ -18,8 +18,8 @@ from skytether.api.rest import SiteCreate
 
 from ..domain.errors import DomainError, NotFoundError
 from ..providers.base import Condition, Found, Invitation, Order, ProviderFailure, ProviderSilentError
-from ..scheduling.moves import Moves
 from ..scheduling.sites import Site, Sites
+from ..scheduling.successors import Successors
 from ..store.engine import GONE
 from ..store.group_store import GroupRow, MachineRow
 from ..store.leader import Lead, LeadLostError, fence, fenced
@@ -60,7 +60,7 @@ class Scaler:
         store: Store,
         groups: Callable[[], Groups],
         sites: Callable[[], Sites],
-        moves: Moves,
+        successors: Successors,
         demand: Demand,
         lead: Lead,
         clock: Callable[[], float],
@@ -73,7 +73,7 @@ class Scaler:
         self._store = store
         self._groups = groups
         self._sites = sites
-        self._moves = moves
+        self._successors = successors
         self._demand = demand
         self._lead = lead
         self._clock = clock
@@ -219,7 +219,7 @@ class Scaler:
         if site is None:
             return
         for record in self._store.live_at(site.name):
-            self._moves.displace(record, f"the machine of site {site.name} is gone")
+            self._successors.displace(record, f"the machine of site {site.name} is gone")
         self._empty(site)
         self._wake_placer()
 

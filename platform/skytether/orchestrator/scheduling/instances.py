@@ -40,10 +40,11 @@ from ..store.store import KeyReusedError, Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.reports import Reports
 from .catalog import Catalog
-from .moves import Moves, told
-from .placement import Decision
-from .reconcile import Reconciler
+from .placement import Decision, told
+from .placer import Placer
 from .sites import Site, Sites
+from .standbys import Standbys
+from .successors import Successors
 
 
 def utc(seconds: float) -> datetime:
@@ -59,8 +60,9 @@ class Instances:
         store: Store,
         catalog: Catalog,
         sites: Sites,
-        reconciler: Reconciler,
-        moves: Moves,
+        placer: Placer,
+        standbys: Standbys,
+        successors: Successors,
         metrics: Metrics,
         reports: Reports,
         gates: Gates,
@@ -73,8 +75,9 @@ class Instances:
         self._store = store
         self._catalog = catalog
         self._sites = sites
-        self._reconciler = reconciler
-        self._moves = moves
+        self._placer = placer
+        self._standbys = standbys
+        self._successors = successors
         self._metrics = metrics
         self._reports = reports
         self._gates = gates
@@ -126,10 +129,10 @@ class Instances:
             params=asked.params,
             measurements=self._of_known_sites(asked.measurements),
         )
-        decision = self._reconciler.weigh(record, {})  # whether it could ever run does not depend on what is there
+        decision = self._placer.weigh(record, {})  # whether it could ever run does not depend on what is there
         if decision.hopeless:
             self._sites.refresh()  # one may have been added at another orchestrator a moment ago
-            decision = self._reconciler.weigh(record, {})
+            decision = self._placer.weigh(record, {})
         if decision.hopeless:
             raise self._no_site(record, decision)
         return record
@@ -145,7 +148,7 @@ class Instances:
 
     def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:
         """A warm instance instead of a new one, if there is one that fits."""
-        for spare in self._moves.spares_for(record):
+        for spare in self._standbys.fitting(record):
             robot = {"robot": record.robot, "measurements": record.measurements, "created_at": record.created_at}
             lease = {"lease_s": record.lease_s, "lease_expires_at": record.lease_expires_at}
             claimed = self._store.claim(spare, {**robot, **lease}, self._clock(), owner, key, digest)
@@ -181,8 +184,8 @@ class Instances:
             self._sites.get(asked.site)
             if asked.site == record.site:
                 raise ConflictError(f"instance '{instance}' is at site '{asked.site}' already")
-        successor = self._moves.successor_of(record, asked.site)
-        decision = self._reconciler.weigh(successor)
+        successor = self._successors.successor_of(record, asked.site)
+        decision = self._placer.weigh(successor)
         if decision.site is None:
             raise self._no_site(successor, decision)
         with self._quotas.admitting(successor):
@@ -212,14 +215,14 @@ class Instances:
             self._check_size(record, site, wanted)
             why = site.runtime.keeps_size(record.spec)
             with self._quotas.resizing(record, wanted):
-                why = why or self._reconciler.lacks(record, wanted)
+                why = why or self._placer.lacks(record, wanted)
                 told_ = {"reason": "asked", "why": f"{principal.owner} asked for it"}
                 resize = {**wanted.model_dump(), **told_}
                 changed = None if why else self._store.change(record, self._clock(), resize=resize)
             if why:
                 return self._move_for_size(principal, record, wanted, why)
             if changed is not None:  # else somebody else changed it meanwhile: look again
-                self._reconciler.note(changed)
+                self._placer.hold(changed)
                 site.wake()
                 return changed
 
@@ -258,8 +261,8 @@ class Instances:
         """Have another one started where it can have that; gives back the present one."""
         if self._store.successor(record.id) is not None:
             raise ConflictError(f"instance '{record.id}' is being moved: give the one that is coming another size")
-        successor = self._moves.successor_of(record, size=wanted)
-        decision = self._reconciler.weigh(successor)
+        successor = self._successors.successor_of(record, size=wanted)
+        decision = self._placer.weigh(successor)
         if decision.site is None:
             self._metrics.refused(record.service, decision.refused)
             others = "; ".join(f"{r.site}: {r.detail}" for r in decision.refused if r.site != record.site)

@@ -11,6 +11,9 @@ log = logging.getLogger(__name__)
 _AFTER_ERROR = 1.0
 """Seconds until the next pass after one that raised."""
 
+_SHARE = 0.1
+"""Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
+
 
 class Loop:
     """Calls ``step``, which says in how many seconds it wants to be called again; ``wake`` makes that now."""
@@ -58,3 +61,8 @@ class Loop:
             log.debug("%s: pass of %.2f ms", self._thread.name, (self.last_pass - began) * 1e3)
             self._first.set()
             self._wake.wait(delay)
+
+
+def rest_of(usual: float, took: float) -> float:
+    """Seconds from one look at all until the next, for one that took so many of a processor's."""
+    return max(usual, took / _SHARE)

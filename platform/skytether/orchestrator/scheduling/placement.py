@@ -15,6 +15,7 @@ from skytether.api.manifest import Needs, Tier
 from skytether.api.rest import Measurement, Refusal, Score
 
 from ..config.settings import Weights
+from ..domain.records import Record
 from ..runtimes.base import Capacity, RuntimeFailure
 
 NOTHING = Capacity(0.0, 0)
@@ -208,3 +209,9 @@ def lacks(needs: Needs, total: Capacity, used: Capacity) -> tuple[str, str, bool
             free = f"{round(max(there - taken, 0.0), 2):g} of {there:g} are free"
             return reason, f"needs {needed:g} {unit}, {free}", False
     return None
+
+
+def told(record: Record, refused: Sequence[Refusal]) -> str:
+    """All refusals in one sentence."""
+    none = "no other" if record.replaces else "none"
+    return "; ".join(f"{r.site}: {r.detail}" for r in refused) or f"there is {none}: add one with `skytether site add`"

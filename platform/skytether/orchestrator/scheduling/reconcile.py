@@ -1,40 +1,37 @@
-"""Carries out what ``plan`` decides: the placer for what has no site yet, and one pass per site for what is there."""
+"""The pass over a site: carries out what ``plan`` decides of what is there."""
 
 from __future__ import annotations
 
 import base64
 import logging
 import math
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
-from itertools import zip_longest
 from typing import Any
 
 from skytether.api.grant import Grant
-from skytether.api.rest import Measurement, Refusal, Size, State
+from skytether.api.rest import Refusal, Size, State
 
 from ..access.disk_usage import DiskUsage
-from ..config.settings import Limits, Timing, Weights
-from ..domain.clock_jump import ClockJump
+from ..config.settings import Timing
 from ..domain.counter_totals import of_instance, of_run
-from ..domain.overload import Overload
-from ..domain.records import Change, Record
+from ..domain.records import Record
 from ..domain.security import SecretFileError, Secrets
-from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
-from ..store.engine import GONE
-from ..store.leader import ALONE, Lead, LeadLostError, fence, fenced
+from ..runtimes.base import Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
+from ..store.leader import ALONE, Lead
 from ..store.store import Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.service_events import ServiceEvents
-from .moves import Moves, told
-from .placement import UNSTARTED, Decision, Prospect, believable, lacks, place
+from .leases import Leases
+from .loops import rest_of
+from .placement import UNSTARTED, believable, told
+from .placer import Placer
 from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
-from .promises import NOTHING, Promises, Sums
 from .resizing import Resizing
-from .sites import Site, Sites
+from .sites import Site
+from .standbys import Standbys
+from .successors import Successors
 
 log = logging.getLogger(__name__)
 
@@ -47,105 +44,53 @@ _WHOLE = 1.0
 over the same database did."""
 _SPARE_IDLE = 86_400.0
 """Seconds that a standby waits for a robot before it ends by itself, should the orchestrator be gone for good."""
-_UNSETTLED = 2.0
-"""Seconds after the clock was set in which another orchestrator may still date leases by what it was before."""
-_PRUNE = 60.0
-"""Seconds between two looks for what is too old to keep."""
 _ACTING = 0.5
 """Seconds for which a pass over a site acts, at most: of a crowd some are ready before the last ones are started."""
-_PLACED_AT_ONCE = 16
-"""Instances that get their sites in one transaction: each takes a server's disk, and keeps others from writing."""
 _BALKS = 5
 """Acts in a row that a site did not answer, after which a pass asks it for nothing more: nor would it answer that."""
-_SHARE = 0.1
-"""Of the time, at most, for which each loop looks at all instances again and again: of many thousands, less often."""
 _PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
-_PROMISES_AGE = 3.0
-"""Seconds for which sums are good enough for a request at an orchestrator that does not lead."""
-
-
-def _none_grows(_: Record) -> Sequence[Prospect]:
-    return ()
 
 
 class Reconciler:
-    """Makes what is what should be, while this orchestrator leads; otherwise it looks only.
-
-    ``sites`` and ``moves`` are set before the first pass: each needs the other.
-    """
-
-    sites: Sites
-    moves: Moves
-    prospects: Callable[[Record], Sequence[Prospect]] = staticmethod(_none_grows)
-    """What groups of sites could still do for an instance that no site takes."""
+    """Makes what is at a site what should be, while this orchestrator leads; otherwise it looks only."""
 
     def __init__(
         self,
         store: Store,
         secrets: Secrets,
+        placer: Placer,
+        leases: Leases,
+        standbys: Standbys,
+        successors: Successors,
         metrics: Metrics,
         timing: Timing,
-        limits: Limits,
-        weights: Weights,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],
         lead: Lead = ALONE,
         steady: Callable[[], float] = time.monotonic,
-        overload: Overload | None = None,
-        site_instances: int = sys.maxsize,
         disk_usage: DiskUsage | None = None,
         left: Callable[[str], Size] = lambda _: _PLENTY,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
-        While ``overload`` is felt no lease runs out. A site gets no more than ``site_instances``, and
-        nothing more where ``disk_usage`` says that it is full. ``left``: what a robot may have beside what it has.
+        What belongs to a robot that has too much by ``disk_usage`` ends. ``left``: what a robot may have beside what it
+        has.
         """
-        self._resizing = Resizing(store, metrics, lambda: self.moves, self._room, left, self.note, steady)
-        self._site_instances = site_instances
-        self._disk_usage = disk_usage
-        self._overload = overload or Overload(steady)
+        self._resizing = Resizing(store, metrics, successors, placer, left, steady)
         self._service_events = ServiceEvents(store, steady)
         self._store = store
         self._secrets = secrets
+        self._placer = placer
+        self._leases = leases
+        self._standbys = standbys
+        self._successors = successors
         self._metrics = metrics
         self._timing = timing
-        self._limits = limits
-        self._weights = weights
         self._clock = clock
         self._wake_placer = wake_placer
         self._lead = lead
         self._steady = steady
-        self._clock_lock = threading.Lock()
-        self._clock_jump = ClockJump(clock(), steady())
-        self._times_set = 0
-        """How often the clock was set: what was read before the last time is dated by another one."""
-        self._settles_at = -math.inf
-        """Steady seconds: leases that others dated until then count anew, and none runs out before."""
-        self._place_due = -math.inf
-        """Steady seconds: when the placer's next whole pass is due."""
-        self._promises = Promises()
-        """As of the last whole pass of the placer, and what this orchestrator has changed since."""
-        self._promises_until = -math.inf
-        """Steady seconds."""
-        self._pruned_at = -_PRUNE
-        self._database_gone = False
-        self._owes_leases = False
-
-    def owe_leases(self) -> None:
-        """Before anything is ended for its lease, all count anew: nobody may have led, and nobody could renew."""
-        self._owes_leases = True
-
-    def place_turn(self) -> float:
-        """As much of a pass of the placer as is due: woken between two whole ones, it places what waits only."""
-        due = self._place_due - self._steady()
-        if due <= 0:
-            return self.place_step()
-        return min(due, self.place_step(whole=False))
-
-    def place_step(self, *, whole: bool = True) -> float:
-        """One pass of the placer; returns seconds until the next."""
-        return self._with_database(lambda: self._place_pass(whole))
+        self._disk_usage = disk_usage
 
     def site_turn(self, site: Site) -> float:
         """As much of a pass over a site as is due; returns seconds until the next.
@@ -156,8 +101,8 @@ class Reconciler:
         now = self._steady()
         if now < site.rests_until:
             return site.rests_until - now
-        due = site.passed_at + _rest(_WHOLE, site.pass_took) - now
-        look = site.watched_at + _rest(self._timing.observe, site.look_took) - now
+        due = site.passed_at + rest_of(_WHOLE, site.pass_took) - now
+        look = site.watched_at + rest_of(self._timing.observe, site.look_took) - now
         if called := site.called:
             site.called = False  # before the look, and only what was seen: no call is lost
         if due > 0 >= look:
@@ -176,276 +121,16 @@ class Reconciler:
     def site_step(self, site: Site, *, whole: bool = True) -> float:
         """One pass over a site, or over what starts or stops there; returns seconds until the next."""
         began = time.monotonic()
-        delay = self._with_database(lambda: self._site_pass(site, whole))
+        delay = self._leases.guarded(lambda: self._site_pass(site, whole))
         self._metrics.reconciled(site.name, time.monotonic() - began)
         return delay
 
-    def _with_database(self, step: Callable[[], float]) -> float:
-        """Wait where the database does not answer; once it does, leases count anew: nobody could renew meanwhile."""
-        try:
-            with fenced(self._lead.epoch):
-                if self._database_gone and self._leads():
-                    self._store.extend_leases(self._clock())
-                    log.warning("the database answers again")
-                delay = step()
-            self._database_gone = False
-            return delay
-        except LeadLostError as error:
-            log.warning("%s", error)
-            return self._timing.place
-        except GONE as error:
-            if not self._database_gone:
-                log.error(
-                    "the database does not answer, trying again: %s",
-                    str(getattr(error, "orig", None) or error).splitlines()[0],
-                )
-            self._database_gone = True
-            return self._timing.place
-
-    def _leads(self) -> bool:
-        """Whether this pass acts: it may have begun before this orchestrator led, or for an earlier lead of its own."""
-        return self._lead.leads and self._lead.epoch == fence()
-
-    def _now(self) -> float:
-        """The time. Was the clock set, all leases count anew first: nobody can say how old they are."""
-        with self._clock_lock:
-            now, steady = self._clock(), self._steady()
-            by = self._clock_jump.set_by(now, steady)
-            if by:
-                if self._leads():
-                    self._store.extend_leases(now)
-                self.moves.clock_was_set()
-                self._times_set += 1
-                self._settles_at = steady + _UNSETTLED
-                text = "the clock was set %s by %.0f s, or this machine slept: leases and waits count anew"
-                log.warning(text, "forward" if by > 0 else "back", abs(by))
-            if -math.inf < self._settles_at <= steady:
-                self._settles_at = -math.inf
-                if self._leads():
-                    self._store.extend_leases(now)  # what is about to end has another version then
-            if self._owes_leases and self._leads():
-                self._owes_leases = False  # first: it may be owed again meanwhile
-                self._store.extend_leases(now)
-                self._times_set += 1
-            if self._overload.owed() and self._leads():
-                self._store.extend_leases(now)
-                self._times_set += 1
-                log.warning("robots could not renew for a while, for want of room or of time: leases count anew")
-            self._clock_jump.accept(now, steady)
-            return now
-
-    # What has no site yet
-
-    def _place_pass(self, whole: bool) -> float:
-        if whole:
-            self.sites.refresh()
-        if not self._leads():
-            self._place_due = -math.inf  # who leads next, or again, begins with a look at all
-            return self._timing.place
-        began, times_set = time.thread_time(), self._times_set
-        live = self._store.live() if whole else self._store.waiting()
-        now = self._now()
-        if times_set != self._times_set:
-            return 0.0  # what was read is dated by another clock
-        if whole:
-            self._promise_anew(live)
-            rest = _rest(self._timing.place, time.thread_time() - began)
-            self._give_up_siteless([record for record in live if record.site is not None], now)
-        chosen: list[Change] = []
-        for action in plan([record for record in live if record.site is None], {}, (), now, self._timing):
-            if isinstance(action, Place):
-                chosen += self._choose(action.record)
-                if len(chosen) >= _PLACED_AT_ONCE:
-                    self._place(chosen)
-                    chosen = []
-            elif isinstance(action, Expire):
-                self._expire(action.record)
-        self._place(chosen)
-        if whole or self.moves.warms:
-            self.moves.keep_spares()
-        if not whole:
-            return self._timing.place
-        self.sites.end_drained(
-            {name for name, sum_ in self._promises.sums().items() if sum_.instances}, self._metrics.forget_site
-        )
-        self.moves.watch(live)
-        if self._steady() - self._pruned_at >= _PRUNE:
-            self._pruned_at = self._steady()
-            self._prune(now)
-        self._place_due = self._steady() + rest
-        return rest
-
-    def _promise_anew(self, live: Iterable[Record]) -> None:
-        self._promises = Promises(live)
-        self._promises_until = self._steady() + _PROMISES_AGE
-
-    def promised(self, without: Iterable[Record] = ()) -> Sums:
-        """What sites have promised, to all but these and what they are about to end.
-
-        As whoever leads knows it, at others some seconds old at most.
-        """
-        if not self._lead.leads and self._steady() >= self._promises_until:  # only the placer replaces what it adds to
-            self._promise_anew(self._store.live())
-        return self._promises.sums({record.id for record in without} | self._leaving())
-
-    def note(self, record: Record) -> None:
-        """It holds more or less at its site than before; the next whole pass of the placer knows it anyway."""
-        self._promises.add(record)
-
-    def _room(self, site: Site) -> Size:
-        capacity, promised = site.capacity or Capacity(0.0, 0), self.promised().get(site.name, NOTHING)
-        return Size(cpu=capacity.cpu - promised.cpu, memory_mb=capacity.memory_mb - promised.memory_mb)
-
-    def lacks(self, record: Record, size: Size) -> str:
-        """Why an instance cannot have this at its site, beside all that is stored; empty: it can."""
-        site = self.sites.find(record.site)
-        if site is None:
-            return f"site '{record.site}' was deleted"
-        promised = Promises(self._store.live()).sums(self._leaving() | {record.id})
-        used = promised.get(site.name, NOTHING).capacity
-        found = lacks(record.sized(size).needs, site.capacity or Capacity(0.0, 0), used)
-        return "" if found is None else found[1]
-
-    def _give_up_siteless(self, placed: Sequence[Record], now: float) -> None:
-        """End what was placed at a site in the moment when that was deleted: nobody else looks at it ever again."""
-        missing = [record for record in placed if self.sites.find(record.site) is None]
-        there = {site.name for site in self._store.sites()} if missing else set()  # those here may just be opened anew
-        for record in missing:
-            if record.site not in there:
-                to = State.STOPPED if record.state is State.STOPPING else State.FAILED
-                self._store.change(record, now, state=to, reason=f"site '{record.site}' was deleted: ask again")
-
-    def weigh(self, record: Record, promised: Sums | None = None, runs: bool = False) -> Decision:
-        """Where it would run now, beside what is promised; looks only. ``runs``: it need not be started any more.
-
-        Without ``promised``, beside all that is stored.
-        """
-        if promised is None:
-            promised = Promises(self._store.live()).sums(self._leaving())
-        measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
-        allowed = [site for site in self.sites.all() if self._allows(record, site)]
-        tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
-        now = self._steady()
-        sites = [
-            site.candidate(
-                record.spec,
-                promised.get(site.name, NOTHING).capacity,
-                tried.get(site.name),
-                None if record.pinned else site.fitness.objection(record, now),
-            )
-            for site in allowed
-        ]
-        most = self._site_instances
-        if self._disk_usage is not None:
-            full = self._disk_usage.full()
-            sites = [replace(s, full=full[s.name]) if s.name in full else s for s in sites]
-        sites = [
-            replace(s, full=f"{there} instances are there, and {most} may be (quotas.site_instances)")
-            if (there := promised.get(s.name, NOTHING).instances) >= most
-            else s
-            for s in sites
-        ]
-        if runs:
-            sites = [replace(site, blocked=None, unfit=None) for site in sites]
-        spec = record.spec
-        decision = place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
-        if decision.site is not None or record.pinned is not None or record.spare:
-            return decision
-        prospects = self.prospects(record)
-        return replace(
-            decision,
-            refused=(*decision.refused, *(prospect.refusal for prospect in prospects)),
-            hopeless=decision.hopeless and all(prospect.hopeless for prospect in prospects),
-        )
-
-    def _allows(self, record: Record, site: Site) -> bool:
-        """One that replaces another does not go where that is.
-
-        Unless it was told to, or that one is ended there, or it is there for being larger or smaller.
-        """
-        if record.pinned is not None:
-            return site.name == record.pinned
-        replaced = self._store.get(record.replaces) if record.replaces else None
-        if replaced is None or site.name != replaced.site or replaced.id in site.leaving:
-            return True
-        return record.has != replaced.has
-
-    def _leaving(self) -> set[str]:
-        """What sites are about to end: it takes no room of what they have left."""
-        return {instance for site in self.sites.all() for instance in site.leaving}
-
-    def _waits(self, record: Record) -> bool:
-        """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
-        return 0 < record.start_at - self._clock() <= self._timing.backoff_max
-
-    def _choose(self, record: Record) -> list[Change]:
-        """How an instance gets a site, which is promised to it from then on; nothing: none takes it now."""
-        promised = self.promised()
-        decision = self.weigh(record, promised)
-        untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
-        if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
-            decision = self.weigh(replace(record, refused=untried), promised)  # it may have been mended
-        smaller, happened = {}, ""
-        if decision.site is None and record.size is not None and record.replaces is None:
-            as_its_manifest_says = self.weigh(replace(record, size=None), promised)
-            if as_its_manifest_says.site is not None:
-                has, gets = record.has, replace(record, size=None).has
-                smaller, happened = {"size": None}, f"has {gets} instead of {has}: {told(record, decision.refused)}"
-                decision = as_its_manifest_says
-        refused = [refusal.model_dump() for refusal in decision.refused]
-        if refused != record.refused:
-            self._metrics.refused(record.service, decision.refused)
-        if decision.site is None:
-            reason = f"waiting for a site: {told(record, decision.refused)}"
-            if reason != record.reason or record.state is not State.PENDING:
-                self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
-            return []
-        changes = {
-            "state": State.STARTING,
-            "reason": "",
-            "site": decision.site,
-            "refused": refused,
-            "scores": [score.model_dump() for score in decision.scores],
-            "start_at": 0.0,
-            **smaller,
-        }
-        self._promises.add(record.after(changes))
-        if (site := self.sites.find(decision.site)) is not None:
-            site.fitness.placed(record, self._steady(), self._clock())
-        return [Change(record, changes, State.PLACING if record.state is State.PENDING else None, happened)]
-
-    def _place(self, chosen: Sequence[Change]) -> None:
-        """Give instances the sites that were chosen for them, unless somebody changed them meanwhile."""
-        if not chosen:
-            return
-        now, placed = self._clock(), list[Record | None]()
-        try:
-            placed = self._store.change_all(chosen, now)
-        finally:
-            for one, record in zip_longest(chosen, placed):
-                if record is None:
-                    self._promises.remove(one.record)
-        for record in filter(None, placed):
-            self._metrics.phase(record, "placing", now - record.created_at)
-        for name in {record.site for record in placed if record is not None}:
-            if (site := self.sites.find(name)) is not None:
-                site.wake()
-
-    def _prune(self, now: float) -> None:
-        limits = self._limits
-        for instance, name in self._store.prune(now, limits.ended_age, limits.ended_count, limits.events):
-            site = self.sites.find(name)
-            if site is not None:
-                site.ended -= {instance}  # the site's next whole pass finds it as a stranger, and removes it
-
-    # What is at a site
-
     def _site_pass(self, site: Site, whole: bool) -> float:
-        began, times_set = time.thread_time(), self._times_set
+        began, times_set = time.thread_time(), self._leases.times_set
         site.awaited = None  # whatever ends this pass early, or is left to do
         if whole:
             site.passed_at = -math.inf
-        led = self._lead.epoch if self._leads() else 0
+        led = self._lead.epoch if self._leases.leads() else 0
         # Before the look: nothing can be observed that is not in it.
         live = self._store.live_at(site.name, changing=not whole)
         if whole:
@@ -475,16 +160,16 @@ class Reconciler:
             site.seen_since = None
             site.passed_at = -math.inf
             return self._timing.place
-        if self._leads():
+        if self._leases.leads():
             for record, seen in _ended(live, site.observed, looked):
                 self._store.count(record, [of_run(record, seen)])
         others = {} if whole else {i: seen for i, seen in site.observed.items() if i not in ids}
         site.observed, site.failure, site.looked_at = {**others, **looked}, "", time.monotonic()
         site.leaving = {i: seen.leaving for i, seen in site.observed.items() if seen.leaving}
-        if not self._leads():
+        if not self._leases.leads():
             return self._timing.observe
-        now = self._now()
-        if times_set != self._times_set:
+        now = self._leases.now()
+        if times_set != self._leases.times_set:
             return 0.0  # what was read is dated by another clock
         if site.seen_since is None or site.seen_since[0] != times_set:
             site.seen_since = (times_set, now)
@@ -570,11 +255,11 @@ class Reconciler:
             case Crash():
                 self._crash(site, action)
             case Expire(record):
-                self._expire(record)
+                self._leases.expire(record)
             case End(record):
                 site.runtime.stop(record.id, force=True)  # what its main process left behind
                 if self._store.change(record, self._clock(), state=State.STOPPED):
-                    self._promises.remove(record)
+                    self._placer.release(record)
                     self._wake_placer()  # there is room for another
                     return True
             case Stop(instance, force):
@@ -645,15 +330,15 @@ class Reconciler:
             return
         if larger is not None and after.has == larger:
             self._metrics.resized(crash.record, crash.record.has, larger, "memory")
-            self.note(after)
+            self._placer.hold(after)
         log.warning("%s for %s (%s): %s", after.service, after.robot, after.id, after.reason)
         if after.restarts:
             self._store.count(after, [of_instance(after)])
-        self.moves.fail_over(after, after.reason)
+        self._successors.fail_over(after, after.reason)
         if after.site is None or after.state.final:
-            self._promises.remove(after)
+            self._placer.release(after)
             if after.state.final and after.spare:
-                self.moves.spare_failed(after)
+                self._standbys.failed(after)
             self._wake_placer()
             site.runtime.stop(after.id, force=True)  # what its main process left behind
 
@@ -667,7 +352,7 @@ class Reconciler:
         if not site.runtime.blocked():
             site.fitness.failed(record, crash.why, self._steady(), self._clock())
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
-        decision = self.weigh(replace(record, refused=refused), self.promised())
+        decision = self._placer.weigh(replace(record, refused=refused), self._placer.promised())
         if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
             several = gives_up and len(decision.refused) > 1
             return {"reason": f"no site can start it: {told(record, decision.refused)}"} if several else {}
@@ -683,15 +368,6 @@ class Reconciler:
             "restarts": 0,
             "start_at": self._clock() + self._timing.backoff_max,
         }
-
-    def _expire(self, record: Record) -> None:
-        if self._overload.felt() or self._steady() < self._settles_at:
-            return  # its robot may have been refused, or wait for its answer; or it was dated by another clock
-        now = self._clock()
-        reason = f"the robot did not renew its lease of {record.lease_s:g} s"
-        to = State.STOPPED if record.site is None else State.STOPPING
-        if self._store.change(record, now, state=to, stopping_at=now, reason=reason):
-            log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)
 
 
 def _as_it_was(site: Site) -> bool:
@@ -739,8 +415,3 @@ def _ended(
         if was is not None and was.phase is not Phase.EXITED and over:
             ended.append((record, was))
     return ended
-
-
-def _rest(usual: float, took: float) -> float:
-    """Seconds from one look at all until the next, for one that took so many of a processor's."""
-    return max(usual, took / _SHARE)

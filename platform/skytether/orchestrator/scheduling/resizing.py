@@ -18,8 +18,9 @@ from ..domain.records import Record
 from ..runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from ..store.store import Store
 from ..telemetry.metrics import Metrics
-from .moves import Moves
+from .placer import Placer
 from .sites import Site
+from .successors import Successors
 from .vertical_scaling import Proposal, Seen, Trend, bounded, decide, more_memory
 
 log = logging.getLogger(__name__)
@@ -55,10 +56,9 @@ class Resizing:
         self,
         store: Store,
         metrics: Metrics,
-        moves: Callable[[], Moves],
-        room: Callable[[Site], Size],
+        successors: Successors,
+        placer: Placer,
         left: Callable[[str], Size],
-        noted: Callable[[Record], None],
         steady: Callable[[], float],
     ) -> None:
         """What it needs of others.
@@ -66,18 +66,16 @@ class Resizing:
         Args:
             store: Where records are.
             metrics: Told of each change.
-            moves: Start another one where a site does not give it.
-            room: What a site has beside what it has promised.
+            successors: Start another one where a site does not give it.
+            placer: Knows what a site has beside what it has promised; told of each record that holds more or less.
             left: What a robot may have beside what it has.
-            noted: Called with each record that holds more or less than before.
             steady: Seconds of a clock that nobody sets.
         """
         self._store = store
         self._metrics = metrics
-        self._moves = moves
-        self._room = room
+        self._successors = successors
+        self._placer = placer
         self._left = left
-        self._noted = noted
         self._steady = steady
         self._known: dict[str, _Known] = {}
 
@@ -110,7 +108,7 @@ class Resizing:
         if scaling is None or scaling.memory_mb is None:
             return None
         wanted = more_memory(scaling.memory_mb, has)
-        wanted = bounded(bounded(wanted, has, self._left(record.robot)), has, self._room(site))
+        wanted = bounded(bounded(wanted, has, self._left(record.robot)), has, self._placer.room(site))
         return wanted if wanted.memory_mb > has.memory_mb else None
 
     def _keep(self, site: Site, record: Record, seen: Observation, now: float) -> None:
@@ -149,7 +147,7 @@ class Resizing:
             return
         known.asked_since = math.inf
         known.told.clear()
-        self._noted(after)
+        self._placer.hold(after)
         if text:
             log.info("%s for %s (%s) %s", record.service, record.robot, record.id, text)
             self._metrics.resized(record, has, wants, record.resize["reason"])
@@ -165,13 +163,13 @@ class Resizing:
         known.asked_since, known.not_before = math.inf, self._steady() + _AGAIN_S
         text, moved = f"site {site.name} does not give it {wants}: {why}", None
         if _is_more(wants, record.has):
-            moved, text = self._moves().move_for_size(record, wants, text)
+            moved, text = self._successors.move_for_size(record, wants, text)
         text = text if moved else f"{text}; it keeps {record.has}"
         after = self._store.change(record, now, resize=None, happened=text)
         self._metrics.not_resized(record)
         if after is not None:
             log.warning("%s for %s (%s): %s", record.service, record.robot, record.id, text)
-            self._noted(after)
+            self._placer.hold(after)
 
     def _hold(self, site: Site, record: Record, known: _Known) -> None:
         """Whoever else has changed it, or did so late: it has what it is noted to have."""
@@ -199,7 +197,7 @@ class Resizing:
             if not _is_more(left, has):
                 self._tell_once(record, f"would get {size}, for {proposed.why}: its robot may have no more", known, now)
                 return
-            size = left if keeps else bounded(left, has, self._room(site))
+            size = left if keeps else bounded(left, has, self._placer.room(site))
             if keeps or not _is_more(size, has):
                 self._move(site, record, left, proposed, keeps, known, now)
                 return
@@ -208,7 +206,7 @@ class Resizing:
         told = {"reason": proposed.reason, "why": proposed.why}
         asked = self._store.change(record, now, resize={**size.model_dump(), **told})
         if asked is not None:
-            self._noted(asked)
+            self._placer.hold(asked)
             self._carry_out(site, asked, known, now)
 
     def _move(
@@ -218,7 +216,7 @@ class Resizing:
         why = f"is to have {size}, for {proposed.why}, and site {site.name} has no room for that"
         if keeps:
             why = f"is to have {size}, for {proposed.why}, and at site {site.name} {keeps}"
-        moved, text = self._moves().move_for_size(record, size, why)
+        moved, text = self._successors.move_for_size(record, size, why)
         if moved is None:
             self._metrics.not_resized(record)
         self._tell_once(record, text, known, now)

@@ -199,6 +199,19 @@ class Site:
         )
 
 
+def reachable(site: Site | None) -> bool:
+    """Whether there is one that can be used now."""
+    return site is not None and not site.unreachable
+
+
+def about_to_end(site: Site | None, instance: str) -> str:
+    """Why a site is about to end an instance; empty: it is not."""
+    if site is None:
+        return ""
+    drained = f"site {site.name} is being drained" if site.evacuating else ""
+    return site.leaving.get(instance, "") or drained
+
+
 class Sites:
     """All sites, in memory and in the store."""
 
