@@ -13,6 +13,7 @@ from orchestrator_program import Program, until
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
 from skytether.api.rest import InstanceCreate, State
+from skytether.orchestrator.domain.records import Change
 from skytether.orchestrator.store.store import Store
 
 GRACE = 3.0
@@ -86,7 +87,7 @@ class Scene:
         store = Store(f"sqlite:///{program.folder / 'state.db'}")
         record = store.get(self.placing)
         assert record is not None
-        assert store.change(record, time.time(), state=State.PLACING, reason="")
+        assert store.change(Change(record, {"state": State.PLACING, "reason": ""}), time.time())
         store.close()
 
     def after(self) -> dict[str, State]:

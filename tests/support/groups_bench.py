@@ -14,7 +14,7 @@ from reconcile_bench import Passes
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Limits, Timing, Weights
-from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.groups.demand import Demand
 from skytether.orchestrator.groups.groups import Groups
 from skytether.orchestrator.groups.scaler import Scaler
@@ -145,7 +145,7 @@ class GroupsBench:
         for id_ in ids:
             record = self.store.get(id_)
             assert record is not None
-            self.store.change(record, self.clock(), state=State.STOPPING, stopping_at=self.clock())
+            self.store.change(Change(record, {"state": State.STOPPING, "stopping_at": self.clock()}), self.clock())
 
     def step(self, times: int = 1, seconds: float = 1.0) -> None:
         """Time goes by, and every thread has its turn."""

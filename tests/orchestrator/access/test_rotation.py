@@ -16,6 +16,7 @@ from skytether.api.rest import InstanceCreate, RobotCreate, State
 from skytether.cli.app import app
 from skytether.orchestrator.access.rotation import Rotation, rotate_key, rotate_operator
 from skytether.orchestrator.backup import backup, restore
+from skytether.orchestrator.domain.records import Change
 from skytether.orchestrator.domain.security import SecretFileError, Secrets, fingerprint_of
 
 ID = "0011223344556677"
@@ -122,7 +123,7 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(
     stranger = tmp_path / "stranger"
     stranger.mkdir()
     assert not Rotation(stranger, Secrets(stranger), store, time.time).agree()
-    assert store.change(record, 1_700_000_001.0, state=State.STOPPED)
+    assert store.change(Change(record, {"state": State.STOPPED}), 1_700_000_001.0)
     ahead[0] = 0.0
     rotation.look()
     assert old.exists(), "another orchestrator may not have seen the rotation"

@@ -16,7 +16,7 @@ from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
 from skytether.orchestrator.config.settings import Limits
 from skytether.orchestrator.domain.clock_jump import ClockJump, SharedClock
-from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.store.store import Store
 from skytether.testing.runtimes import CrashingRuntime, NeverReadyRuntime
 
@@ -75,7 +75,7 @@ def test_a_start_and_an_end_get_their_time_and_no_more(bench: Any, new_record: N
     b.step()
     assert b.record().restarts == 1
 
-    b.store.change(b.record(), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.store.change(Change(b.record(), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
     b.runtime.obedient = False
     b.step()
     b.clock.set_by(by)
@@ -111,7 +111,7 @@ def test_ended_instances_are_kept_for_their_time_by_the_databases_clock_not_by_t
     add(b, new_record())
     add(b, new_record("elsewhere", state=State.STOPPED))
     b.step(2)
-    b.store.change(b.record(), shared(), state=State.STOPPING, stopping_at=shared())
+    b.store.change(Change(b.record(), {"state": State.STOPPING, "stopping_at": shared()}), shared())
     b.step(2)
     clock.forward(Limits().ended_age - 1)
     b.step()

@@ -9,6 +9,7 @@ from typing import Any
 
 from skytether.api.rest import State
 from skytether.orchestrator.domain.counter_totals import CounterTotals
+from skytether.orchestrator.domain.records import Change
 from skytether.orchestrator.store.store import Store
 
 KEY = ("topic_messages", "scan", "64", "in", "sent")
@@ -93,8 +94,8 @@ def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store,
     record = store.get(record.id)
     assert record is not None
     assert store.renew(record.id, now, None, robot="other") is None
-    stopping = store.change(record, now, state=State.STOPPING)
+    stopping = store.change(Change(record, {"state": State.STOPPING}), now)
     assert stopping is not None
-    assert store.change(stopping, now, state=State.STOPPED)
+    assert store.change(Change(stopping, {"state": State.STOPPED}), now)
     store.prune(now + 60, ended_age=10, ended_count=10, events_count=10)
     assert store.accounts() == {}

@@ -83,14 +83,14 @@ def test_a_service_that_does_not_like_its_grant_is_not_tried_again(new_record: N
     record = at_site(new_record, State.STARTING, started_at=NOW)
     action = decide(record, seen(Phase.EXITED, exit_status=2, last_line="mass: must be above 0"), NOW, T)
     assert isinstance(action, Crash)
-    changes = after_crash(action, NOW, T)
-    assert changes["state"] is State.FAILED
-    assert 'exit status 2; its last line: "mass: must be above 0"; correct' in changes["reason"]
+    change = after_crash(action, NOW, T)
+    assert change.state is State.FAILED
+    assert 'exit status 2; its last line: "mass: must be above 0"; correct' in change.after.reason
     # After it has run, the same status says nothing of the grant.
     ran = at_site(new_record, State.RUNNING)
     action = decide(ran, seen(Phase.EXITED, exit_status=2), NOW, T)
     assert isinstance(action, Crash)
-    assert after_crash(action, NOW, T)["state"] is State.STARTING
+    assert after_crash(action, NOW, T).state is State.STARTING
 
 
 def test_what_runs_is_left_alone_unless_it_moved(new_record: NewRecord) -> None:
@@ -142,15 +142,15 @@ def test_back_off_doubles_up_to_its_bound() -> None:
 def test_quick_failures_in_a_row_are_given_up_and_a_long_run_starts_the_count_again(new_record: NewRecord) -> None:
     record, waits = at_site(new_record, State.STARTING), []
     while record.state is not State.FAILED:
-        record = dataclasses.replace(record, **after_crash(Crash(record, "ended"), NOW, T))
+        record = after_crash(Crash(record, "ended"), NOW, T).after
         waits.append(record.start_at - NOW)
     assert record.restarts == 4
     assert waits == [0, 0.5, 1, 2, 2]
     assert record.reason == "given up after 5 failures in a row: the service ended; see `skytether instance logs i1`"
 
     stable = at_site(new_record, State.RUNNING, failures=4, running_at=NOW - 10)
-    changes = after_crash(Crash(stable, "ended"), NOW, T)
-    assert (changes["state"], changes["failures"], changes["start_at"]) == (State.STARTING, 1, NOW)
+    after = after_crash(Crash(stable, "ended"), NOW, T).after
+    assert (after.state, after.failures, after.start_at) == (State.STARTING, 1, NOW)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ class World:
                 assert self.run.phase is Phase.RUNNING
                 self.change(state=State.RUNNING, host=host, port=port, running_at=self.now)
             case Crash():
-                self.change(**after_crash(action, self.now, T))
+                self.change(**after_crash(action, self.now, T).columns)
             case Expire(record):
                 to = State.STOPPING if record.site else State.STOPPED
                 self.change(state=to, stopping_at=self.now)

@@ -133,7 +133,7 @@ def test_a_full_site_makes_it_wait_with_the_number_and_an_end_makes_room(bench: 
     b.step(3)
     assert len(b.reasons("i2")) == 2, "the same reason is told once"
     woken = b.woken
-    b.store.change(b.record("i1"), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.store.change(Change(b.record("i1"), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
     b.step(4)
     assert b.woken > woken
     assert b.record("i2").state is State.RUNNING
@@ -389,7 +389,7 @@ def test_a_stubborn_service_is_ended_by_force_after_the_grace(bench: Any, new_re
     b = bench(StubbornRuntime)
     add(b, new_record())
     b.step(2)
-    b.store.change(b.record(), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.store.change(Change(b.record(), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
     b.clock.forward(4.9)
     b.step()
     assert b.record().state is State.STOPPING
@@ -498,7 +498,7 @@ def test_what_nobody_asked_for_is_removed_and_the_ended_is_kept_for_its_log(benc
     add(b, new_record())
     b.step(2)
     b.runtime.world["stranger"] = b.runtime.world["i1"]
-    b.store.change(b.record(), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.store.change(Change(b.record(), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
     b.step(4)
     assert list(b.runtime.observe()) == ["i1"]
     assert b.runtime.logs("i1", 5)
@@ -510,7 +510,7 @@ def test_too_many_ended_ones_are_forgotten_with_what_is_left_of_them(bench: Any,
         add(b, new_record(name))
         b.step(2)
         b.clock.forward(1)
-        b.store.change(b.record(name), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+        b.store.change(Change(b.record(name), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
         b.step(3)
     b.clock.forward(61)
     b.step(2)
@@ -526,7 +526,7 @@ def test_a_change_by_somebody_else_in_between_wins(bench: Any, new_record: NewRe
     def deleted_meanwhile() -> Any:
         record = b.record()
         if record.state is State.STARTING:
-            store.change(record, b.clock(), state=State.STOPPING, stopping_at=b.clock())
+            store.change(Change(record, {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
         return real()
 
     b.runtime.observe = deleted_meanwhile
@@ -557,10 +557,10 @@ def test_what_was_placed_while_its_site_was_deleted_is_given_up(
 ) -> None:
     b = bench()
     add(b, new_record())
-    b.store.change(b.record(), b.clock(), state=State.PLACING)
-    b.store.change(b.record(), b.clock(), state=State.STARTING, site="deleted")
+    b.store.change(Change(b.record(), {"state": State.PLACING}), b.clock())
+    b.store.change(Change(b.record(), {"state": State.STARTING, "site": "deleted"}), b.clock())
     if state is not State.STARTING:
-        b.store.change(b.record(), b.clock(), state=state)
+        b.store.change(Change(b.record(), {"state": state}), b.clock())
     b.step()
     assert (b.record().state, b.record().reason) == (after, "site 'deleted' was deleted: ask again")
 

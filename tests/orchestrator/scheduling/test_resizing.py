@@ -15,7 +15,7 @@ from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Resize, Size, State
 from skytether.orchestrator.access.quotas import use_of
 from skytether.orchestrator.config.settings import Quotas as QuotaSettings
-from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.runtimes.base import OvertakenError, SiteSilentError
 from skytether.orchestrator.scheduling.vertical_scaling import CALM_S, PAUSE_S
 
@@ -44,7 +44,7 @@ def running(bench: Any, new_record: NewRecord) -> Callable[..., Bench]:
 
 def want(b: Bench, size: Size, name: str = "i1") -> None:
     resize = {**size.model_dump(), "reason": "asked", "why": "operator asked for it"}
-    assert b.store.change(b.record(name), b.clock(), resize=resize) is not None
+    assert b.store.change(Change(b.record(name), {"resize": resize}), b.clock()) is not None
 
 
 def told(b: Bench, name: str = "i1") -> list[str]:

@@ -10,7 +10,7 @@ from reconcile_bench import Bench, add
 
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Timing
-from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.runtimes.base import SiteSilentError
 from skytether.orchestrator.scheduling.sites import Site
 from skytether.testing.runtimes import FakeRuntime, NeverReadyRuntime, SlowRuntime, StubbornRuntime
@@ -61,7 +61,7 @@ def turn(b: Bench, after: float = 0.0) -> float:
 
 def end(b: Bench, name: str = "i1") -> None:
     """As a request does."""
-    b.store.change(b.record(name), b.clock(), state=State.STOPPING, stopping_at=b.clock())
+    b.store.change(Change(b.record(name), {"state": State.STOPPING, "stopping_at": b.clock()}), b.clock())
     b.site.wake()
 
 

@@ -15,7 +15,7 @@ from sqlalchemy import text
 
 from skytether.api.rest import State
 from skytether.orchestrator.domain.clock_jump import SharedClock
-from skytether.orchestrator.domain.records import Record
+from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.store.engine import make_engine, migrate
 from skytether.orchestrator.store.leader import LEASE, Leadership, LeadLostError, Lock, fenced
 from skytether.orchestrator.store.postgres import Connection
@@ -139,7 +139,7 @@ def test_each_leader_has_a_later_epoch_and_changes_nothing_once_there_is_another
     first, second = in_turn(*locks)
     with fenced(first):
         for act in (
-            lambda: one.change(record, 1.0, state=State.PLACING),
+            lambda: one.change(Change(record, {"state": State.PLACING}), 1.0),
             lambda: one.extend_leases(1.0),
             lambda: one.prune(1e12, 0, 0, 0),
             lambda: one.count(record, []),
@@ -148,7 +148,7 @@ def test_each_leader_has_a_later_epoch_and_changes_nothing_once_there_is_another
                 act()
     assert other.get(record.id) == record
     with fenced(second):
-        assert other.change(record, 1.0, state=State.PLACING) is not None
+        assert other.change(Change(record, {"state": State.PLACING}), 1.0) is not None
     assert one.renew(record.id, 1.0, None) is not None, "what anybody may do is not the leader's"
     locks[1].release()
 

@@ -14,6 +14,7 @@ from alembic.migration import MigrationContext
 
 from skytether.api.groups import Stage
 from skytether.api.rest import State
+from skytether.orchestrator.domain.records import Change
 from skytether.orchestrator.domain.security import TokenHash
 from skytether.orchestrator.store import migrations
 from skytether.orchestrator.store.engine import make_engine, migrate
@@ -232,10 +233,10 @@ def look_through(store: Store, counts: dict[str, int]) -> None:
     assert again is not None
     assert again.id == "i1"
     # What is added later fits in beside it.
-    changed = store.change(record, NOW + 3, state=State.STOPPING)
+    changed = store.change(Change(record, {"state": State.STOPPING}), NOW + 3)
     assert changed is not None
     assert [e.id for e in store.events("i1", 1)] == [2]
-    assert store.change(changed, NOW + 4, state=State.STOPPED) is not None
+    assert store.change(Change(changed, {"state": State.STOPPED}), NOW + 4) is not None
     store.delete_robot("walker")
     assert store.tokens() == []
     store.prune(NOW + 1000, ended_age=1, ended_count=0, events_count=0)

@@ -87,11 +87,11 @@ def test_looking_again_reads_only_what_changed(store: Store, new_record: NewReco
     before = store.live()
     assert [old is new for old, new in zip(before, store.live_at("lab"), strict=True)] == [True] * 3
     store.renew("b", NOW + 1, 60)
-    store.change(before[2], NOW, state=State.STOPPING)
+    store.change(Change(before[2], {"state": State.STOPPING}), NOW)
     now = store.live()
     assert [old is new for old, new in zip(before, now, strict=True)] == [True, False, False]
     assert now == [store.get(name) for name in ("a", "b", "c")]
-    store.change(now[2], NOW, state=State.STOPPED)
+    store.change(Change(now[2], {"state": State.STOPPED}), NOW)
     listed = store.all()
     assert listed == [store.get(name) for name in ("a", "b", "c")]
     assert [old is new for old, new in zip(now, listed, strict=True)] == [True, True, False]
@@ -111,10 +111,10 @@ def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecor
 
 def test_a_change_needs_to_have_seen_the_last_one(store: Store, new_record: NewRecord) -> None:
     first = store.add(new_record(), "operator", None, "")
-    second = store.change(first, NOW + 1, state=State.PLACING)
+    second = store.change(Change(first, {"state": State.PLACING}), NOW + 1)
     assert second is not None
     assert second.updated_at == NOW + 1
-    assert store.change(first, NOW + 2, state=State.STOPPED) is None
+    assert store.change(Change(first, {"state": State.STOPPED}), NOW + 2) is None
     assert store.get("i1") == second
 
 
@@ -122,7 +122,7 @@ def _change_several(store: Store, new_record: NewRecord) -> None:
     told: list[str] = []
     store.on_change = told.append
     seen = [store.add(new_record(name), "operator", None, "") for name in ("i1", "i2", "i3")]
-    ended = store.change(seen[1], NOW + 1, state=State.STOPPED)
+    ended = store.change(Change(seen[1], {"state": State.STOPPED}), NOW + 1)
     to = {"state": State.STARTING, "site": "lab"}
     done = store.change_all([Change(record, to, State.PLACING) for record in seen], NOW + 2)
     assert [record and record.site for record in done] == ["lab", None, "lab"]
@@ -159,10 +159,10 @@ def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_reco
     told: list[str] = []
     store.on_change = told.append
     record = store.add(new_record(), "operator", None, "")
-    quiet = store.change(record, NOW + 1, refused=[{"site": "x"}])
+    quiet = store.change(Change(record, {"refused": [{"site": "x"}]}), NOW + 1)
     assert quiet is not None
     assert quiet.updated_at == NOW
-    loud = store.change(quiet, NOW + 2, reason="r" * 5000)
+    loud = store.change(Change(quiet, {"reason": "r" * 5000}), NOW + 2)
     assert loud is not None
     assert len(loud.reason) == 1024
     assert [e.reason[:1] for e in store.events("i1", 0)] == ["", "r"]
@@ -172,7 +172,7 @@ def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_reco
 def test_an_illegal_move_changes_nothing(store: Store, new_record: NewRecord) -> None:
     record = store.add(new_record(), "operator", None, "")
     with pytest.raises(IllegalMoveError, match="cannot go from pending to running"):
-        store.change(record, NOW, state=State.RUNNING)
+        store.change(Change(record, {"state": State.RUNNING}), NOW)
     assert store.get("i1") == record
 
 
@@ -212,7 +212,7 @@ def test_of_many_changes_at_once_one_is_made(store: Store, new_record: NewRecord
 
     def change(number: int) -> None:
         barrier.wait()
-        made.append(store.change(record, NOW, reason=str(number)))
+        made.append(store.change(Change(record, {"reason": str(number)}), NOW))
 
     threads = [threading.Thread(target=change, args=(n,)) for n in range(8)]
     for thread in threads:
@@ -227,7 +227,7 @@ def test_a_renewal_beats_who_was_about_to_end_it(store: Store, new_record: NewRe
     renewed = store.renew("i1", NOW + 14, None)
     assert renewed is not None
     assert renewed.record.lease_expires_at == NOW + 29
-    assert store.change(record, NOW + 15, state=State.STOPPING) is None
+    assert store.change(Change(record, {"state": State.STOPPING}), NOW + 15) is None
     longer = store.renew("i1", NOW + 20, 60)
     assert longer is not None
     assert (longer.record.lease_s, longer.record.lease_expires_at) == (60, NOW + 80)
@@ -274,7 +274,7 @@ def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_
     assert store.events("old", 0) == []
     assert store.made_with("operator", "key", "") == live
     for number in range(10):
-        live = store.change(live, NOW, reason=str(number)) or live
+        live = store.change(Change(live, {"reason": str(number)}), NOW) or live
     store.prune(NOW, ended_age=100, ended_count=2, events_count=3)
     assert [e.reason for e in store.events("live", 0)] == ["7", "8", "9"]
 
@@ -317,10 +317,10 @@ def test_an_instance_is_replaced_by_one_at_a_time(store: Store, new_record: NewR
     first = store.add(new_record("first", replaces="old"), "operator", None, "")
     assert store.add(new_record("second", replaces="old"), "operator", None, "") == first
     assert store.get("second") is None
-    taken = {"robot": "walker", "replaces": "old"}
-    assert store.claim(spare, taken, NOW, "", None, "") is None
-    assert store.change(first, NOW, state=State.STOPPED) is not None
-    assert store.claim(spare, taken, NOW, "", None, "") is not None, "the first one serves no more"
+    taken = Change(spare, {"robot": "walker", "replaces": "old", "spare": False})
+    assert store.claim(taken, NOW, "", None, "") is None
+    assert store.change(Change(first, {"state": State.STOPPED}), NOW) is not None
+    assert store.claim(taken, NOW, "", None, "") is not None, "the first one serves no more"
 
 
 @pytest.mark.slow
@@ -342,7 +342,7 @@ def test_two_orchestrators_that_replace_an_instance_at_once_make_one_successor(
                 made = [pool.submit(add, store, f"{turn} {store is one}") for store in (one, other)]
                 first, second = (future.result(30) for future in made)
                 assert first == second
-                assert one.change(first, NOW, state=State.STOPPED) is not None
+                assert one.change(Change(first, {"state": State.STOPPED}), NOW) is not None
 
 
 def test_event_ids_never_come_again(store: Store, new_record: NewRecord) -> None:

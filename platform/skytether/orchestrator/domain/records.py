@@ -152,6 +152,16 @@ class Change(NamedTuple):
     happened: str = ""
     """What is told as an event, where neither state nor reason tells it."""
 
+    @property
+    def state(self) -> State:
+        """In which it is then."""
+        return State(self.columns.get("state", self.record.state))
+
+    @property
+    def after(self) -> Record:
+        """As it is then."""
+        return self.record.after(self.columns)
+
     def draft(self, now: float) -> tuple[Record, dict[str, Any], list[Record]]:
         """The record as it would be, the columns that change, and what is told of it, in this order.
 

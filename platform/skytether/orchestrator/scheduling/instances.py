@@ -32,6 +32,7 @@ from ..domain.counter_totals import of_robot
 from ..domain.errors import ConflictError, Fault, InvalidError, NoSiteError, NotFoundError, SilentSiteError
 from ..domain.records import Record, new_record
 from ..domain.security import SecretFileError, Secrets
+from ..domain.transitions import claimed, noted, resizing, stopping
 from ..domain.validation import check_params
 from ..robots.gates import Gates
 from ..runtimes.base import LogStream, RuntimeFailure
@@ -149,12 +150,11 @@ class Instances:
     def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:
         """A warm instance instead of a new one, if there is one that fits."""
         for spare in self._standbys.fitting(record):
-            robot = {"robot": record.robot, "measurements": record.measurements, "created_at": record.created_at}
-            lease = {"lease_s": record.lease_s, "lease_expires_at": record.lease_expires_at}
-            claimed = self._store.claim(spare, {**robot, **lease}, self._clock(), owner, key, digest)
-            if claimed is not None:
-                self._metrics.phase(claimed, "total", self._clock() - record.created_at)
-                return claimed
+            now = self._clock()
+            taken = self._store.claim(claimed(spare, record, now), now, owner, key, digest)
+            if taken is not None:
+                self._metrics.phase(taken, "total", self._clock() - record.created_at)
+                return taken
         return None
 
     def migrate(self, principal: Principal, instance: str, asked: Migrate) -> Record:
@@ -216,9 +216,8 @@ class Instances:
             why = site.runtime.keeps_size(record.spec)
             with self._quotas.resizing(record, wanted):
                 why = why or self._placer.lacks(record, wanted)
-                told_ = {"reason": "asked", "why": f"{principal.owner} asked for it"}
-                resize = {**wanted.model_dump(), **told_}
-                changed = None if why else self._store.change(record, self._clock(), resize=resize)
+                resize = resizing(record, wanted, "asked", f"{principal.owner} asked for it")
+                changed = None if why else self._store.change(resize, self._clock())
             if why:
                 return self._move_for_size(principal, record, wanted, why)
             if changed is not None:  # else somebody else changed it meanwhile: look again
@@ -271,7 +270,7 @@ class Instances:
         with self._quotas.admitting(successor):
             self._store.add(successor, principal.owner, None, "")
         text = f"is to have {wanted}, and at site {record.site} {why}: its robot is handed over"
-        self._store.change(record, self._clock(), happened=text)
+        self._store.change(noted(record, text), self._clock())
         self._wake_placer()
         return self._store.get(record.id) or record
 
@@ -355,8 +354,7 @@ class Instances:
         if record.state.final or record.state is State.STOPPING:
             return record
         now = self._clock()
-        to = State.STOPPED if record.site is None else State.STOPPING
-        ended = self._store.change(record, now, state=to, stopping_at=now, reason=reason)
+        ended = self._store.change(stopping(record, now, reason), now)
         if ended is not None:
             site = self._sites.find(ended.site)
             (site.wake if site else self._wake_placer)()

@@ -12,11 +12,10 @@ import threading
 import time
 from collections.abc import Callable
 
-from skytether.api.rest import State
-
 from ..domain.clock_jump import ClockJump
 from ..domain.overload import Overload
 from ..domain.records import Record
+from ..domain.transitions import stopping
 from ..store.engine import GONE
 from ..store.leader import ALONE, Lead, LeadLostError, fence, fenced
 from ..store.store import Store
@@ -131,6 +130,5 @@ class Leases:
             return  # its robot may have been refused, or wait for its answer; or it was dated by another clock
         now = self._clock()
         reason = f"the robot did not renew its lease of {record.lease_s:g} s"
-        to = State.STOPPED if record.site is None else State.STOPPING
-        if self._store.change(record, now, state=to, stopping_at=now, reason=reason):
+        if self._store.change(stopping(record, now, reason), now):
             log.info("%s for %s (%s): %s", record.service, record.robot, record.id, reason)

@@ -12,6 +12,7 @@ from skytether.api.rest import State
 
 from ..config.settings import Limits, Timing
 from ..domain.records import Change, Record
+from ..domain.transitions import failed, starting, stopped, waiting
 from ..store.store import Store
 from ..telemetry.metrics import Metrics
 from .leases import Leases
@@ -116,8 +117,8 @@ class PlacementPass:
         there = {site.name for site in self._store.sites()} if missing else set()  # those here may just be opened anew
         for record in missing:
             if record.site not in there:
-                to = State.STOPPED if record.state is State.STOPPING else State.FAILED
-                self._store.change(record, now, state=to, reason=f"site '{record.site}' was deleted: ask again")
+                end = stopped if record.state is State.STOPPING else failed
+                self._store.change(end(record, f"site '{record.site}' was deleted: ask again"), now)
 
     def _waits(self, record: Record) -> bool:
         """Whether its time to start is still to come; a wait longer than the longest was another clock's."""
@@ -130,12 +131,12 @@ class PlacementPass:
         untried = [refusal for refusal in record.refused if refusal["reason"] != UNSTARTED]
         if decision.site is None and len(untried) < len(record.refused) and not self._waits(record):
             decision = self._placer.weigh(replace(record, refused=untried), promised)  # it may have been mended
-        smaller, happened = {}, ""
+        instead = ""
         if decision.site is None and record.size is not None and record.replaces is None:
             as_its_manifest_says = self._placer.weigh(replace(record, size=None), promised)
             if as_its_manifest_says.site is not None:
                 has, gets = record.has, replace(record, size=None).has
-                smaller, happened = {"size": None}, f"has {gets} instead of {has}: {told(record, decision.refused)}"
+                instead = f"has {gets} instead of {has}: {told(record, decision.refused)}"
                 decision = as_its_manifest_says
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
@@ -143,21 +144,13 @@ class PlacementPass:
         if decision.site is None:
             reason = f"waiting for a site: {told(record, decision.refused)}"
             if reason != record.reason or record.state is not State.PENDING:
-                self._store.change(record, self._clock(), state=State.PENDING, reason=reason, refused=refused)
+                self._store.change(waiting(record, reason, decision.refused), self._clock())
             return []
-        changes = {
-            "state": State.STARTING,
-            "reason": "",
-            "site": decision.site,
-            "refused": refused,
-            "scores": [score.model_dump() for score in decision.scores],
-            "start_at": 0.0,
-            **smaller,
-        }
-        self._placer.hold(record.after(changes))
+        change = starting(record, decision.site, decision.scores, decision.refused, instead)
+        self._placer.hold(change.after)
         if (site := self._sites.find(decision.site)) is not None:
             site.fitness.placed(record, self._steady(), self._clock())
-        return [Change(record, changes, State.PLACING if record.state is State.PENDING else None, happened)]
+        return [change]
 
     def _place(self, chosen: Sequence[Change]) -> None:
         """Give instances the sites that were chosen for them, unless somebody changed them meanwhile."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from skytether.api.rest import State
 
 from ..config.settings import Timing
-from ..domain.records import Record
+from ..domain.records import Change, Record
+from ..domain.transitions import crashed, restarting
 from ..runtimes.base import Observation, Phase
 
 BAD_GRANT_STATUS = 2
@@ -211,23 +211,26 @@ def how_it_ended(seen: Observation) -> str:
     return f'{text}; its last line: "{seen.last_line}"' if seen.last_line else text
 
 
-def after_crash(crash: Crash, now: float, timing: Timing) -> dict[str, Any]:
-    """What a crash changes in the record: the next run and when, or failed with a reason to act on."""
+def failures_by(crash: Crash, now: float, timing: Timing) -> int:
+    """Quick failures in a row, with this one."""
     record = crash.record
     ran = now - record.running_at if record.running_at is not None else 0.0
-    failures = 1 if ran >= timing.stable else record.failures + 1
-    changes: dict[str, Any] = {"failures": failures, "started_at": None, "running_at": None}
+    return 1 if ran >= timing.stable else record.failures + 1
+
+
+def after_crash(crash: Crash, now: float, timing: Timing) -> Change:
+    """What a crash changes in the record: the next run and when, or failed with a reason to act on."""
+    record, failures = crash.record, failures_by(crash, now, timing)
     if crash.for_good:
-        reason = f"the service {crash.why}; correct what it names and ask again"
-        return {**changes, "state": State.FAILED, "reason": reason}
+        return crashed(record, failures, f"the service {crash.why}; correct what it names and ask again")
     if failures >= timing.max_failures:
         advice = f"see `skytether instance logs {record.id}`"
-        reason = f"given up after {failures} failures in a row: the service {crash.why}; {advice}"
-        return {**changes, "state": State.FAILED, "reason": reason}
+        return crashed(
+            record, failures, f"given up after {failures} failures in a row: the service {crash.why}; {advice}"
+        )
     wait = backoff(failures, timing)
     reason = f"the service {crash.why}; starting it again" + (f" in {wait:g} s" if wait else "")
-    again = {"attempt": record.attempt + 1, "restarts": record.restarts + 1, "start_at": now + wait}
-    return {**changes, **again, "state": State.STARTING, "reason": reason}
+    return restarting(record, failures, now + wait, reason)
 
 
 def backoff(failures: int, timing: Timing) -> float:

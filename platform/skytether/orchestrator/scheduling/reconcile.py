@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import Any
 
 from skytether.api.grant import Grant
 from skytether.api.rest import Refusal, Size, State
@@ -16,8 +15,9 @@ from skytether.api.rest import Refusal, Size, State
 from ..access.disk_usage import DiskUsage
 from ..config.settings import Timing
 from ..domain.counter_totals import of_instance, of_run
-from ..domain.records import Record
+from ..domain.records import Change, Record
 from ..domain.security import SecretFileError, Secrets
+from ..domain.transitions import crashed, launched, progressed, running, stopped, unstarted, with_memory
 from ..runtimes.base import Launch, Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from ..store.leader import ALONE, Lead
 from ..store.store import Store
@@ -27,7 +27,21 @@ from .leases import Leases
 from .loops import rest_of
 from .placement import UNSTARTED, believable, told
 from .placer import Placer
-from .plan import Action, Crash, End, Expire, Place, Progress, Ready, Remove, Start, Stop, after_crash, plan
+from .plan import (
+    Action,
+    Crash,
+    End,
+    Expire,
+    Place,
+    Progress,
+    Ready,
+    Remove,
+    Start,
+    Stop,
+    after_crash,
+    failures_by,
+    plan,
+)
 from .resizing import Resizing
 from .sites import Site
 from .standbys import Standbys
@@ -249,7 +263,7 @@ class Reconciler:
             case Start(record):
                 self._start(site, record)
             case Progress(record, detail):
-                self._store.change(record, self._clock(), reason=detail, started_at=self._clock())
+                self._store.change(progressed(record, self._clock(), detail), self._clock())
             case Ready(record, host, port):
                 return self._ready(site, record, host, port)
             case Crash():
@@ -258,7 +272,7 @@ class Reconciler:
                 self._leases.expire(record)
             case End(record):
                 site.runtime.stop(record.id, force=True)  # what its main process left behind
-                if self._store.change(record, self._clock(), state=State.STOPPED):
+                if self._store.change(stopped(record), self._clock()):
                     self._placer.release(record)
                     self._wake_placer()  # there is room for another
                     return True
@@ -275,7 +289,7 @@ class Reconciler:
 
     def _start(self, site: Site, record: Record) -> None:
         # Noted first: an orchestrator killed in between finds either nothing, and starts, or its run, and adopts.
-        noted = self._store.change(record, self._clock(), started_at=self._clock(), said=0)
+        noted = self._store.change(launched(record, self._clock()), self._clock())
         if noted is None:
             return
         try:
@@ -306,9 +320,7 @@ class Reconciler:
 
     def _ready(self, site: Site, record: Record, host: str | None, port: int | None) -> bool:
         now = self._clock()
-        running_at = record.running_at if record.state is State.RUNNING else now
-        changes: dict[str, Any] = {"state": State.RUNNING, "host": host, "port": port, "running_at": running_at}
-        if self._store.change(record, now, reason="", **changes) is None:
+        if self._store.change(running(record, now, host, port), now) is None:
             return False
         if record.state is State.STARTING:
             site.fitness.started(record)
@@ -318,14 +330,14 @@ class Reconciler:
         return True
 
     def _crash(self, site: Site, crash: Crash) -> None:
-        changes = after_crash(crash, self._clock(), self._timing)
-        if crash.unstarted and changes["failures"] >= _TRIES:
-            changes |= self._elsewhere(site, crash, gives_up=changes["state"] is State.FAILED)
+        now = self._clock()
+        change = after_crash(crash, now, self._timing)
+        if crash.unstarted and failures_by(crash, now, self._timing) >= _TRIES:
+            change = self._elsewhere(site, crash, change)
         larger = self._resizing.larger(site, crash.record) if crash.out_of_memory else None
-        if larger is not None and not changes["state"].final:
-            changes |= {"size": larger.model_dump(), "resize": None}
-            changes["reason"] += f", with {larger.memory_mb} MiB of memory instead of {crash.record.has.memory_mb}"
-        after = self._store.change(crash.record, self._clock(), **changes)
+        if larger is not None and not change.state.final:
+            change = with_memory(change, larger)
+        after = self._store.change(change, self._clock())
         if after is None:
             return
         if larger is not None and after.has == larger:
@@ -342,32 +354,27 @@ class Reconciler:
             self._wake_placer()
             site.runtime.stop(after.id, force=True)  # what its main process left behind
 
-    def _elsewhere(self, site: Site, crash: Crash, *, gives_up: bool) -> dict[str, Any]:
-        """What else changes where a run cannot be started: the site is refused, if that leaves another one to try.
+    def _elsewhere(self, site: Site, crash: Crash, change: Change) -> Change:
+        """What changes where a run cannot be started: the site is refused, if that leaves another one to try.
 
         A site that can start nothing at all is not refused so: it says so itself, until it can. The others stay refused
         while another one fits, or until ``start_at``: nobody tells when they were mended.
         """
-        record, refused = crash.record, list(crash.record.refused)
+        record, gives_up = crash.record, change.state is State.FAILED
+        refused = list(record.refused)
         if not site.runtime.blocked():
             site.fitness.failed(record, crash.why, self._steady(), self._clock())
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
         decision = self._placer.weigh(replace(record, refused=refused), self._placer.promised())
         if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
-            several = gives_up and len(decision.refused) > 1
-            return {"reason": f"no site can start it: {told(record, decision.refused)}"} if several else {}
+            if gives_up and len(decision.refused) > 1:
+                why = f"no site can start it: {told(record, decision.refused)}"
+                return crashed(record, change.after.failures, why)
+            return change
         self._metrics.refused(record.service, decision.refused)
-        return {
-            "state": State.PENDING,
-            "site": None,
-            "host": None,
-            "port": None,
-            "reason": f"site {site.name}: the service {crash.why}; trying another site",
-            "refused": [refusal.model_dump() for refusal in decision.refused],
-            "failures": 0,
-            "restarts": 0,
-            "start_at": self._clock() + self._timing.backoff_max,
-        }
+        reason = f"site {site.name}: the service {crash.why}; trying another site"
+        again_at = self._clock() + self._timing.backoff_max
+        return unstarted(record, change.after.attempt, again_at, reason, decision.refused)
 
 
 def _as_it_was(site: Site) -> bool:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from skytether.api.rest import Size, State
 
 from ..domain.records import Record
+from ..domain.transitions import not_resized, noted, resized, resizing
 from ..runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from ..store.store import Store
 from ..telemetry.metrics import Metrics
@@ -142,7 +143,7 @@ class Resizing:
             return
         has = record.has
         text = "" if wants == has else f"has {wants} instead of {has}: {record.resize['why']}"
-        after = self._store.change(record, now, size=wants.model_dump(), resize=None, happened=text)
+        after = self._store.change(resized(record, wants, text), now)
         if after is None:
             return
         known.asked_since = math.inf
@@ -165,7 +166,7 @@ class Resizing:
         if _is_more(wants, record.has):
             moved, text = self._successors.move_for_size(record, wants, text)
         text = text if moved else f"{text}; it keeps {record.has}"
-        after = self._store.change(record, now, resize=None, happened=text)
+        after = self._store.change(not_resized(record, text), now)
         self._metrics.not_resized(record)
         if after is not None:
             log.warning("%s for %s (%s): %s", record.service, record.robot, record.id, text)
@@ -203,8 +204,7 @@ class Resizing:
                 return
         elif keeps:
             return  # it has more than it needs, and to be moved for that is not worth it
-        told = {"reason": proposed.reason, "why": proposed.why}
-        asked = self._store.change(record, now, resize={**size.model_dump(), **told})
+        asked = self._store.change(resizing(record, size, proposed.reason, proposed.why), now)
         if asked is not None:
             self._placer.hold(asked)
             self._carry_out(site, asked, known, now)
@@ -223,7 +223,7 @@ class Resizing:
 
     def _tell_once(self, record: Record, text: str, known: _Known, now: float) -> None:
         without_numbers = "".join(c for c in text if not c.isdigit())
-        if without_numbers not in known.told and self._store.change(record, now, happened=text) is not None:
+        if without_numbers not in known.told and self._store.change(noted(record, text), now) is not None:
             known.told.add(without_numbers)
             log.warning("%s for %s (%s) %s", record.service, record.robot, record.id, text)
 

@@ -16,6 +16,7 @@ from skytether.api.rest import State
 from ..config.settings import Timing, Weights
 from ..domain.errors import InvalidError
 from ..domain.records import Record, new_record
+from ..domain.transitions import stopping
 from ..domain.validation import check_params
 from ..store.store import Store
 from .catalog import Catalog
@@ -119,8 +120,7 @@ class Standbys:
             self._store.add(spare, "", None, "")
 
     def _end(self, spare: Record, now: float) -> None:
-        to = State.STOPPED if spare.site is None else State.STOPPING
-        self._store.change(spare, now, state=to, stopping_at=now, reason="this standby is not needed any more")
+        self._store.change(stopping(spare, now, "this standby is not needed any more"), now)
 
     def failed(self, record: Record) -> None:
         """Do not try another one at once."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from skytether.api.rest import Measurement, Report, Size, State
 
 from ..config.settings import Timing, Weights
 from ..domain.records import Record, new_record
+from ..domain.transitions import displaced, explained, failed, stopped, takes_over
 from ..store.store import Store
 from .placement import UNSTARTED, told
 from .placer import Placer
@@ -82,13 +82,8 @@ class Successors:
             return
         wanted = self.successor_of(record)
         for spare in self._standbys.fitting(replace(wanted, replaces=None, refused=[])):
-            robot: dict[str, Any] = {"robot": record.robot, "measurements": record.measurements, "replaces": record.id}
-            if wanted.has != spare.has:
-                as_before = {"reason": "successor", "why": f"instance {record.id} had that"}
-                robot["resize"] = {**wanted.has.model_dump(), **as_before}
-            lease = {"lease_s": record.lease_s, "lease_expires_at": wanted.lease_expires_at}
             now = self._clock()
-            if self._store.claim(spare, {**robot, **lease, "created_at": now}, now, "", None, ""):
+            if self._store.claim(takes_over(spare, wanted, now), now, "", None, ""):
                 log.warning("%s for %s: %s; standby %s takes over", record.service, record.robot, why, spare.id)
                 return
 
@@ -103,7 +98,7 @@ class Successors:
             elif why := about_to_end(self._sites.find(record.site), record.id):
                 self._evacuate(record, why, now)
             elif record.reason:
-                self._store.change(record, now, reason="")  # it need not leave any more
+                self._store.change(explained(record, ""), now)  # it need not leave any more
         reports = self._store.reports(_BY_ITSELF)
         bad = {r.id for r in live if r.state is State.RUNNING and r.id in reports}
         self._bad_since = {i: self._bad_since.get(i, now) for i in bad}
@@ -129,33 +124,19 @@ class Successors:
             else:
                 reason = f"{why}, and nothing else takes it: {told(wanted, decision.refused)}"
         if reason != record.reason:
-            self._store.change(record, now, reason=reason)
+            self._store.change(explained(record, reason), now)
 
     def displace(self, record: Record, why: str) -> None:
         """Place anew what was lost with its site; ``why`` is a sentence."""
         now = self._clock()
         if record.state is State.STOPPING:
-            self._store.change(record, now, state=State.STOPPED, reason=why)
+            self._store.change(stopped(record, why), now)
             return
         if record.spare:
-            self._store.change(record, now, state=State.FAILED, reason=why)
+            self._store.change(failed(record, why), now)
             return
         self.fail_over(record, why)
-        self._store.change(
-            record,
-            now,
-            through=State.STARTING if record.state is State.RUNNING else None,
-            state=State.PENDING,
-            reason=f"{why}: trying another site",
-            site=None,
-            host=None,
-            port=None,
-            attempt=record.attempt + 1,
-            restarts=record.restarts + 1,
-            start_at=0.0,
-            started_at=None,
-            running_at=None,
-        )
+        self._store.change(displaced(record, f"{why}: trying another site"), now)
 
     def move_for_size(self, record: Record, size: Size, why: str) -> tuple[str | None, str]:
         """Start another one of that size where there is room, for one whose site does not give it that.

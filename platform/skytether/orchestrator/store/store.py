@@ -295,17 +295,12 @@ class Store(GroupStore):
         with self._reader.connect() as connection:
             return set(connection.scalars(select(instances.c.id).where(instances.c.id.in_(list(ids)))))
 
-    def change(
-        self, record: Record, now: float, *, through: State | None = None, happened: str = "", **changes: Any
-    ) -> Record | None:
+    def change(self, asked: Change, now: float) -> Record | None:
         """Change an instance if it is still as it was seen.
 
         Args:
-            record: As it was seen.
+            asked: What is to become of it; see ``domain.transitions``.
             now: Seconds since the epoch.
-            through: A state that it passes at once.
-            happened: What is told as an event, where neither state nor reason tells it.
-            changes: New values of fields.
 
         Returns:
             The record as it is now; None if somebody else changed it meanwhile.
@@ -313,7 +308,7 @@ class Store(GroupStore):
         Raises:
             IllegalMoveError: The move of state is not in the table.
         """
-        return self.change_all([Change(record, changes, through, happened)], now)[0]
+        return self.change_all([asked], now)[0]
 
     def change_all(self, asked: Sequence[Change], now: float) -> list[Record | None]:
         """The same of several, in one transaction: a change by itself takes a server's disk, each time."""
@@ -370,11 +365,10 @@ class Store(GroupStore):
         self.on_change(new.id)
         return new
 
-    def claim(
-        self, spare: Record, changes: dict[str, Any], now: float, owner: str, key: str | None, body_sha256: str
-    ) -> Record | None:
-        """Give a spare to a robot; None if another request was quicker, or what it would replace has a successor."""
-        changes = {**changes, "version": spare.version + 1, "updated_at": now, "spare": False}
+    def claim(self, asked: Change, now: float, owner: str, key: str | None, body_sha256: str) -> Record | None:
+        """Give a standby to a robot; None if another was quicker, or what it would replace has a successor."""
+        spare = asked.record
+        changes = {**asked.columns, "version": spare.version + 1}
         new = spare.after(changes)
         try:
             with self._writing() as connection:
