@@ -27,8 +27,8 @@ from skytether.orchestrator.http.app import create_app
 from skytether.orchestrator.http.refusal_delay import RefusalDelay
 from skytether.orchestrator.http.server import listening
 from skytether.orchestrator.scheduling import catalog as catalog
-from skytether.orchestrator.scheduling import sites
-from skytether.orchestrator.scheduling.sites import load_runtime
+from skytether.orchestrator.scheduling import runtime_entry_points
+from skytether.orchestrator.scheduling.runtime_entry_points import load_runtime
 from skytether.orchestrator.store.store import Store
 from skytether.testing import runtimes
 from skytether.testing.runtimes import FakeRuntime
@@ -111,7 +111,7 @@ def installed_services_are_read_once() -> Iterator[None]:
     read, installed = cache(catalog.read_builtin), cache(entry_points)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(catalog, "entry_points", installed)
-        patch.setattr(sites, "entry_points", installed)
+        patch.setattr(runtime_entry_points, "entry_points", installed)
         patch.setattr(catalog, "read_builtin", lambda points: read(tuple(points)))
         yield
 

@@ -21,7 +21,8 @@ from skytether.orchestrator.groups.scaler import Scaler
 from skytether.orchestrator.providers.base import Invitation, Provider
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
 from skytether.orchestrator.scheduling.placer import Placer
-from skytether.orchestrator.scheduling.sites import Site, Sites
+from skytether.orchestrator.scheduling.site import Site
+from skytether.orchestrator.scheduling.sites import Sites
 from skytether.orchestrator.store.leader import ALONE, Lead
 from skytether.orchestrator.store.store import Store
 from skytether.orchestrator.telemetry.metrics import Metrics

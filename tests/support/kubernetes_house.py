@@ -20,7 +20,7 @@ from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.runtimes.base import Runtime
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
-from skytether.orchestrator.scheduling.sites import load_runtime
+from skytether.orchestrator.scheduling.runtime_entry_points import load_runtime
 from skytether.wire.events import Event, MessageReceived
 from skytether.wire.topic import Role
 

@@ -16,7 +16,8 @@ from skytether.orchestrator.scheduling.leases import Leases
 from skytether.orchestrator.scheduling.placement_pass import PlacementPass
 from skytether.orchestrator.scheduling.placer import Placer
 from skytether.orchestrator.scheduling.reconcile import Reconciler
-from skytether.orchestrator.scheduling.sites import Site, Sites
+from skytether.orchestrator.scheduling.site import Site
+from skytether.orchestrator.scheduling.sites import Sites
 from skytether.orchestrator.scheduling.standbys import Standbys
 from skytether.orchestrator.scheduling.successors import Successors
 from skytether.orchestrator.store.leader import ALONE, Lead

@@ -47,7 +47,8 @@ from .scheduling.loops import Loop
 from .scheduling.placement_pass import PlacementPass
 from .scheduling.placer import Placer
 from .scheduling.reconcile import Reconciler
-from .scheduling.sites import Sites, load_runtime
+from .scheduling.runtime_entry_points import load_runtime
+from .scheduling.sites import Sites
 from .scheduling.standbys import Standbys
 from .scheduling.successors import Successors
 from .store.engine import GONE

@@ -25,7 +25,7 @@ from skytether.api.rest import (
     TopicReport,
 )
 from skytether.orchestrator.config.settings import Timing
-from skytether.orchestrator.scheduling.sites import RUNTIMES
+from skytether.orchestrator.scheduling.runtime_entry_points import RUNTIMES
 
 ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
 

@@ -14,8 +14,8 @@ from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.errors import ConflictError, InvalidError
 from skytether.orchestrator.runtimes.base import Observation, Phase, Runtime
 from skytether.orchestrator.runtimes.process import ProcessRuntime
-from skytether.orchestrator.scheduling import sites as module
-from skytether.orchestrator.scheduling.sites import load_runtime
+from skytether.orchestrator.scheduling import runtime_entry_points as module
+from skytether.orchestrator.scheduling.runtime_entry_points import load_runtime
 from skytether.orchestrator.store.leader import fenced
 from skytether.orchestrator.store.store import Store
 from skytether.testing.runtimes import FakeOptions, FakeRun, FakeRuntime, FakeWorld

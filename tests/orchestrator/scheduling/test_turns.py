@@ -12,7 +12,7 @@ from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Timing
 from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.runtimes.base import SiteSilentError
-from skytether.orchestrator.scheduling.sites import Site
+from skytether.orchestrator.scheduling.site import Site
 from skytether.testing.runtimes import FakeRuntime, NeverReadyRuntime, SlowRuntime, StubbornRuntime
 
 NewRecord = Callable[..., Record]

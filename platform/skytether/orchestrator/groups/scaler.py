@@ -18,7 +18,8 @@ from skytether.api.rest import SiteCreate
 
 from ..domain.errors import DomainError, NotFoundError
 from ..providers.base import Condition, Found, Invitation, Order, ProviderFailure, ProviderSilentError
-from ..scheduling.sites import Site, Sites
+from ..scheduling.site import Site
+from ..scheduling.sites import Sites
 from ..scheduling.successors import Successors
 from ..store.engine import GONE
 from ..store.group_store import GroupRow, MachineRow

@@ -20,7 +20,8 @@ from skytether.api.rest import SiteCreate
 from ..domain.errors import InvalidError
 from ..domain.validation import parse
 from ..runtimes.base import Capacity, RuntimeFailure
-from ..scheduling.sites import dismantle, load_runtime
+from ..scheduling.runtime_entry_points import load_runtime
+from ..scheduling.sites import dismantle
 from .base import Condition, Found, Order, Provider, ProviderFailure, ProviderSilentError, SiteShape
 
 _OURS = ("cpu", "memory_mb", "owner", "folder")

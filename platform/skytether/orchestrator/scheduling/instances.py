@@ -43,7 +43,8 @@ from ..telemetry.reports import Reports
 from .catalog import Catalog
 from .placement import Decision, told
 from .placer import Placer
-from .sites import Site, Sites
+from .site import Site
+from .sites import Sites
 from .standbys import Standbys
 from .successors import Successors
 

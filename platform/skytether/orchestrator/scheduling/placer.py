@@ -21,7 +21,8 @@ from ..store.leader import ALONE, Lead
 from ..store.store import Store
 from .placement import UNSTARTED, Decision, Prospect, lacks, place
 from .promises import NOTHING, Promises, Sums
-from .sites import Site, Sites
+from .site import Site
+from .sites import Sites
 
 _PROMISES_AGE = 3.0
 """Seconds for which sums are good enough for a request at an orchestrator that does not lead."""

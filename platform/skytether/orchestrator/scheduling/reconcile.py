@@ -43,7 +43,7 @@ from .plan import (
     plan,
 )
 from .resizing import Resizing
-from .sites import Site
+from .site import Site
 from .standbys import Standbys
 from .successors import Successors
 

@@ -20,7 +20,7 @@ from ..runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, 
 from ..store.store import Store
 from ..telemetry.metrics import Metrics
 from .placer import Placer
-from .sites import Site
+from .site import Site
 from .successors import Successors
 from .vertical_scaling import Proposal, Seen, Trend, bounded, decide, more_memory
 

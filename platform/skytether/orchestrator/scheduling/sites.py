@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from typing_extensions import override
-
-from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.rest import SiteCreate
 from skytether.api.validation_errors import known
 
@@ -21,17 +16,15 @@ from ..config.settings import Timing
 from ..config.sites_file import stored_as
 from ..domain.errors import ConflictError, Fault, ForbiddenError, InvalidError, NotFoundError
 from ..domain.validation import parse
-from ..runtimes.base import Capacity, Launch, Observation, OvertakenError, Runtime, RuntimeFailure
+from ..runtimes.base import OvertakenError, Runtime, RuntimeFailure
 from ..store.engine import GONE
 from ..store.leader import LeadLostError, fence, fenced
 from ..store.store import Store
-from .fitness import Fitness
-from .loops import Loop
-from .placement import NOTHING, Candidate
+from .runtime_entry_points import Unusable, load_runtime
+from .site import Site, Step
 
 log = logging.getLogger(__name__)
 
-RUNTIMES = "skytether.runtimes"
 DEFAULT_SITE = SiteCreate(name="local", tier="edge", runtime="process")
 """Made when there is no site at all. Tier ``edge``: the orchestrator's machine is near the robot, not on it."""
 NODE = "node://"
@@ -40,176 +33,6 @@ _FIRST_LOOK = 1.0
 """Seconds a new site gets to answer before it is listed all the same."""
 _CLOSE_TIMEOUT = 5.0
 """Seconds that a call into a hanging runtime gets at the end."""
-
-Step = Callable[["Site"], float]
-"""One reconcile pass over a site; returns seconds until the next."""
-
-
-def load_runtime(name: str) -> type[Runtime]:
-    """Find a runtime by its entry point.
-
-    Raises:
-        InvalidError: There is none, or it cannot be imported; the cause is told.
-    """
-    found = {point.name: point for point in entry_points(group=RUNTIMES)}
-    if name not in found:
-        there = ", ".join(sorted(found)) or "none"
-        raise InvalidError([Fault("runtime", f"there is no runtime '{name}'; installed are: {there}")])
-    try:
-        loaded = found[name].load()
-    except ImportError as error:
-        raise InvalidError([Fault("runtime", f"runtime '{name}' cannot be used: {error}")]) from error
-    if not (isinstance(loaded, type) and issubclass(loaded, Runtime)):
-        raise InvalidError([Fault("runtime", f"entry point '{name}' is no Runtime")])
-    return loaded
-
-
-class Unusable(Runtime):
-    """Stands in for a runtime that cannot be made (its extra was removed, say): the site is listed, with the reason."""
-
-    Options = Strict
-
-    def __init__(self, reason: str) -> None:
-        self._reason = reason
-
-    @override
-    def refuses(self, spec: ServiceSpec) -> str | None:
-        return self._reason
-
-    def capacity(self) -> Capacity:
-        raise RuntimeFailure(self._reason)
-
-    @override
-    def start(self, launch: Launch) -> None:
-        raise RuntimeFailure(self._reason)
-
-    def observe(self) -> Mapping[str, Observation]:
-        raise RuntimeFailure(self._reason)
-
-    @override
-    def stop(self, instance: str, *, force: bool) -> None:
-        raise RuntimeFailure(self._reason)
-
-    @override
-    def remove(self, instance: str) -> None:
-        raise RuntimeFailure(self._reason)
-
-    @override
-    def logs(self, instance: str, lines: int) -> str:
-        raise RuntimeFailure(self._reason)
-
-
-class Site:
-    """One site: its runtime, and what is known of it now. Read from any thread, written by its own."""
-
-    def __init__(self, asked: SiteCreate, runtime: Runtime, step: Step, timing: Timing) -> None:
-        self.asked = asked
-        self.runtime = runtime
-        self.fitness = Fitness(timing.backoff_max, timing.unfit_max)
-        """What it failed to start: only the orchestrator that leads knows."""
-        self.capacity: Capacity | None = None
-        self.load: float | None = None
-        """Share of its processors that is busy; None: not known."""
-        self.failure = ""
-        """Why the last look failed; empty: it did not."""
-        self.balks = 0
-        """Passes in a row that looked, and were then not answered, or overtaken, when they acted."""
-        self.rests_until = -math.inf
-        """Steady seconds: it answered nothing, and whoever calls meanwhile does not have it asked again."""
-        self.observed: Mapping[str, Observation] = {}
-        self.looked_at = -math.inf
-        """Monotonic seconds of the last look that did not fail."""
-        self.seen_since: tuple[int, float] | None = None
-        """Since when it has answered each time, after how many settings of the clock; None: it does not answer."""
-        self.hosted: frozenset[str] | None = None
-        """Robots that have, or had, an instance here, as far as the store knows; None: it was not asked yet."""
-        self.ended: frozenset[str] = frozenset()
-        """Those of the observed that the store knows as ended."""
-        self.leaving: Mapping[str, str] = {}
-        """Of the observed those that the site is about to end, and why."""
-        self.awaited: Collection[str] | None = None
-        """What starts or stops here, all of it seen as ``observed`` has it and dealt with; None: not known."""
-        self.draining = False
-        """It takes no more instances, and is deleted with its last one."""
-        self.group = ""
-        """Whose machine it is, for whoever leads; empty: of no group."""
-        self.evacuating = False
-        """It takes no more instances, and those that are there are moved elsewhere."""
-        self.called = False
-        """Somebody started or ended an instance here since the last pass began."""
-        self.passed_at = -math.inf
-        """Seconds of the reconciler's steady clock: when the last whole pass ended; minus infinity: with something left
-        to do, or not at all."""
-        self.watched_at = -math.inf
-        """The same of the last look at all that is here."""
-        self.pass_took = self.look_took = 0.0
-        """Seconds of a processor that both took."""
-        self.tidied_at = -math.inf
-        self.ender: threading.Thread | None = None
-        """Deletes it, once it is drained."""
-        self.led = 0
-        """Epoch of the leader as whose its runtime was last told to act; 0: nobody's."""
-        self.loop = Loop(f"site-{asked.name}", lambda: step(self), time.monotonic)
-        self._silent_after = timing.site_silent
-
-    @property
-    def name(self) -> str:
-        return self.asked.name
-
-    def wake(self) -> None:
-        """Look at once at what starts or stops here; from any thread."""
-        self.called = True
-        self.loop.wake()
-
-    @property
-    def unreachable(self) -> str:
-        """Why it cannot be used now; empty: it can."""
-        silent = time.monotonic() - self.looked_at
-        if self.failure or silent < self._silent_after:
-            return self.failure
-        return f"it has not answered for {silent:.0f} s" if self.capacity else "it has not answered yet"
-
-    def candidate(
-        self, spec: ServiceSpec, used: Capacity, unstarted: str | None = None, unfit: str | None = None
-    ) -> Candidate:
-        """As placement sees it for one service.
-
-        Args:
-            spec: The service.
-            used: What the instances that are here asked for.
-            unstarted: Why this very instance could not be started here.
-            unfit: Why none of the service is to be, for a while.
-        """
-        return Candidate(
-            name=self.name,
-            tier=self.asked.tier,
-            cannot_run=self.runtime.refuses(spec),
-            draining=self.draining or self.evacuating,
-            unstarted=unstarted,
-            unfit=unfit,
-            unreachable=self.unreachable or None,
-            blocked=self.runtime.blocked() or None,
-            total=self.capacity or NOTHING,
-            used=used,
-            load=self.load or 0.0,
-            speed=self.asked.speed,
-            cost=self.asked.cost,
-            images=self.asked.images,
-            fills=bool(self.group),
-        )
-
-
-def reachable(site: Site | None) -> bool:
-    """Whether there is one that can be used now."""
-    return site is not None and not site.unreachable
-
-
-def about_to_end(site: Site | None, instance: str) -> str:
-    """Why a site is about to end an instance; empty: it is not."""
-    if site is None:
-        return ""
-    drained = f"site {site.name} is being drained" if site.evacuating else ""
-    return site.leaving.get(instance, "") or drained
 
 
 class Sites:

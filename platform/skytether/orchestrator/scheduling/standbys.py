@@ -21,7 +21,8 @@ from ..domain.validation import check_params
 from ..store.store import Store
 from .catalog import Catalog
 from .placer import Placer
-from .sites import Sites, about_to_end, reachable
+from .site import about_to_end, reachable
+from .sites import Sites
 
 FOREVER = 2.5e11
 """End of a standby's lease: a date that can be written (the year 9892)."""

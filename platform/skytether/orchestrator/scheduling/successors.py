@@ -19,7 +19,8 @@ from ..domain.transitions import displaced, explained, failed, stopped, takes_ov
 from ..store.store import Store
 from .placement import UNSTARTED, told
 from .placer import Placer
-from .sites import Sites, about_to_end, reachable
+from .site import about_to_end, reachable
+from .sites import Sites
 from .standbys import Standbys
 
 log = logging.getLogger(__name__)

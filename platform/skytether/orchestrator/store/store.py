@@ -7,33 +7,24 @@ service reports.
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 from sqlalchemy import (
     ColumnElement,
     Connection,
-    Float,
-    FromClause,
-    RowMapping,
     Select,
-    and_,
-    bindparam,
     case,
     delete,
     exists,
     func,
     insert,
     select,
-    text,
     update,
 )
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.sql.dml import ReturningUpdate
 
 from skytether.api.report_metrics import Counts, Owner
 from skytether.api.rest import State
@@ -42,10 +33,10 @@ from skytether.api.service_report import ServiceReport
 from ..domain.counter_totals import MOST_NAMES, CounterTotals, merge
 from ..domain.discovery import NAME
 from ..domain.records import Change, Record
+from . import statements as sql
 from .group_store import GroupStore
 from .models import accounts, events, idempotency, instances, reports
 
-_FINAL = [state for state in State if state.final]
 _SEEN = 65_536
 """Records that are remembered, of what has not ended, so that looking at many again and again reads only those that
 changed."""
@@ -76,94 +67,6 @@ class Renewed:
     record: Record
     successor: str | None
     """The id of the one that replaces it and has not ended."""
-
-
-def _serves(table: FromClause) -> ColumnElement[bool]:
-    return and_(*(table.c.state != state for state in (*_FINAL, State.STOPPING)))
-
-
-# Made once: what every request asks. To make a statement takes longer than to run it.
-_INSTANCE = select(instances).where(instances.c.id == bindparam("instance"))
-_later = instances.alias()
-_SUCCESSOR = (
-    select(_later.c.id)
-    .where(_later.c.replaces == bindparam("instance"), _serves(_later))
-    .order_by(_later.c.created_at.desc())
-    .limit(1)
-)
-_SUCCEEDS = _SUCCESSOR.scalar_subquery().label("successor")
-"""Not by the renewed row's own id: names after RETURNING lose their table's on SQLite, and would be the subquery's."""
-_SUCCEED = text("SELECT pg_advisory_xact_lock(hashtextextended(:instance, 0))")
-"""Not a lock of its row: who extends all leases locks rows in any order."""
-_LOCKED_ACCOUNTS = (
-    select(accounts)
-    .where(accounts.c.robot.in_(bindparam("robots", expanding=True)))
-    .order_by(accounts.c.robot, accounts.c.service)
-    .with_for_update()
-)
-"""Locked, for two orchestrators may be told of the same robots at once; in order, lest each waits for the other."""
-_NEW_ACCOUNT = text(
-    "INSERT INTO accounts (robot, service, account) VALUES (:of_robot, :of_service, '{}') ON CONFLICT DO NOTHING"
-)
-_KEEP_ACCOUNT = (
-    update(accounts)
-    .where(accounts.c.robot == bindparam("of_robot"), accounts.c.service == bindparam("of_service"))
-    .values(account=bindparam("account"))
-)
-_HEAR = text(
-    "INSERT INTO reports (instance, at, report) SELECT id, :at, :report FROM instances WHERE id = :of_instance"
-    " ON CONFLICT (instance) DO UPDATE SET at = excluded.at, report = excluded.report WHERE reports.at <= excluded.at"
-).bindparams(bindparam("report", type_=reports.c.report.type))
-"""Nothing for an instance that was forgotten meanwhile, or of which another orchestrator has heard since."""
-
-
-@cache
-def _renewal(*, length: bool, robot: bool, measurements: bool) -> ReturningUpdate[Any]:
-    """Renews a lease, perhaps with another length, only for a robot, with new measurements; tells the successor too.
-
-    One that comes late, for its orchestrator was frozen or waited for the database, does not shorten what a later one
-    gave, unless it asks for another length.
-    """
-    lease_s = bindparam("length", type_=Float) if length else instances.c.lease_s
-    statement = update(instances).where(instances.c.id == bindparam("instance"), _serves(instances))
-    if robot:
-        statement = statement.where(instances.c.robot == bindparam("of_robot"))
-    if measurements:
-        statement = statement.values(measurements=bindparam("measured"))
-    # The version counts up, so that whoever is about to end it for its old lease has to look again.
-    full = bindparam("now", type_=Float) + lease_s
-    later = and_(instances.c.lease_expires_at > full, instances.c.lease_s == lease_s)
-    ends = {"lease_s": lease_s, "lease_expires_at": case((later, instances.c.lease_expires_at), else_=full)}
-    return statement.values(**ends, version=instances.c.version + 1).returning(instances, _SUCCEEDS)
-
-
-_LIVE = instances.c.state.not_in(_FINAL)
-_CHANGE = update(instances).where(
-    instances.c.id == bindparam("seen_id"), instances.c.version == bindparam("seen_version")
-)
-_EVENT = insert(events)
-
-
-def _versions(*conditions: ColumnElement[bool]) -> Select[str, int]:
-    """Which instances, oldest first, and how often each was changed."""
-    found = select(instances.c.id, instances.c.version).where(*conditions)
-    return found.order_by(instances.c.created_at, instances.c.id)
-
-
-_WHOLE = select(instances).where(instances.c.id.in_(bindparam("ids", expanding=True)))
-_CHANGEABLE = select(*(column for column in instances.c if column is not instances.c.manifest)).where(
-    instances.c.id.in_(bindparam("ids", expanding=True))
-)
-"""All but the manifest, which is the largest part and stays as it is."""
-_EVERY = _versions()
-_ALL_LIVE = _versions(_LIVE)
-_LIVE_OF = _versions(_LIVE, instances.c.robot == bindparam("robot"))
-_COUNT_LIVE = select(func.count()).where(_LIVE, instances.c.service == bindparam("service"))
-_LIVE_AT = _versions(_LIVE, instances.c.site == bindparam("site"))
-_CHANGING_AT = _versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
-_WAITING = _versions(instances.c.state.in_([State.PENDING, State.PLACING]))
-_LIVE_SPARES = _versions(_LIVE, instances.c.spare)
-_SPARES = _versions(instances.c.spare, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
 
 
 class _ChangedMeanwhileError(Exception):
@@ -207,12 +110,12 @@ class Store(GroupStore):
         try:
             with self._writing() as connection:
                 if (coming := self._coming(connection, record.replaces)) is not None:
-                    return _record(connection.execute(_INSTANCE, {"instance": coming}).mappings().one())
-                connection.execute(insert(instances).values(**_values(record)))
+                    return sql.record(connection.execute(sql.INSTANCE, {"instance": coming}).mappings().one())
+                connection.execute(insert(instances).values(**sql.values(record)))
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": record.id}
                     connection.execute(insert(idempotency).values(created_at=record.created_at, **row))
-                _add_event(connection, record)
+                sql.add_event(connection, record)
         except IntegrityError:
             earlier = self.made_with(owner, key, body_sha256) if key is not None else None
             if earlier is None:
@@ -225,7 +128,7 @@ class Store(GroupStore):
     def keys_in_use(self) -> set[str]:
         """Fingerprints of the secret keys of all instances that have not ended."""
         with self._reader.connect() as connection:
-            return set(connection.scalars(select(instances.c.key_id).where(_LIVE).distinct()))
+            return set(connection.scalars(select(instances.c.key_id).where(sql.LIVE).distinct()))
 
     def made_with(self, owner: str, key: str, body_sha256: str) -> Record | None:
         """The instance that was made with an idempotency key; None if the key is new.
@@ -241,48 +144,48 @@ class Store(GroupStore):
             return None
         if row["body_sha256"] != body_sha256:
             raise KeyReusedError
-        return _record(row)
+        return sql.record(row)
 
     def get(self, instance: str) -> Record | None:
         with self._reader.connect() as connection:
-            row = connection.execute(_INSTANCE, {"instance": instance}).mappings().one_or_none()
-        return None if row is None else _record(row)
+            row = connection.execute(sql.INSTANCE, {"instance": instance}).mappings().one_or_none()
+        return None if row is None else sql.record(row)
 
     def all(self, robot: str | None = None) -> list[Record]:
         """Newest first; of one robot, or of all."""
         if robot is None:
-            return sorted(self._look(_EVERY), key=lambda record: -record.created_at)
+            return sorted(self._look(sql.EVERY), key=lambda record: -record.created_at)
         query = select(instances).where(instances.c.robot == robot)
         return self._records(query.order_by(instances.c.created_at.desc(), instances.c.id))
 
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
-        return self._look(_ALL_LIVE)
+        return self._look(sql.ALL_LIVE)
 
     def live_of(self, robot: str) -> list[Record]:
         """All of one robot that has not ended, oldest first."""
-        return self._look(_LIVE_OF, robot=robot)
+        return self._look(sql.LIVE_OF, robot=robot)
 
     def count_live(self, service: str) -> int:
         """How many instances of a service have not ended."""
         with self._reader.connect() as connection:
-            return connection.scalar(_COUNT_LIVE, {"service": service}) or 0
+            return connection.scalar(sql.COUNT_LIVE, {"service": service}) or 0
 
     def live_at(self, site: str, *, changing: bool = False) -> list[Record]:
         """All at one site that has not ended, oldest first; with ``changing`` only what is starting or stopping."""
-        return self._look(_CHANGING_AT if changing else _LIVE_AT, site=site)
+        return self._look(sql.CHANGING_AT if changing else sql.LIVE_AT, site=site)
 
     def waiting(self) -> list[Record]:
         """All that has no site yet, oldest first."""
-        return self._look(_WAITING)
+        return self._look(sql.WAITING)
 
     def live_spares(self) -> list[Record]:
         """Those that are nobody's and have not ended, oldest first."""
-        return self._look(_LIVE_SPARES)
+        return self._look(sql.LIVE_SPARES)
 
     def spares(self, service: str) -> list[Record]:
         """Those of a service that run and are nobody's, oldest first."""
-        return self._look(_SPARES, service=service)
+        return self._look(sql.SPARES, service=service)
 
     def robots_at(self, site: str) -> frozenset[str]:
         """Robots of all instances at a site of which the store has a row, ended or not."""
@@ -313,8 +216,8 @@ class Store(GroupStore):
     def change_all(self, asked: Sequence[Change], now: float) -> list[Record | None]:
         """The same of several, in one transaction: a change by itself takes a server's disk, each time."""
         drafts = [one.draft(now) for one in asked]
-        rows = [{**columns, **_as_seen(one.record)} for one, (_, columns, _) in zip(asked, drafts, strict=True)]
-        events = [[_event(record) for record in told] for _, _, told in drafts]
+        rows = [{**columns, **sql.as_seen(one.record)} for one, (_, columns, _) in zip(asked, drafts, strict=True)]
+        events = [[sql.event(record) for record in told] for _, _, told in drafts]
         try:
             as_seen = self._change_rows(rows, events, at_once=len(rows) > 1)
         except _ChangedMeanwhileError:
@@ -338,14 +241,14 @@ class Store(GroupStore):
         """
         with self._writing() as connection:
             if at_once and len({frozenset(row) for row in rows}) == 1:
-                if connection.execute(_CHANGE, rows).rowcount != len(rows):
+                if connection.execute(sql.CHANGE, rows).rowcount != len(rows):
                     raise _ChangedMeanwhileError
                 as_seen = [True] * len(rows)
             else:
-                as_seen = [connection.execute(_CHANGE, row).rowcount > 0 for row in rows]
+                as_seen = [connection.execute(sql.CHANGE, row).rowcount > 0 for row in rows]
             said = [event for told, same in zip(events, as_seen, strict=True) if same for event in told]
             if said:
-                connection.execute(_EVENT, said)
+                connection.execute(sql.EVENT, said)
         return as_seen
 
     def tell(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
@@ -357,9 +260,9 @@ class Store(GroupStore):
         changes = {"version": record.version + 1, "said": reports[-1].number}
         said = {"instance": record.id, "at": now, "state": record.state.value}
         with self._writing() as connection:
-            if connection.execute(_CHANGE, {**changes, **_as_seen(record)}).rowcount == 0:
+            if connection.execute(sql.CHANGE, {**changes, **sql.as_seen(record)}).rowcount == 0:
                 return None
-            connection.execute(_EVENT, [{**said, "reason": one.message, "code": one.code} for one in reports])
+            connection.execute(sql.EVENT, [{**said, "reason": one.message, "code": one.code} for one in reports])
         new = record.after(changes)
         self._remember(new)
         self.on_change(new.id)
@@ -374,12 +277,12 @@ class Store(GroupStore):
             with self._writing() as connection:
                 if self._coming(connection, new.replaces) is not None:
                     return None
-                if connection.execute(_CHANGE, {**changes, **_as_seen(spare)}).rowcount == 0:
+                if connection.execute(sql.CHANGE, {**changes, **sql.as_seen(spare)}).rowcount == 0:
                     return None
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": new.id}
                     connection.execute(insert(idempotency).values(created_at=now, **row))
-                _add_event(connection, new)
+                sql.add_event(connection, new)
         except IntegrityError:
             return None  # the same request came twice at once: the other one has it
         self.on_change(new.id)
@@ -390,8 +293,8 @@ class Store(GroupStore):
         if replaced is None:
             return None
         if self.served:
-            connection.execute(_SUCCEED, {"instance": replaced})
-        return connection.scalar(_SUCCESSOR, {"instance": replaced})
+            connection.execute(sql.SUCCEED, {"instance": replaced})
+        return connection.scalar(sql.SUCCESSOR, {"instance": replaced})
 
     def hand_out(self, instance: str, claim_sha256: str) -> bool:
         """Note who gets the key of an instance's session; False if somebody else has it."""
@@ -403,7 +306,7 @@ class Store(GroupStore):
     def successor(self, instance: str) -> str | None:
         """The id of the one that replaces an instance and has not ended."""
         with self._reader.connect() as connection:
-            return connection.scalar(_SUCCESSOR, {"instance": instance})
+            return connection.scalar(sql.SUCCESSOR, {"instance": instance})
 
     def last_params(self, service: str) -> dict[str, Any] | None:
         """What the last robot that asked for a service asked for; None: nobody did."""
@@ -432,13 +335,15 @@ class Store(GroupStore):
         Returns:
             None if it is not there, not the robot's, or has ended or ends.
         """
-        statement = _renewal(length=lease_s is not None, robot=robot is not None, measurements=measurements is not None)
+        statement = sql.renewal(
+            length=lease_s is not None, robot=robot is not None, measurements=measurements is not None
+        )
         values = {"instance": instance, "now": now, "length": lease_s, "of_robot": robot, "measured": measurements}
         with self._writing(alone=True) as connection:
             row = connection.execute(statement, values).mappings().one_or_none()
         if row is None:
             return None
-        renewed = Renewed(_record(row), row["successor"])
+        renewed = Renewed(sql.record(row), row["successor"])
         self._remember(renewed.record)
         return renewed
 
@@ -459,12 +364,12 @@ class Store(GroupStore):
         rows = [{"of_instance": i, "at": at, "report": report} for i, (at, report) in sorted(heard.items())]
         with self._writing() as connection:
             beyond = self._count(connection, counted)
-            connection.execute(_HEAR, rows)
+            connection.execute(sql.HEAR, rows)
         return beyond
 
     def reports(self, control: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
         """The last report on each instance that has not ended; only of robots that one of these controls, if given."""
-        query = select(reports.c.instance, reports.c.report).join(instances).where(instances.c.state.not_in(_FINAL))
+        query = select(reports.c.instance, reports.c.report).join(instances).where(instances.c.state.not_in(sql.FINAL))
         if control is not None:
             query = query.where(reports.c.report["control_source"].as_string().in_(control))
         with self._reader.connect() as connection:
@@ -481,11 +386,11 @@ class Store(GroupStore):
         kept = _kept(connection, owners)
         new = [{"of_robot": robot, "of_service": service} for robot, service in owners if (robot, service) not in kept]
         if new:
-            connection.execute(_NEW_ACCOUNT, new)
+            connection.execute(sql.NEW_ACCOUNT, new)
             kept = _kept(connection, owners)
         merged, beyond = merge(kept, counted, self._robot_names)
         rows = [{"of_robot": o[0], "of_service": o[1], "account": merged[o].document()} for o in owners]
-        connection.execute(_KEEP_ACCOUNT, rows)
+        connection.execute(sql.KEEP_ACCOUNT, rows)
         return beyond
 
     def accounts(self) -> dict[tuple[str, str], CounterTotals]:
@@ -504,7 +409,7 @@ class Store(GroupStore):
         full: ColumnElement[float] = now + instances.c.lease_s
         if at_least:
             full = case((instances.c.lease_expires_at > full, instances.c.lease_expires_at), else_=full)
-        statement = update(instances).where(instances.c.state.not_in(_FINAL), instances.c.spare.is_(False))
+        statement = update(instances).where(instances.c.state.not_in(sql.FINAL), instances.c.spare.is_(False))
         with self._writing() as connection:
             connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))
 
@@ -523,7 +428,7 @@ class Store(GroupStore):
         Returns:
             Forgotten instances with their sites.
         """
-        ended = select(instances.c.id, instances.c.site, instances.c.updated_at).where(instances.c.state.in_(_FINAL))
+        ended = select(instances.c.id, instances.c.site, instances.c.updated_at).where(instances.c.state.in_(sql.FINAL))
         with self._writing() as connection:
             rows = connection.execute(ended.order_by(instances.c.updated_at.desc())).all()
             gone = [(r.id, r.site) for i, r in enumerate(rows) if i >= ended_count or r.updated_at < now - ended_age]
@@ -548,10 +453,12 @@ class Store(GroupStore):
                 these = changed[start : start + _FETCHED]
                 known = {id_: seen for id_ in these if (seen := found[id_]) is not None}
                 if known:
-                    newer = connection.execute(_CHANGEABLE, {"ids": list(known)}).mappings()
+                    newer = connection.execute(sql.CHANGEABLE, {"ids": list(known)}).mappings()
                     found |= {row["id"]: known[row["id"]].after(dict(row)) for row in newer}
                 if new := [id_ for id_ in these if id_ not in known]:
-                    found |= {row["id"]: _record(row) for row in connection.execute(_WHOLE, {"ids": new}).mappings()}
+                    found |= {
+                        row["id"]: sql.record(row) for row in connection.execute(sql.WHOLE, {"ids": new}).mappings()
+                    }
         for id_ in changed:
             if (record := found[id_]) is not None:
                 self._remember(record)
@@ -568,33 +475,9 @@ class Store(GroupStore):
 
     def _records(self, query: Any) -> list[Record]:
         with self._reader.connect() as connection:
-            return [_record(row) for row in connection.execute(query).mappings()]
+            return [sql.record(row) for row in connection.execute(query).mappings()]
 
 
 def _kept(connection: Connection, owners: Iterable[Owner]) -> dict[Owner, dict[str, Any]]:
-    rows = connection.execute(_LOCKED_ACCOUNTS, {"robots": list({robot for robot, _ in owners})})
+    rows = connection.execute(sql.LOCKED_ACCOUNTS, {"robots": list({robot for robot, _ in owners})})
     return {(row.robot, row.service): row.account for row in rows}
-
-
-def _values(record: Record) -> dict[str, Any]:
-    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-
-
-_COLUMNS = [field.name for field in dataclasses.fields(Record)]
-
-
-def _record(row: RowMapping) -> Record:
-    return Record(**{name: row[name] for name in _COLUMNS})
-
-
-def _as_seen(record: Record) -> dict[str, Any]:
-    """That it is changed only if it is still so."""
-    return {"seen_id": record.id, "seen_version": record.version}
-
-
-def _add_event(connection: Connection, record: Record) -> None:
-    connection.execute(_EVENT, _event(record))
-
-
-def _event(record: Record) -> dict[str, Any]:
-    return {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}

@@ -24,7 +24,7 @@ from skytether.orchestrator.domain.errors import InvalidError, NoSiteError
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, Runtime, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
-from skytether.orchestrator.scheduling.sites import load_runtime
+from skytether.orchestrator.scheduling.runtime_entry_points import load_runtime
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
 

@@ -12,7 +12,7 @@ from skytether.api.rest import NodeState, Site, SiteCreate, Unfit
 from ...access.access import Principal
 from ...core import Orchestrator
 from ...scheduling.instances import utc
-from ...scheduling.sites import Site as LiveSite
+from ...scheduling.site import Site as LiveSite
 from ...store.node_rows import Node
 from .deps import PREFIX, Caller, Core, SitesOperator, made, says
 
