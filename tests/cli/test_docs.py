@@ -151,14 +151,14 @@ def test_each_rule_of_the_bridge_that_the_code_cites_is_on_its_page() -> None:
     assert {number for _, number in cited} <= rules.keys()
 
 
-@pytest.mark.parametrize("package", ["wire"])
+@pytest.mark.parametrize("package", ["orchestrator", "wire"])
 def test_what_a_page_of_internals_names_is_there(package: str) -> None:
     page = (ROOT / "docs" / "internals" / f"{package}.md").read_text()
     platform, tests = ROOT / "platform" / "skytether", ROOT / "tests" / package
     files = re.findall(r"`([\w/]+\.py)`", page)
     assert len(files) > 20
     for file in files:
-        homes = (platform / package, platform, tests)
+        homes = (platform / package, platform, tests, ROOT)
         assert any((home / file).is_file() for home in homes), file
     defined = {
         (type_.name, name)

@@ -24,7 +24,7 @@ from ..access.access import Principal
 from ..config.settings import Limits
 from ..domain.errors import TooManyError, UnauthenticatedError
 from ..domain.overload import Overload
-from .connections import GUEST
+from .connections import CONNECTION
 from .problems import answer, answer_to
 from .refusal_delay import RefusalDelay
 
@@ -104,7 +104,7 @@ class Admission:
             on_renewed: Told how long a renewal took [s].
         """
         self._app = app
-        self._doorman = authenticator
+        self._authenticator = authenticator
         self._limits = limits
         self._overload = overload
         self._places, self._strangers = _Places(), _Places()
@@ -155,7 +155,7 @@ class Admission:
                 except _LeftError:
                     return None
                 whole = bytes(body.data)
-            self._doorman.charge(caller, len(whole))
+            self._authenticator.charge(caller, len(whole))
             return await self._place(
                 scope,
                 whole,
@@ -170,19 +170,19 @@ class Admission:
         given = token.strip() if kind.lower() == "bearer" else None
         address = scope["client"][0] if scope.get("client") else ""
         run: Callable[..., Awaitable[Any]] = self._for_renewals.run if renewal else to_thread.run_sync
-        recent = self._doorman.recent(given, address)
+        recent = self._authenticator.recent(given, address)
         caller: Principal
         if recent is None:
-            caller = await self._for_strangers.run(self._doorman.authenticate, given, address)
+            caller = await self._for_strangers.run(self._authenticator.authenticate, given, address)
         elif _PROBE.fullmatch(scope["path"]):  # what measures a round trip is not to measure a database too
             caller = recent
         elif renewal:  # the thread that renews asks first: each change of thread waits for its turn
-            self._doorman.spend(recent)
-            caller, run = recent, partial(self._for_renewals.run, _verified, self._doorman, given)
+            self._authenticator.spend(recent)
+            caller, run = recent, partial(self._for_renewals.run, _verified, self._authenticator, given)
         else:
-            caller = await run(self._doorman.authenticate, given, address)
+            caller = await run(self._authenticator.authenticate, given, address)
         scope.setdefault("state", {}).update({PRINCIPAL: caller, "who": caller.owner, RUN: run})
-        if (connection := scope.get(GUEST)) is not None:
+        if (connection := scope.get(CONNECTION)) is not None:
             connection.know(caller.owner)
         return caller
 

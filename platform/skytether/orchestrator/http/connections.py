@@ -27,7 +27,7 @@ from .certificate import LiveCertificate
 
 log = logging.getLogger(__name__)
 
-GUEST = "skytether.connection"
+CONNECTION = "skytether.connection"
 """Key of the connection's connection in an ASGI scope."""
 _SWEEP = 0.5
 """Seconds between two looks for connections that are late."""
@@ -236,7 +236,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._around = self._head = 0
         self._reads_head = True
         super().on_message_begin()
-        self.scope[GUEST] = self.connection  # type: ignore[literal-required]
+        self.scope[CONNECTION] = self.connection  # type: ignore[literal-required]
         if self._idle:  # the first head is due from the moment when the connection was taken
             self._idle = False
             self._owes(self.limits.head_s)
