@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.wire.topic import Role
 
 ROUNDING = 2e-6

@@ -12,7 +12,7 @@ import pytest
 from skytether.bridge import BridgeError
 from skytether.bridge.datagrams import DatagramSocket
 from skytether.bridge.endpoint import _new_loop
-from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.wire import Config
 from skytether.wire.events import Connected, Disconnected, PeerMoved, Refused
 from skytether.wire.topic import Direction, Role, Topic

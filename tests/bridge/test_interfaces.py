@@ -7,7 +7,7 @@ import pytest
 
 from skytether.bridge import interfaces
 from skytether.bridge.interfaces import LocalPath, Network, Watcher, addresses, select
-from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.wire import PathSwitched, Role
 
 PRESENT = {

@@ -6,7 +6,7 @@ import pytest
 from networks import Program, cable, masquerade
 
 from skytether.cli.commands.bridge.config import write_new_key
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.netns import Namespace
 from skytether.lab.tun import SERVICE, TunEmulator
 

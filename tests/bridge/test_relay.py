@@ -7,7 +7,7 @@ import pytest
 
 from skytether.bridge import BridgeError, Relay, RelayLimits
 from skytether.bridge.datagrams import DatagramSocket
-from skytether.lab.link import LinkEmulator
+from skytether.emulator.udp_link import LinkEmulator
 from skytether.wire.codec import packet
 from skytether.wire.events import Connected, PeerMoved
 from skytether.wire.topic import Role

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from skytether.guard import clock
-from skytether.robot.control import stall
+from skytether.robot.agent.clocks import read_clocks
 
 
 @pytest.fixture
@@ -18,4 +18,4 @@ def slept(monkeypatch):
 
 def test_guard_gate_and_agent_count_the_time_in_which_the_machine_slept(slept):
     assert clock.now() == 36_100.0
-    assert stall.clocks() == (100.0, 36_100.0)
+    assert read_clocks() == (100.0, 36_100.0)

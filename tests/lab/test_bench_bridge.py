@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.bench import conditions
 from skytether.lab.bench.pair import BenchError, Pair
 from skytether.lab.bench.traffic import COMMANDS, TABLE2, fig26
 from skytether.lab.bench.transports import NAMES, load
 from skytether.lab.bench.transports.base import TransportError
-from skytether.lab.link_model import LinkConditions
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from skytether.lab.link import LinkCounters
+from skytether.emulator.udp_link import LinkCounters
 from skytether.lab.trial.report import devices, summary
 from skytether.lab.trial.results import KeptTrials, TopicRow, Traces, TrialResult
 from skytether.lab.trial.scenario import Scenario, TrialSettings

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.netns import Namespace, NetworkError, enter
 from skytether.lab.tun import ROBOT, SERVICE, TunEmulator
 

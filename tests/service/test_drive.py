@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.trail import Pose
 from skytether.lab.world.plan import Box, Plan
 from skytether.messages import String, TFMessage, Twist, Vector3

@@ -8,9 +8,9 @@ from random import Random
 
 import pytest
 
+from skytether.emulator.link_model import IP_UDP_HEADERS, LinkConditions
 from skytether.lab.bench.conditions import SATURATED, find
 from skytether.lab.bench.traffic import COMMANDS, TABLE2
-from skytether.lab.link_model import IP_UDP_HEADERS, LinkConditions
 from skytether.wire import Role, Topic
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Direction, PeerMoved, Role, Topic
 from skytether.wire.codec import packet
 

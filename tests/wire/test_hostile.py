@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Role
 from skytether.wire.codec import packet
 from skytether.wire.codec.plaintext import OVERHEAD

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Role
 from skytether.wire.codec import frames, packet
 from skytether.wire.codec.ciphers import HandshakeTags

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.testing.link import LossyLink
 from skytether.wire import Config, Direction, Role, Session, Topic
 from skytether.wire.events import Connected

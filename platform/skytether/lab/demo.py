@@ -17,6 +17,7 @@ from pathlib import Path
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.messages import JointState, Message, Odometry, Twist, WrenchStamped
 from skytether.robot.agent.agent import Agent, AgentConfig
 from skytether.robot.agent.snapshot import AgentStatus
@@ -24,7 +25,6 @@ from skytether.robot.control.command import Source
 from skytether.wire.stats import TopicStats
 
 from .embedded import EmbeddedOrchestrator
-from .link import LinkConditions, LinkEmulator
 from .measures import Judge, Measures, Sample
 from .plot import plot_walk
 from .trail import Trail

@@ -16,9 +16,8 @@ from typing import Any
 from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.interfaces import LocalPath
 from skytether.bridge.local import GraphPort, LocalGraph
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.wire.topic import Direction, PathUse, Role, Topic
-
-from .link import LinkConditions, LinkEmulator
 
 SIZE, PERIOD = 128, 0.010
 BREAK_AFTER = 0.2

@@ -19,8 +19,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
-from .link import keep_time
-from .link_model import IP_UDP_HEADERS, LinkConditions, LinkCounters, LinkModel
+from skytether.emulator.link_model import IP_UDP_HEADERS, LinkConditions, LinkCounters, LinkModel
+from skytether.emulator.udp_link import keep_time
+
 from .netns import Namespace, NetworkError
 
 ROBOT = "10.77.0.1"

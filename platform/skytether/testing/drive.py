@@ -14,7 +14,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skytether.lab.link_model import LinkConditions, LinkModel
+from skytether.emulator.link_model import LinkConditions, LinkModel
 from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.plan import Plan
 from skytether.lab.world.simulation import TICK, Robot, Simulation

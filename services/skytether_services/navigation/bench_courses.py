@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.world.cluttered import field
 from skytether.lab.world.plan import Plan, building
 from skytether.lab.world.simulation import TICK

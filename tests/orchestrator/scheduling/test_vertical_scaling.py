@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from skytether.api.manifest import Needs, Scaling, ServiceSpec
 from skytether.api.rest import Size
-from skytether.orchestrator.runtimes.containers import least_memory_mb
+from skytether.orchestrator.runtimes.base import least_memory_mb
 from skytether.orchestrator.scheduling.vertical_scaling import (
     AIM_CPU,
     BUSY,

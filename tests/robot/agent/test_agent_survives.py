@@ -6,9 +6,9 @@ import pytest
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
+from skytether.emulator.udp_link import LinkEmulator
 from skytether.lab.demo import WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.lab.link import LinkEmulator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.robot.agent.agent import Agent, AgentConfig

@@ -5,7 +5,7 @@ from math import inf, nan
 
 import pytest
 
-from skytether.robot.control import stall
+from skytether.robot.agent.clocks import read_clocks
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
@@ -179,6 +179,6 @@ def test_the_watch_with_clocks_that_are_not_to_be_trusted():
 
 
 def test_both_clocks_of_this_machine_go_on():
-    (now, boot), (later, after) = stall.clocks(), stall.clocks()
+    (now, boot), (later, after) = read_clocks(), read_clocks()
     assert later >= now
     assert after >= boot

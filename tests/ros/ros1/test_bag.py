@@ -8,7 +8,7 @@ from ros1_pair import Pair
 from rosbags.rosbag1 import Reader
 
 from skytether.api.manifest import TopicSpec
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.tun import SERVICE, TunEmulator
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener

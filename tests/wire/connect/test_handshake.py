@@ -2,7 +2,7 @@
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Refused, Role, Session, Topic
 from skytether.wire.codec import packet
 from skytether.wire.connect.handshake import HandshakeResponder

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Connected, Disconnected, Role
 from skytether.wire.codec import packet
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions, LinkModel
+from skytether.emulator.link_model import LinkConditions, LinkModel
 from skytether.wire import Direction, Role, Topic
 from skytether.wire.codec.frames import Feedback
 from skytether.wire.path.congestion import LOWEST, MARGIN, PATIENCE, TARGET, RateControl

@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions, LinkModel
+from skytether.emulator.link_model import LinkConditions, LinkModel
 from skytether.wire.codec.frames import MOST_RUN
 from skytether.wire.codec.packet import TICK, TICKS, ticks
 from skytether.wire.config import Config

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Disconnected, Role, Topic
 from skytether.wire.codec import packet
 from skytether.wire.state.epoch import MAX_BYTES, Epoch

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Role, Topic
 from skytether.wire.events import MessageReceived
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 
 SWEEP = (0, 1, 2, 5, 10, 15, 20, 25, 30)
 """Losses of ``sweep``, percent."""

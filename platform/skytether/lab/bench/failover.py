@@ -30,7 +30,7 @@ from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
-from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.agent.agent import Agent, AgentConfig
 from skytether.robot.control.command import Command, Source

@@ -12,8 +12,8 @@ from typing import Any
 from skytether.api.client import Client, Unreachable
 from skytether.api.rest import Instance, InstanceCreate, Renew, Report, State
 from skytether.bridge.spec import SessionSpec
-from skytether.lab.link_model import LinkConditions
-from skytether.lab.lossy_link import LossyLink
+from skytether.emulator.link_model import LinkConditions
+from skytether.emulator.lossy_link import LossyLink
 from skytether.robot.agent.snapshot import report
 from skytether.robot.offload.lease_client import LeaseClient
 from skytether.robot.session.counter_totals import COUNTERS, CounterTotals

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from skytether.lab.link_model import IP_UDP_HEADERS, LinkConditions, LinkCounters
+from skytether.emulator.link_model import IP_UDP_HEADERS, LinkConditions, LinkCounters
 from skytether.lab.tun import SERVICE
 from skytether.wire.topic import Role
 

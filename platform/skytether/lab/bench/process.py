@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from skytether.lab.link import LinkEmulator, keep_time
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
+from skytether.emulator.udp_link import LinkEmulator, keep_time
 from skytether.lab.netns import enter
 from skytether.lab.tun import TunEmulator
 

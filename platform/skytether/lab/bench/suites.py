@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from skytether.lab.link_model import LinkConditions
+from skytether.emulator.link_model import LinkConditions
 
 from . import traffic
 from .conditions import SATURATED, Condition

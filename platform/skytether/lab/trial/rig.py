@@ -20,8 +20,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
+from skytether.emulator.udp_link import LinkEmulator
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.lab.link import LinkEmulator
 from skytether.lab.throttle import Throttle, children_of
 from skytether.lab.world.agent import Clockwork, Observer, WorldGraph, WorldHardware
 from skytether.lab.world.simulation import Simulation

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from skytether.lab.link import LinkConditions
+from skytether.emulator.udp_link import LinkConditions
 
 ROBOT_CPU = 0.25
 """Processors of the robot's computer, in those of this machine: the Pioneer LX has an Atom of two slow cores (thesis,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from skytether.lab.link import LinkCounters
+from skytether.emulator.udp_link import LinkCounters
 from skytether.lab.world.simulation import Robot
 
 from .results import Point, rounded

@@ -22,7 +22,7 @@ from skytether.api.node import ANSWER_S, GO, MOST_WAYS, PING_S, SILENT_S, Said, 
 from skytether.api.splice import PIECE, Stream, splice
 
 from ..domain.rate_limit import RateLimiter
-from ..runtimes.docker.engine import ENGINE_AWAY, ENGINE_SOCKET
+from ..runtimes.base import ENGINE_AWAY, ENGINE_SOCKET
 
 log = logging.getLogger(__name__)
 

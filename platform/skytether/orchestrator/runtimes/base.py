@@ -15,6 +15,7 @@ suite each must pass, and docs/writing-a-runtime.md says how to write one.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -25,6 +26,16 @@ from typing import Any, ClassVar
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec, Strict
 from skytether.api.service_report import ServiceReport
+
+ENGINE_SOCKET, ENGINE_AWAY = "engine.sock", "engine.away"
+"""In the folder of a site that joined: the socket of its engine while the node is linked, and why it is not."""
+_ROOM_MB = 32
+"""Memory that is left beside what is used, however little that is [MiB]."""
+
+
+def least_memory_mb(used_bytes: int) -> int:
+    """Below which nothing that uses so much is brought while it runs [MiB]: the kernel would kill it."""
+    return math.ceil(max(used_bytes * 1.1, used_bytes + (_ROOM_MB << 20)) / 2**20)
 
 
 class Phase(StrEnum):

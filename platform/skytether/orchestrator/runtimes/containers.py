@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import secrets
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ _UNOWNED = "skytether/"
 """What the names of our own images begin with, as `make images` builds them."""
 _PUBLIC = ("docker.io", "index.docker.io")
 """Whom engines ask for names without a registry."""
-_ROOM_MB = 32
-"""Memory that is left beside what is used, however little that is [MiB]."""
 _SIGNALLED, _SIGNALS = 128, 64
 """An exit status above the first means the signal that is left, as far as there are any: 255 is a program's own -1."""
 
@@ -73,11 +70,6 @@ def most_cores(spec: ServiceSpec) -> float:
 def most_memory_mb(spec: ServiceSpec) -> int:
     """That a container may have [MiB]; beyond it the service is killed."""
     return spec.limits.memory_mb or spec.needs.memory_mb
-
-
-def least_memory_mb(used_bytes: int) -> int:
-    """Below which nothing that uses so much is brought while it runs [MiB]: the kernel would kill it."""
-    return math.ceil(max(used_bytes * 1.1, used_bytes + (_ROOM_MB << 20)) / 2**20)
 
 
 def exit_status(code: int) -> int:

@@ -35,8 +35,7 @@ from ..domain.security import SecretFileError, Secrets
 from ..domain.transitions import claimed, noted, resizing, stopping
 from ..domain.validation import check_params
 from ..robots.gates import Gates
-from ..runtimes.base import LogStream, RuntimeFailure
-from ..runtimes.containers import least_memory_mb
+from ..runtimes.base import LogStream, RuntimeFailure, least_memory_mb
 from ..store.store import KeyReusedError, Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.reports import Reports

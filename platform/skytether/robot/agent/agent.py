@@ -31,7 +31,7 @@ from skytether.messages import Encoding, Message, Twist, type_hash, warm
 from skytether.wire.stats import SessionStats
 from skytether.wire.topic import Role
 
-from ..control import fallback, stall
+from ..control import fallback
 from ..control.arbiter import Needs
 from ..control.command import Source
 from ..control.control_loop import Clocks, ControlLoop, Observer, RobotHardware
@@ -49,6 +49,7 @@ from ..session.counter_totals import CounterTotals
 from ..session.link_quality import Quality
 from ..session.session import Endpoint, LiveSession
 from ..session.topic_table import Offer, robot_table, spoken
+from .clocks import read_clocks
 from .gate_report import GateReporter
 from .gate_watch import GateWatch
 from .log_queue import log_queue
@@ -157,7 +158,7 @@ class Agent:
         client: The orchestrator; made from the configuration if not given.
         bridge: Makes the robot's end of the bridge.
         clock: Monotonic seconds; the bridge's must be the same.
-        clocks: The same clock, and one that goes on while the computer sleeps; without it `stall.clocks`, or with a
+        clocks: The same clock, and one that goes on while the computer sleeps; without it `read_clocks`, or with a
             ``clock`` that is made up, that one alone.
         random: For the jitter of the back-off.
 
@@ -182,7 +183,7 @@ class Agent:
         self._hardware = hardware
         self._graph = graph
         self._clock = clock
-        self._clocks = clocks or (stall.clocks if clock is time.monotonic else lambda: (self._clock(), None))
+        self._clocks = clocks or (read_clocks if clock is time.monotonic else lambda: (self._clock(), None))
         self._make_bridge = bridge or (
             lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
         )

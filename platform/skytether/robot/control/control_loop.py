@@ -142,7 +142,7 @@ class ControlLoop:
         needs: The arbiter's, and the robot's own; what a session says about the service only tightens them.
         now: Monotonic seconds.
         observer: See `Observer`.
-        clocks: Both clocks as `stall.clocks` reads them, looked at right before each velocity is
+        clocks: Both clocks as `agent.clocks` reads them, looked at right before each velocity is
             written: who is stopped in the middle of a tick tells nothing old. None: time is made up.
     """
 

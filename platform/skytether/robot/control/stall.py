@@ -2,13 +2,11 @@
 
 Wheels stop by themselves when they hear nothing (`RobotHardware`). Whoever goes on after such a gap with what it knew
 before tells a standing robot to drive. CLOCK_MONOTONIC does not see a suspend, because it stands still itself;
-CLOCK_BOOTTIME goes on, so the difference of the two grows by what was slept. Pure, but for `clocks`: times are
-arguments.
+CLOCK_BOOTTIME goes on, so the difference of the two grows by what was slept. Pure: times are arguments.
 """
 
 from __future__ import annotations
 
-import time
 from math import inf, isfinite
 
 _SLEPT_S = 0.005
@@ -55,9 +53,3 @@ class StallWatch:
         if slept > _SLEPT_S:
             return max(gap, 0.0) + slept
         return gap if gap > self._most_s else 0.0
-
-
-def clocks() -> tuple[float, float | None]:
-    """Both clocks of this computer now, in the order of `StallWatch.look`."""
-    boot = time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else None
-    return time.monotonic(), boot

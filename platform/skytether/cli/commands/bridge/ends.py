@@ -16,7 +16,7 @@ from skytether.bridge.interfaces import LocalPath, Wanted
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.bridge.port import Port
 from skytether.bridge.spec import SessionSpec, parse_id, topics_from_api
-from skytether.lab.link import LinkConditions, LinkEmulator
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.ros.names import Names
 from skytether.ros.ros2.config import join_graph
 from skytether.wire import Config

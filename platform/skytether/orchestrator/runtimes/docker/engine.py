@@ -25,7 +25,7 @@ from docker.tls import TLSConfig
 
 from skytether.guard.folder import objection_to
 
-from ..base import RuntimeFailure, SiteSilentError
+from ..base import ENGINE_AWAY, ENGINE_SOCKET, RuntimeFailure, SiteSilentError
 from .client import Client
 from .options import LOCAL_SOCKET, DockerOptions
 
@@ -39,8 +39,6 @@ _PROBE_S = 5.0
 """An engine that is stopped lets its queue of connections fill up; then even this takes time."""
 _MOST_WORDS = 2000
 """Characters of what an engine says is wrong: they are kept, logged and told."""
-ENGINE_SOCKET, ENGINE_AWAY = "engine.sock", "engine.away"
-"""In the folder of a site that joined: the socket of its engine while the node is linked, and why it is not."""
 _SSH_TIMEOUT = 15
 """Seconds that SSH gets to connect, and after which a silent connection is given up."""
 

@@ -27,8 +27,9 @@ from ..base import (
     Phase,
     Runtime,
     RuntimeFailure,
+    least_memory_mb,
 )
-from ..containers import USER, kept_owner, least_memory_mb, with_owner
+from ..containers import USER, kept_owner, with_owner
 from .engine import Engine, EngineGoneError
 from .fence import Fence
 from .follow import Follower

@@ -25,8 +25,9 @@ from ..base import (
     Runtime,
     RuntimeFailure,
     SiteSilentError,
+    least_memory_mb,
 )
-from ..containers import USER, kept_owner, least_memory_mb, with_owner
+from ..containers import USER, kept_owner, with_owner
 from ..egress import resolve
 from .budget import Budget
 from .cluster import Cluster, ClusterSilentError, RefusedError

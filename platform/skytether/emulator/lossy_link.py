@@ -6,7 +6,7 @@
     link.run(0.2)
     assert link.messages[Role.SERVICE]
 
-What happens to each packet is decided by the same model as in `skytether.lab.link`, which does it to real sockets.
+What happens to each packet is decided by the same model as in `udp_link`, which does it to real sockets.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from itertools import count, groupby
 from random import Random
 from typing import NamedTuple
 
-from skytether.lab.link_model import LinkConditions, LinkModel
+from skytether.emulator.link_model import LinkConditions, LinkModel
 from skytether.wire import Event, MessageReceived, Role, Session, Transmit
 
 _STEPS = 200_000

@@ -7,8 +7,8 @@ from itertools import groupby
 
 import pytest
 
-from skytether.lab.link import LinkConditions, LinkEmulator
-from skytether.lab.link_model import IP_UDP_HEADERS, LinkModel
+from skytether.emulator.link_model import IP_UDP_HEADERS, LinkModel
+from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 
 # --- what is decided: made-up time --------------------------------------------------------------------------------
 
