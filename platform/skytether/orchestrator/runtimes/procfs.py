@@ -1,4 +1,8 @@
-"""What the kernel tells of processes (Linux ``/proc``, see proc(5)): one small read per look, no race in it."""
+"""What the kernel tells of processes (Linux ``/proc``, see proc(5)): one small read per look, no race in it.
+
+psutil has no session of a process, and puts state, times, start and memory together from several reads: 90 us a look
+against 17 us here, five times a second for each process of each instance.
+"""
 
 from __future__ import annotations
 

@@ -35,8 +35,10 @@ _POSTGRES = {
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,
     "options": f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout=5000"
-    " -c tcp_keepalives_idle=5 -c tcp_keepalives_interval=2 -c tcp_keepalives_count=3",
+    " -c tcp_keepalives_idle=5 -c tcp_keepalives_interval=2 -c tcp_keepalives_count=3"
+    " -c tcp_user_timeout=10000",
 }
 """A server that is gone is noticed within seconds, and by a server a leader that is gone; for one that hangs see
 ``postgres.py``. In a database without an encoding (``SQL_ASCII``) text would come back as bytes."""

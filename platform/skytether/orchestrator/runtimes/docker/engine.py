@@ -197,6 +197,10 @@ class Tunnel:
     """An SSH client that makes an engine's socket one of ours.
 
     It runs ``cat`` there, which ends with our end of its input: no tunnel outlives the orchestrator, however that ends.
+
+    docker-py has two ways of its own. By the ``ssh`` program it starts one for each connection, wants Docker's command
+    line over there, takes no option (whose host keys are believed, which identity, keepalives), and waits without end
+    for an engine that is silent, since a pipe has no timeout. By paramiko the user's SSH configuration counts in part.
     """
 
     def __init__(self, options: DockerOptions) -> None:
