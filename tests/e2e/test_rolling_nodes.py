@@ -32,7 +32,8 @@ from skytether.lab.demo import WalkerHardware
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.orchestrator.store.engine import make_engine, migrate
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Source
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.postgres]

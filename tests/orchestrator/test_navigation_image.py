@@ -15,7 +15,7 @@ from skytether.api.rest import Instance, InstanceCreate, RobotCreate, SiteCreate
 from skytether.lab.bench.start_robots import ROBOTS, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.nine_goals import SCENARIOS, NineGoalsSettings, NineGoalsTrial
-from skytether.robot.agent.agent import AgentConfig
+from skytether.robot.agent.config import AgentConfig
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
 

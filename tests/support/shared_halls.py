@@ -20,7 +20,8 @@ from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import Header, OccupancyGrid, Path, Point, PoseStamped, String, decode
 from skytether.messages import Pose as PoseMessage
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 
 PATIENCE_S = 120.0
 

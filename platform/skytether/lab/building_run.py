@@ -21,7 +21,8 @@ import yaml
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.messages import String, Twist, decode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 
 from .embedded import EmbeddedOrchestrator
 from .nine_goals import LIMITS, ROBOT, SERVICE

@@ -19,7 +19,8 @@ from skytether.api.client import Client
 from skytether.api.rest import RobotCreate
 from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.messages import JointState, Message, Odometry, Twist, WrenchStamped
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.snapshot import AgentStatus
 from skytether.robot.control.command import Source
 from skytether.wire.stats import TopicStats

@@ -11,7 +11,8 @@ from skytether.api.manifest import TopicSpec
 from skytether.api.rest import Session, TopicReport
 from skytether.bridge import BridgeError, topics_from_api
 from skytether.messages import WrenchStamped, type_hash
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
 from skytether.robot.control.fallback import FallbackError
@@ -39,7 +40,7 @@ CONFIG = AgentConfig(
 class Rig:
     """An agent whose threads do not run, a made-up clock, and the bridges that it made."""
 
-    def __init__(self, base, orchestrator, make_bridge, config=CONFIG):
+    def __init__(self, base, orchestrator, make_bridge, config=CONFIG, graph=None):
         self.now = 50.0
         self.made = []
 
@@ -48,7 +49,7 @@ class Rig:
             self.made.append((spec, port, bind, peer, endpoint))
             return endpoint
 
-        self.agent = Agent(config, base, client=orchestrator, bridge=bridge, clock=lambda: self.now)
+        self.agent = Agent(config, base, graph=graph, client=orchestrator, bridge=bridge, clock=lambda: self.now)
 
     def tick(self):
         self.now += 0.01
@@ -186,7 +187,10 @@ class OneAtATime:
         pass
 
 
-def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orchestrator, make_cloud):
+def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(base, orchestrator, make_bridge, make_cloud):
+    orchestrator.session = SESSION
+    rig = Rig(base, orchestrator, make_bridge, graph=(graph := OneAtATime()))
+
     def drive():
         cloud = make_cloud(rig.agent._control_loop.session)
         for _ in range(500):
@@ -194,7 +198,6 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(rig, orche
             rig.tick()
         assert rig.agent.source is Source.CLOUD
 
-    rig.agent._graph = graph = OneAtATime()
     rig.ask()
     kept, old = rig.agent.status().instance, rig.agent._control_loop.session
     drive()

@@ -10,7 +10,8 @@ from skytether.api.manifest import Needs, TopicSpec
 from skytether.api.rest import Session
 from skytether.bridge import Bridge, SessionSpec
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
 from skytether.wire.topic import Role

@@ -11,7 +11,8 @@ from skytether.lab.demo import WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Source
 from skytether.robot.offload.site_prober import TaskConfig
 

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 from skytether.api.client import ApiError
 from skytether.api.rest import Placement, Problem
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.offload.site_prober import TaskConfig
 from skytether.robot.offload.task_manager import Mode, Policy
 

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from skytether.api.rest import Placement
 from skytether.cli.app import app
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.status import StatusServer, document, metrics
 from skytether.robot.offload.site_prober import TaskConfig
 from skytether.robot.offload.task_manager import Option

@@ -5,7 +5,8 @@ import time
 from pathlib import Path
 
 from skytether.messages import Vector3, Wrench, WrenchStamped
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.safety.client import GateLink
 

@@ -23,7 +23,8 @@ from skytether.api.rest import GateReport, RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.messages import Bool, Joy, LaserScan, Message, Twist, Vector3, Wrench, WrenchStamped, decode, encode
 from skytether.robot.agent import remote_stop
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.safety.client import GateError, GateLink, ask
 

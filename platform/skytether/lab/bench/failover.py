@@ -32,7 +32,8 @@ from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Command, Source
 from skytether.robot.control.failure_detector import least_s
 from skytether.robot.control.supervisor import Limits

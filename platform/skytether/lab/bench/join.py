@@ -23,7 +23,7 @@ from skytether.lab.bench.pair import BenchError
 from skytether.lab.bench.start import ROBOT, first_command
 from skytether.lab.bench.start_robots import ROBOTS, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.robot.agent.agent import AgentConfig
+from skytether.robot.agent.config import AgentConfig
 
 _SERVICE = "virtual-trail"
 _NODE = "bench-node"

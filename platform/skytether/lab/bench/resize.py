@@ -33,7 +33,8 @@ from skytether.lab.demo import ROBOT, SERVICE, WalkerHardware
 from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Source
 
 SIZES = Size(cpu=2.0, memory_mb=512), Size(cpu=1.0, memory_mb=256)

@@ -16,7 +16,8 @@ from skytether.lab.bench.pair import BenchError
 from skytether.lab.bench.pods import kubernetes_site
 from skytether.lab.bench.start_robots import ROBOTS, Asking, Watch
 from skytether.lab.embedded import EmbeddedOrchestrator
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 
 ROBOT = "robot"
 _LIMIT_S = 60.0

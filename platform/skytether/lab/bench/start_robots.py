@@ -18,7 +18,8 @@ from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.plan import building
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import String, decode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Command
 from skytether.robot.control.supervisor import Objection
 

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from skytether.control.admittance import AdmittanceParams
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink

@@ -20,7 +20,8 @@ from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.lab.bench.failover import Granted
 from skytether.messages import Message, Twist, Vector3, encode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateLink

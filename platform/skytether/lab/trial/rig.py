@@ -26,7 +26,8 @@ from skytether.lab.throttle import Throttle, children_of
 from skytether.lab.world.agent import Clockwork, Observer, WorldGraph, WorldHardware
 from skytether.lab.world.simulation import Simulation
 from skytether.messages import Message, String, Twist, decode
-from skytether.robot.agent.agent import Agent, AgentConfig
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.supervisor import Limits
 
 from .results import Measured, TopicRow

@@ -12,48 +12,40 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
-from itertools import count
 from math import nan
-from pathlib import Path
 from random import Random
 from types import TracebackType
 from typing import Any
 
 from skytether.api import rest
 from skytether.api.client import Client
-from skytether.bridge import Bridge, BridgeError, SessionSpec
-from skytether.bridge.interfaces import Wanted
-from skytether.bridge.port import Port
-from skytether.bridge.spec import parse_id, parse_key
-from skytether.messages import Encoding, Message, Twist, type_hash, warm
+from skytether.bridge import BridgeError
+from skytether.messages import Twist, warm
 from skytether.wire.stats import SessionStats
-from skytether.wire.topic import Role
 
 from ..control import fallback
-from ..control.arbiter import Needs
 from ..control.command import Source
 from ..control.control_loop import Clocks, ControlLoop, Observer, RobotHardware
-from ..control.service_manager import ServiceManager, Terms, terms
-from ..control.supervisor import Limits
+from ..control.service_manager import ServiceManager, terms
 from ..graphs.graph_base import Graph
 from ..graphs.wheels_watch import NOBODY, WatchesWheels
 from ..log_throttle import LogThrottle
 from ..offload.lease_client import LeaseClient, Orchestrator
 from ..offload.resolver import Resolver
 from ..offload.shared_topics import Serving, SharedTopics, SharedTopicsExchange
-from ..offload.site_prober import SiteProber, TaskConfig
+from ..offload.site_prober import SiteProber
 from ..offload.task_manager import PathQuality, RobotView
 from ..session.counter_totals import CounterTotals
 from ..session.link_quality import Quality
-from ..session.session import Endpoint, LiveSession
-from ..session.topic_table import Offer, robot_table, spoken
+from ..session.session import LiveSession
 from .clocks import read_clocks
+from .config import AgentConfig
 from .gate_report import GateReporter
 from .gate_watch import GateWatch
 from .log_queue import log_queue
 from .remote_stop import RemoteStop
+from .session_opener import MakeBridge, OpenSession, SessionOpener
 from .snapshot import AgentStatus, report
 from .status import StatusServer, document, metrics
 
@@ -66,84 +58,6 @@ _WATCH_S = 0.1
 """Between looks at the bridge's counters."""
 _JOIN_S = 2.0
 """A thread that does not end by then is left behind; the wheels have been stopped before."""
-
-Address = tuple[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class AgentConfig:
-    """One robot and the service it wants.
-
-    Attributes:
-        robot: Its name at the orchestrator.
-        url: The orchestrator's base address.
-        token: The robot's.
-        service: What it asks for.
-        params: The service's parameters.
-        measurements: What it measured towards the sites, by site.
-        fallback: Entry point of the group ``skytether.fallbacks``.
-        fallback_options: The fallback's.
-        limits: The supervisor's; from here only.
-        needs: The arbiter's patience, and what the link must be like at least. What a session says the service needs
-            (``needs.max_rtt_ms`` and ``needs.max_loss`` of its manifest) only tightens that.
-        command_topic: The service's topic (geometry_msgs/msg/Twist) that drives the robot.
-        rate_hz: Of the control loop.
-        lease_s: The instance ends when the robot was not heard of for this long.
-        renew_s: Between renewals, which carry the report.
-        request_timeout_s: Of each request to the orchestrator.
-        bind: Local address of the robot's end of the bridge; port 0: any.
-        paths: Networks that the bridge uses side by side, or "auto" (`skytether.bridge.interfaces`); none: `bind` only.
-        ca_file: PEM file of the authority of the orchestrator's certificate; none: the system's.
-        insecure_http: Whether plain http may leave this machine.
-        task: How it is decided whether to ask, and for which site; None: the service is asked for always, at whatever
-            site the orchestrator chooses by ``measurements``.
-        fresh_token: Gives the robot's token as it is now, when the one in use was refused; None: there is no other.
-        status_port: Port on loopback of ``/status`` and ``/metrics``, the next if it is taken; 0: any free one; None:
-            there are none.
-        gate: Folder of the gate before the wheels; None: there is none.
-        stop_from_afar: Whether the orchestrator may stop the robot, by the gate.
-        route: Where to send what is meant for the service's address; for experiments with an emulated link.
-    """
-
-    robot: str
-    url: str
-    service: str
-    token: str = field(repr=False)
-    params: Mapping[str, Any] = field(default_factory=dict)
-    measurements: Mapping[str, rest.Measurement] = field(default_factory=dict)
-    fallback: str = "stop"
-    fallback_options: Mapping[str, Any] = field(default_factory=dict)
-    limits: Limits = field(default_factory=Limits)
-    needs: Needs = field(default_factory=Needs)
-    command_topic: str = "cmd_vel"
-    rate_hz: float = 100.0
-    lease_s: float = 15.0
-    renew_s: float = 2.0
-    request_timeout_s: float = 5.0
-    bind: Address = ("0.0.0.0", 0)  # noqa: S104 - the robot has one network or several; who sends is authenticated
-    paths: Wanted = ()
-    ca_file: str | None = None
-    insecure_http: bool = False
-    task: TaskConfig | None = None
-    fresh_token: Callable[[], str] | None = None
-    status_port: int | None = None
-    gate: Path | None = None
-    stop_from_afar: bool = False
-    route: Callable[[str, int], Address] = lambda host, port: (host, port)
-
-
-@dataclass(frozen=True, slots=True)
-class _Opened:
-    """A session that is open, the instance that it is of, and what that is held to."""
-
-    session: LiveSession
-    instance: rest.Instance
-    terms: Terms
-    shared: SharedTopics
-
-
-MakeBridge = Callable[[SessionSpec, Port, Address, Address], Endpoint]
-"""Session, port, address to bind, address of the service."""
 
 
 class Agent:
@@ -184,9 +98,7 @@ class Agent:
         self._graph = graph
         self._clock = clock
         self._clocks = clocks or (read_clocks if clock is time.monotonic else lambda: (self._clock(), None))
-        self._make_bridge = bridge or (
-            lambda spec, port, bind, peer: Bridge(spec, port, bind=bind, peer=peer, paths=config.paths)
-        )
+        self._opener = SessionOpener(config, hardware.topics, graph, bridge)
         local = fallback.load(config.fallback, config.fallback_options)
         self._control_loop = ControlLoop(hardware, local, config.limits, config.needs, clock(), observer, self._clocks)
         self._own_client = (
@@ -236,9 +148,8 @@ class Agent:
         self._sharing = SharedTopicsExchange(speaks, self._shares, on_refused=self._another_token, clock=clock)
         self._token = config.token
         self._instance: rest.Instance | None = None
-        self._epochs = count(1)
         self._manager: ServiceManager | None = None
-        self._open_sessions: dict[str, _Opened] = {}
+        self._open_sessions: dict[str, OpenSession] = {}
         """By session id."""
         self._served = ""
         """The session that the manager watches."""
@@ -505,7 +416,7 @@ class Agent:
             if opened is not None:
                 opened.session.move(peer)
                 return
-            session = self._open(granted, peer)
+            session = self._opener.open(granted, peer)
         except (BridgeError, ValueError) as error:
             sentence = f"no bridge to {peer[0]}:{peer[1]}: {error}"
             if sentence != self._trouble:
@@ -514,7 +425,7 @@ class Agent:
             return
         self._trouble = ""
         held_to = terms(granted.needs, granted.topics, self._config.command_topic)
-        self._open_sessions[granted.id] = _Opened(session, instance, held_to, SharedTopics.of(granted.topics))
+        self._open_sessions[granted.id] = OpenSession(session, instance, held_to, SharedTopics.of(granted.topics))
         self._control_loop.offer(session)
 
     def _told(self, instance: rest.Instance) -> None:
@@ -537,36 +448,6 @@ class Agent:
             self._open_sessions.pop(left.id, None)
             self._end(left)
 
-    def _open(self, granted: rest.Session, peer: Address) -> LiveSession:
-        for topic in granted.topics:
-            if (topic.name, topic.direction) == (self._config.command_topic, "out") and topic.type != Twist.TYPE:
-                # Bytes of another type may well decode: a Wrench has the shape of a Twist.
-                raise ValueError(f"the service's {topic.name} is a {topic.type}, and only a {Twist.TYPE} may drive")
-        command = self._config.command_topic
-        shared = SharedTopics.of(granted.topics)
-        if self._graph is None:
-            readings = offers({**self._hardware.topics, **shared.readings})
-            topics = robot_table(spoken(granted.topics, None), readings)
-            names = frozenset(topic.name for topic in topics)
-            session = LiveSession(granted.id, names, command, self._epochs, shared_topic=shared.said)
-        else:
-            encoding = self._graph.encoding
-            topics, port = self._graph.open([topic for topic in granted.topics if not topic.shared], command)
-            between = [topic for topic in granted.topics if topic.shared]
-            topics += robot_table(between, offers(shared.readings, encoding), encoding=encoding)
-            session = LiveSession(
-                granted.id,
-                frozenset(shared.readings),
-                command,
-                self._epochs,
-                encoding=encoding,
-                graph=port,
-                shared_topic=shared.said,
-            )
-        spec = SessionSpec(parse_id(granted.id), parse_key(granted.key or ""), Role.ROBOT, topics)
-        session.open(lambda port: self._make_bridge(spec, port, self._config.bind, peer), peer)
-        return session
-
     def _shares(self) -> Serving | None:
         """What serves the robot now, for sharing."""
         session = self._control_loop.session
@@ -581,8 +462,3 @@ class Agent:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def offers(topics: Mapping[str, type[Message]], encoding: Encoding = "cdr") -> dict[str, Offer]:
-    """What a robot with these message classes can send."""
-    return {name: Offer(cls.TYPE, type_hash(cls, encoding), encoding) for name, cls in topics.items()}

@@ -26,7 +26,7 @@ from skytether.wire.events import Connected, Event, MessageReceived, Refused
 from skytether.wire.stats import SessionStats, TopicStats
 from skytether.wire.topic import Direction, Role, Topic
 
-from ..agent.agent import Address
+from ..agent.config import Address
 from ..agent.snapshot import report
 from ..offload.lease_client import LeaseClient, Orchestrator
 from ..session.counter_totals import CounterTotals

@@ -3,8 +3,8 @@
 import pytest
 from networks import Program
 from ros2_nodes import far_nodes, ros2_nodes
-
 from skytether.lab.link_model import LinkConditions
+
 from skytether.lab.tun import ROBOT, SERVICE, TunEmulator
 
 __all__ = ["far_nodes", "ros2_nodes"]

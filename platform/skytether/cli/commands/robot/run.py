@@ -19,7 +19,7 @@ from ...ros_words import RosWords, given
 from .never_wait import never_wait
 
 if TYPE_CHECKING:
-    from skytether.robot.agent.agent import AgentConfig
+    from skytether.robot.agent.config import AgentConfig
     from skytether.robot.agent.snapshot import AgentStatus
     from skytether.robot.config.robot_config import RobotConfig, Ros1Config, Ros2Config
     from skytether.robot.control.control_loop import RobotHardware
@@ -247,7 +247,7 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         token: The robot's, as it is now.
     """
     from skytether.bridge.interfaces import LocalPath, Wanted
-    from skytether.robot.agent.agent import AgentConfig
+    from skytether.robot.agent.config import AgentConfig
     from skytether.robot.config.robot_config import load_token
     from skytether.robot.control.supervisor import Limits
     from skytether.robot.offload.site_prober import TaskConfig
