@@ -45,7 +45,7 @@ def test_user_space_emulator_delays_and_counts(name: str) -> None:
         assert (row.emulator, row.congestion) == ("user", None)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [n for n in NAMES if not n.startswith(("ros2", "cyclone"))])
 def test_every_transport_carries_the_traffic_between_namespaces(name: str, netns: None) -> None:
     _skip_missing(name)
     ideal = conditions.find(["ideal"])[0]

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from skytether.cli.commands.lab.lab import app as cli
 from skytether.lab.bench import conditions, traffic
 from skytether.lab.bench.bridge import BenchError, make_plan
-from skytether.lab.bench.process import Order, publish
 from skytether.lab.bench.report import cells, markdown_table
+from skytether.lab.bench.ros2_program.schedule import Order, publish
 from skytether.lab.bench.rows import Notes, Row, Run, arrival_rate, make_rows, percentiles_ms
 from skytether.lab.bench.suites import SUITES
 from skytether.lab.bench.traffic import Flow

@@ -147,11 +147,13 @@ def _usable(names: Sequence[str], emulator: str) -> tuple[tuple[str, ...], list[
     for name in names:
         try:
             kind = load(name)
+            kind.check()
         except TransportError as error:
             left_out.append(f"{name} is left out: {error}")
             continue
-        if kind.TCP and emulator == "user":
-            left_out.append(f"{name} is left out: it is carried by TCP and needs the TUN emulator, so root")
+        if (kind.TCP or kind.TUN) and emulator == "user":
+            why = "is carried by TCP" if kind.TCP else "uses several ports"
+            left_out.append(f"{name} is left out: it {why} and needs the TUN emulator, so root")
         else:
             found.append(name)
     return tuple(found), left_out

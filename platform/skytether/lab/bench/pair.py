@@ -17,7 +17,8 @@ from skytether.emulator.link_model import IP_UDP_HEADERS, LinkConditions, LinkCo
 from skytether.lab.tun import SERVICE
 from skytether.wire.topic import Role
 
-from .process import Order, run_emulator, run_end
+from .process import run_emulator, run_end
+from .ros2_program.schedule import Order
 from .rows import Row, Run, make_rows
 from .traffic import Flow
 from .transports import EndSpec, load
@@ -70,7 +71,7 @@ class Pair:
         self._link: Connection | None = None
         with ExitStack() as undo:
             folder = undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-"))
-            listen, connect = (LOOPBACK, _free_port()), (LOOPBACK, 0)
+            listen, connect = (LOOPBACK, free_port()), (LOOPBACK, 0)
             robot_space = service_space = None
             if link is None:
                 connect = listen
@@ -179,7 +180,8 @@ def _start(undo: ExitStack, function: Any, *arguments: Any) -> Connection:
     return ours
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A UDP port of loopback that nobody has at the moment."""
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock:
         sock.bind((LOOPBACK, 0))
         port: int = sock.getsockname()[1]

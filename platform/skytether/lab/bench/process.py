@@ -5,15 +5,10 @@ Each talks with the harness through one pipe and ends when that is closed, so no
 
 from __future__ import annotations
 
-import heapq
 import os
-import resource
 import signal
-import struct
 import time
-from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -21,27 +16,14 @@ from skytether.emulator.link_model import LinkConditions
 from skytether.emulator.udp_link import LinkEmulator, keep_time
 from skytether.lab.netns import enter
 from skytether.lab.tun import TunEmulator
+from skytether.wire.topic import Role
 
+from .ros2_program.schedule import Journal, Order
 from .rows import Notes
-from .traffic import HEADER_BYTES, Flow
-from .transports import EndSpec, Transport, load
+from .transports import EndSpec, Program, Transport, load
 
-_HEADER = struct.Struct("<Qd")
-"""Sequence and time of sending, at the start of each payload."""
 _CONNECT_S = 15.0
 _LOOK_S = 0.01
-_DRAIN_S = 1.0
-"""What has not arrived this long after the last message was sent counts as lost."""
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """One measurement: send from ``begin`` to ``end``; what is sent from ``start`` on counts (monotonic seconds)."""
-
-    flows: tuple[Flow, ...]
-    begin: float
-    start: float
-    end: float
 
 
 def run_end(pipe: Connection, transport: str, spec: EndSpec, namespace: str | None) -> None:
@@ -51,101 +33,48 @@ def run_end(pipe: Connection, transport: str, spec: EndSpec, namespace: str | No
         try:
             if namespace is not None:
                 enter(namespace)
-            end = _End(transport, spec)
+            kind = load(transport)
+            end = kind(spec) if issubclass(kind, Program) else _Within(kind, spec)
         except Exception as error:
             pipe.send(error)
             return
         try:
-            end.serve(pipe)
+            _serve(end, spec.role, pipe)
         finally:
-            end.transport.stop()
+            end.stop()
 
 
-class _End:
-    def __init__(self, transport: str, spec: EndSpec) -> None:
+def _serve(end: Program | _Within, role: Role, pipe: Connection) -> None:
+    try:
+        end.start()
+        pipe.send("started")
+        deadline = time.monotonic() + _CONNECT_S
+        while not end.connected():
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the {role}'s end did not connect within {_CONNECT_S:.0f} s")
+            time.sleep(_LOOK_S)
+        pipe.send("connected")
+        while True:
+            pipe.send(end.measure(pipe.recv()))
+    except (EOFError, BrokenPipeError):
+        raise
+    except Exception as error:
+        pipe.send(error)
+
+
+class _Within:
+    """An end whose transport works within this process."""
+
+    def __init__(self, kind: type[Transport], spec: EndSpec) -> None:
         self._spec = spec
-        self._received: dict[int, list[tuple[int, float, float]]] = {i: [] for i in spec.receives}
-        self.transport: Transport = load(transport)(spec, self._deliver)
+        self._journal = Journal(spec.receives)
+        self._transport = transport = kind(spec, self._journal.deliver)
+        self.start, self.connected, self.stop = transport.start, transport.connected, transport.stop
 
-    def serve(self, pipe: Connection) -> None:
-        try:
-            self.transport.start()
-            pipe.send("started")
-            deadline = time.monotonic() + _CONNECT_S
-            while not self.transport.connected():
-                if time.monotonic() > deadline:
-                    raise TimeoutError(f"the {self._spec.role}'s end did not connect within {_CONNECT_S:.0f} s")
-                time.sleep(_LOOK_S)
-            pipe.send("connected")
-            while True:
-                pipe.send(self._measure(pipe.recv()))
-        except (EOFError, BrokenPipeError):
-            raise
-        except Exception as error:
-            pipe.send(error)
-
-    def _deliver(self, index: int, payload: bytes | memoryview) -> None:
-        now = time.monotonic()
-        sequence, sent_at = _HEADER.unpack_from(payload)
-        self._received[index].append((sequence, sent_at, now))
-
-    def _measure(self, order: Order) -> Notes:
-        for arrivals in self._received.values():
-            arrivals.clear()
-        cpu: list[float] = []
-        sent = publish(order, self._spec.sends, self.transport.publish, lambda: cpu.append(_cpu_seconds()))
-        used = _cpu_seconds() - cpu[0]
-        time.sleep(max(0.0, order.end + _DRAIN_S - time.monotonic()))
-        return Notes(sent, {i: list(arrivals) for i, arrivals in self._received.items()}, used)
-
-
-def publish(
-    order: Order, indices: Sequence[int], send: Callable[[int, bytes], None], on_start: Callable[[], None]
-) -> dict[int, list[float]]:
-    """Send flows on their schedules from ``order.begin`` to ``order.end``.
-
-    A message that is late is sent late, and none is left out while there is time.
-
-    Args:
-        order: What to send, and when.
-        indices: Which of its flows to send.
-        send: Called with index and payload.
-        on_start: Called at ``order.start``.
-
-    Returns:
-        When each message was handed over, by flow and sequence.
-    """
-    keep_time()
-    flows = order.flows
-    bodies = {i: os.urandom(flows[i].size - HEADER_BYTES) for i in indices}
-    sent: dict[int, list[float]] = {i: [] for i in indices}
-    # The first messages are spread over the period, so that the topics do not march in step.
-    first = {i: order.begin + i / len(flows) / flows[i].hz for i in indices}
-    schedule = [(first[i], i) for i in indices]
-    heapq.heapify(schedule)
-    started = False
-    while True:
-        now = time.monotonic()
-        if not started and now >= order.start:
-            started = True
-            on_start()
-        if now >= order.end:
-            return sent
-        wake = order.end if started else order.start
-        due, index = schedule[0] if schedule else (wake, -1)
-        if due > now or index < 0:
-            time.sleep(min(due, wake) - now)
-            continue
-        times = sent[index]
-        payload = _HEADER.pack(len(times), now) + bodies[index]
-        times.append(now)
-        send(index, payload)
-        heapq.heapreplace(schedule, (first[index] + len(times) / flows[index].hz, index))
-
-
-def _cpu_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+    def measure(self, order: Order) -> Notes:
+        keep_time()
+        sent, used = self._journal.measure(order, self._spec.sends, self._transport.publish)
+        return Notes(sent, {i: list(arrivals) for i, arrivals in self._journal.received.items()}, used)
 
 
 def run_emulator(pipe: Connection, kind: str, link: LinkConditions, options: dict[str, Any]) -> None:

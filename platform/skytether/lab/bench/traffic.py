@@ -8,9 +8,9 @@ import numpy as np
 
 from skytether.wire.topic import Direction
 
+from .ros2_program.schedule import HEADER
+
 KB = 1024
-HEADER_BYTES = 16
-"""Sequence number and time of sending, at the start of every payload; so no message is smaller."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class Flow:
         Raises:
             ValueError: The payload has no room for sequence number and time.
         """
-        if self.size < HEADER_BYTES:
-            raise ValueError(f"{self.name}: a message needs at least {HEADER_BYTES} bytes, not {self.size}")
+        if self.size < HEADER.size:
+            raise ValueError(f"{self.name}: a message needs at least {HEADER.size} bytes, not {self.size}")
 
 
 CAMERA = Flow("camera", 47_611, 1 / 0.066, rank=2, depth=1, delivery=0.998)

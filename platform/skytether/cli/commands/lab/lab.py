@@ -15,6 +15,7 @@ from .hostile import hostile
 from .legs import legs
 from .navigation import localisation, mapping, navigation
 from .resize import resize
+from .ros import ros
 from .run import app as run_app
 from .safety import safety
 from .scale import scale
@@ -27,6 +28,7 @@ app.add_typer(run_app, name="run")
 app.command("world")(world)
 bench.command("safety")(safety)
 bench.command("resize")(resize)
+bench.command("ros")(ros)
 bench.command("hostile")(hostile)
 bench.command("scale")(scale)
 bench.command("authentication")(authentication)
@@ -317,7 +319,12 @@ def bridge(
     loss-2%, loss-5%, loss-10%, loss-15%, loss-20%, loss-25%, loss-30%).
 
     Transports: skytether, udp, tcp, websocket-cbor, zenoh-tcp, zenoh-2tcp,
-    zenoh-quic, zenoh-udp, zenoh-mixed.
+    zenoh-quic, zenoh-udp, zenoh-mixed; ROS 2 over Fast DDS across the link,
+    without any bridge: ros2-best-effort, ros2-reliable,
+    ros2-tuned-best-effort, ros2-tuned-reliable (asynchronous, flow
+    controller, fragments under the MTU); cyclone-best-effort and
+    cyclone-reliable. These six run under ROS 2's own Python: that of
+    `make ros2`, or the one that SKYTETHER_ROS2_PYTHON names.
 
     Each row of --json has: transport, condition, topic, sent, delivered,
     delay_p50_ms, delay_p95_ms, delay_p99_ms, delay_max_ms, overhead (bytes

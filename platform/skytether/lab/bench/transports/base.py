@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from skytether.lab.bench.ros2_program.schedule import Order
+from skytether.lab.bench.rows import Notes
 from skytether.lab.bench.traffic import Flow
 from skytether.wire.topic import Role
 
@@ -47,21 +49,26 @@ class EndSpec:
         return tuple(i for i, flow in enumerate(self.flows) if flow.direction.sender is not self.role)
 
 
-class Transport(ABC):
-    """One end. Made, started, asked until connected, used, stopped.
+class Kind(ABC):
+    """What is known of a transport before an end is made.
 
     Attributes:
         TCP: Whether it needs TCP, which the emulator in user space cannot carry.
+        TUN: Whether it needs IP packets between namespaces for another reason.
         ABOUT: How it is set up, for the report.
     """
 
     TCP: ClassVar[bool] = False
+    TUN: ClassVar[bool] = False
     ABOUT: ClassVar[str]
 
-    def __init__(self, spec: EndSpec, deliver: Deliver) -> None:
-        """Keep what is needed; open nothing."""
-        self.spec = spec
-        self.deliver = deliver
+    @classmethod  # noqa: B027 - most need nothing that their modules do not import
+    def check(cls) -> None:
+        """Look whether it can be measured on this machine.
+
+        Raises:
+            TransportError: Something is missing; the text says what to install.
+        """
 
     @abstractmethod
     def start(self) -> None:
@@ -78,9 +85,34 @@ class Transport(ABC):
         """Whether messages of every flow can pass, as far as this end can tell."""
 
     @abstractmethod
+    def stop(self) -> None:
+        """Close everything."""
+
+
+class Transport(Kind):
+    """One end within the harness's process. Made, started, asked until connected, used, stopped."""
+
+    def __init__(self, spec: EndSpec, deliver: Deliver) -> None:
+        """Keep what is needed; open nothing."""
+        self.spec = spec
+        self.deliver = deliver
+
+    @abstractmethod
     def publish(self, index: int, payload: bytes) -> None:
         """Hand over one message; never waits for the network."""
 
+
+class Program(Kind):
+    """One end that is a program of its own, under another interpreter: it sends and notes by itself."""
+
+    def __init__(self, spec: EndSpec) -> None:
+        """Keep what is needed; start nothing."""
+        self.spec = spec
+
     @abstractmethod
-    def stop(self) -> None:
-        """Close everything."""
+    def measure(self, order: Order) -> Notes:
+        """Send what is ordered, and tell what was sent and what arrived.
+
+        Raises:
+            TransportError: The program failed.
+        """
