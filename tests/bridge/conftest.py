@@ -1,12 +1,11 @@
 """Two ends of a session on the loopback interface, with ports that write down what they are told."""
 
-import threading
 import time
 
 import pytest
+from recording_port import RecordingPort
 
 from skytether.bridge import Bridge, SessionSpec
-from skytether.wire.events import Connected
 from skytether.wire.topic import Direction, Role, Topic
 
 KEY = bytes(range(32))
@@ -17,56 +16,21 @@ TOPICS = (
 )
 
 
-class RecordingPort:
-    """Keeps messages and events; `wait` returns when something has come."""
-
-    def __init__(self):
-        self.messages = []
-        self.events = []
-        self.changed = threading.Condition()
-        self.publisher = None
-
-    def attach(self, publisher):
-        self.publisher = publisher
-
-    def deliver(self, message):
-        with self.changed:
-            self.messages.append((message.topic, bytes(message.payload)))
-            self.changed.notify_all()
-
-    def notify(self, event):
-        with self.changed:
-            self.events.append(event)
-            self.changed.notify_all()
-
-    def wait(self, condition, seconds=5):
-        """Wait until condition(self) holds; says what there was if it never does."""
-        with self.changed:
-            assert self.changed.wait_for(lambda: condition(self), seconds), (
-                f"waited in vain; {len(self.messages)} messages, events {self.events}"
-            )
-
-    def count(self, kind):
-        return sum(isinstance(e, kind) for e in self.events)
-
-    def wait_connected(self, times=1):
-        self.wait(lambda port: port.count(Connected) >= times)
-
-    def wait_messages(self, count):
-        self.wait(lambda port: len(port.messages) >= count)
-
-
 class Ends:
     """Makes ends and stops what it made."""
+
+    topics = TOPICS
+    """Of an end that is made without others."""
 
     def __init__(self):
         self.made = []
 
     def make(self, role, port=None, *, topics=TOPICS, key=KEY, session_id=7, **options):
-        """A bridge that is not started yet; its port is its attribute `graph`."""
+        """A bridge that is not started yet; its port is its attribute `graph`, its session `spec`."""
         port = port or RecordingPort()
-        bridge = Bridge(SessionSpec(session_id, key, role, topics), port, **options)
-        bridge.graph = port
+        spec = SessionSpec(session_id, key, role, topics)
+        bridge = Bridge(spec, port, **options)
+        bridge.graph, bridge.spec = port, spec
         self.made.append(bridge)
         return bridge
 

@@ -8,6 +8,7 @@ import pytest
 
 from skytether.api.manifest import TopicSpec
 from skytether.bridge import CallError, CallFailedError, CallTimeoutError, calls, topics_from_api
+from skytether.bridge.datagrams import DatagramSocket
 from skytether.wire.topic import Role
 
 TOPICS = topics_from_api(
@@ -110,7 +111,7 @@ def test_a_late_answer_is_dropped_and_counted(ends, wait_for):
     assert robot.call("plan", b"y", 5) == b"y"
 
 
-def test_calls_in_flight_fail_at_once_when_the_peer_is_restarted_or_the_bridge_stops(ends):
+def test_calls_in_flight_fail_at_once_when_the_peer_is_restarted_or_the_bridge_stops(ends, monkeypatch):
     service, robot = ends.pair(topics=TOPICS)
     asked = threading.Event()
     go = threading.Event()
@@ -119,7 +120,13 @@ def test_calls_in_flight_fail_at_once_when_the_peer_is_restarted_or_the_bridge_s
         answer = pool.submit(robot.call, "plan", b"x", 30)
         assert asked.wait(5)
         start = time.monotonic()
-        service._driver._session._epoch = None  # killed: no goodbye
+        send = DatagramSocket.send
+        killed = service.address  # as far as anybody hears, without a goodbye
+        monkeypatch.setattr(
+            DatagramSocket,
+            "send",
+            lambda own, data, *rest: len(data) if own.address == killed else send(own, data, *rest),
+        )
         other = ends.start(Role.SERVICE, topics=TOPICS)
         robot.set_peer(*other.address)
         with pytest.raises(CallFailedError, match="restarted"):

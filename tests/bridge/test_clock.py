@@ -4,6 +4,7 @@ import struct
 import time
 
 import pytest
+from recording_port import RecordingPort
 
 from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.wire.topic import Role
@@ -12,22 +13,19 @@ ROUNDING = 2e-6
 """Time stamps travel as whole microseconds."""
 
 
-class TimedPort:
+class TimedPort(RecordingPort):
     """Compares what the bridge says of each message's time with what the message says itself."""
 
-    def __init__(self, inner):
-        self._inner = inner
+    def __init__(self):
+        super().__init__()
         self.said = {}
         self.errors = []
-
-    def __getattr__(self, name):
-        return getattr(self._inner, name)
 
     def deliver(self, message):
         (number,) = struct.unpack("i", message.payload)
         self.said[number] = (message.sent_at, message.sent_at_error)
         self.errors.append(message.sent_at_error)
-        self._inner.deliver(message)
+        super().deliver(message)
 
     def wrong(self, published):
         """What was said that cannot be true of a message that was published between two moments."""
@@ -48,9 +46,7 @@ def publish(end, topic, number):
 @pytest.mark.slow
 @pytest.mark.parametrize(("up", "down"), [(0.0, 0.0), (0.005, 0.04), (0.04, 0.005)])
 def test_the_stated_error_holds_whatever_the_asymmetry(ends, up, down):
-    service, robot = ends.make(Role.SERVICE), ends.make(Role.ROBOT)
-    for end in (service, robot):
-        end._port = end.graph = TimedPort(end.graph)
+    service, robot = ends.make(Role.SERVICE, TimedPort()), ends.make(Role.ROBOT, TimedPort())
     service.start()
     conditions = {"up": LinkConditions(delay=up, jitter=0.005), "down": LinkConditions(delay=down, jitter=0.005)}
     with LinkEmulator(service.address, **conditions) as link:

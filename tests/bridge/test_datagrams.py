@@ -1,4 +1,5 @@
 import errno
+import os
 import select
 import socket
 import struct
@@ -97,25 +98,22 @@ def test_taken_ahead_nothing_is_lost_reordered_or_mixed_up(sockets, batches):
     assert got == sent
 
 
-class ScriptedSocket:
-    """Hands over datagrams with the times at which they came, in microseconds."""
+def script_the_kernel(monkeypatch, script):
+    """Have it hand over these datagrams, with the times at which they came, in microseconds."""
+    left = list(script)
 
-    def __init__(self, real, script):
-        self._real, self._script = real, list(script)
-
-    def recvmsg_into(self, buffers, _space):
-        if not self._script:
+    def recvmsg_into(_self, buffers, _space):
+        if not left:
             raise BlockingIOError
-        data, address, micros = self._script.pop(0)
+        data, address, micros = left.pop(0)
         buffers[0][: len(data)] = data
         stamp = struct.pack("@ll", 1_700_000_000, 1000 * micros)
         return len(data), [(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamp)], 0, address
 
-    def __getattr__(self, name):
-        return getattr(self._real, name)
+    monkeypatch.setattr(socket.socket, "recvmsg_into", recvmsg_into)
 
 
-def test_only_equal_datagrams_of_one_moment_and_address_are_put_together(sockets):
+def test_only_equal_datagrams_of_one_moment_and_address_are_put_together(sockets, monkeypatch):
     receiver = sockets(batches=False)
     a, b = ("10.0.0.1", 1), ("10.0.0.2", 1)
     script = [
@@ -127,7 +125,7 @@ def test_only_equal_datagrams_of_one_moment_and_address_are_put_together(sockets
         (b"6", b, 60),
         (b"", b, 60),
     ]
-    receiver._socket = ScriptedSocket(receiver._socket, script)
+    script_the_kernel(monkeypatch, script)
     got = []
     while (batch := receiver.receive(ahead=True)) is not None:
         data, address, segment = batch
@@ -136,10 +134,10 @@ def test_only_equal_datagrams_of_one_moment_and_address_are_put_together(sockets
     assert got == [(b"112233", a, 2), (b"44", a, None), (b"55", b, None), (b"6", b, None), (b"", b, None)]
 
 
-def test_a_batch_put_together_has_its_bound_and_a_last_call_leaves_nothing_behind(sockets):
+def test_a_batch_put_together_has_its_bound_and_a_last_call_leaves_nothing_behind(sockets, monkeypatch):
     receiver = sockets(batches=False)
     script = [(bytes([i]) * 1200, ("10.0.0.1", 1), 0) for i in range(150)]
-    receiver._socket = ScriptedSocket(receiver._socket, script)
+    script_the_kernel(monkeypatch, script)
     sizes = []
     for ahead in (True, True, False):
         data, _, _ = receiver.receive(ahead=ahead)
@@ -147,28 +145,22 @@ def test_a_batch_put_together_has_its_bound_and_a_last_call_leaves_nothing_behin
         assert bytes(data[::1200]) == bytes(range(sum(sizes[:-1]), sum(sizes)))
     assert max(sizes) <= MAX_SEGMENTS
     assert sizes[2] == 1
-    assert receiver._next is None
-
-
-class RefusingSocket:
-    """A real socket whose sendmsg refuses to cut, as kernels and devices without UDP_SEGMENT do."""
-
-    def __init__(self, real, number):
-        self._real, self._number = real, number
-
-    def sendmsg(self, *_):
-        raise OSError(self._number, "refused")
-
-    def __getattr__(self, name):
-        return getattr(self._real, name)
+    while (batch := receiver.receive()) is not None:
+        sizes.append(len(batch[0]) // 1200)
+    assert sizes[2:] == [1] * (150 - sum(sizes[:2]))
+    assert receiver.receive() is None
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
-def test_a_kernel_that_refuses_batches_gets_datagrams_from_then_on(sockets, number):
+def test_a_kernel_that_refuses_batches_gets_datagrams_from_then_on(sockets, monkeypatch, number):
     sender, receiver = sockets(), sockets()
     if not sender.segmentation:
         pytest.skip("this kernel has no UDP_SEGMENT")
-    sender._socket = RefusingSocket(sender._socket, number)
+
+    def refuse_to_cut(*_):
+        raise OSError(number, "refused")
+
+    monkeypatch.setattr(socket.socket, "sendmsg", refuse_to_cut)
     data = bytes(range(250)) * 20
     assert sender.send(data, receiver.address, 1200) == len(data)
     assert receive(receiver, len(data)) == cut(data, 1200)
@@ -199,25 +191,17 @@ def test_no_route_is_counted_and_the_next_datagram_goes_out(sockets):
     assert receive(receiver, 4) == [b"next"]
 
 
-class FullSocket:
-    """A real socket whose buffer takes a number of datagrams and is full then."""
-
-    def __init__(self, real, takes):
-        self._real, self._takes = real, takes
-
-    def sendto(self, data, address):
-        if not self._takes:
-            raise BlockingIOError(errno.EAGAIN, "full")
-        self._takes -= 1
-        return self._real.sendto(data, address)
-
-    def __getattr__(self, name):
-        return getattr(self._real, name)
-
-
-def test_a_full_buffer_returns_how_far_it_got(sockets):
+def test_a_full_buffer_returns_how_far_it_got(sockets, monkeypatch):
     sender, receiver = sockets(batches=False), sockets()
-    sender._socket = FullSocket(sender._socket, 2)
+    sendto, sent = socket.socket.sendto, []
+
+    def send_two(self, data, address):
+        if len(sent) == 2:
+            raise BlockingIOError(errno.EAGAIN, "full")
+        sent.append(data)
+        return sendto(self, data, address)
+
+    monkeypatch.setattr(socket.socket, "sendto", send_two)
     data = bytes(range(250)) * 20
     assert sender.send(data, receiver.address, 1200) == 2400
     assert receive(receiver, 2400) == cut(data, 1200)[:2]
@@ -226,7 +210,8 @@ def test_a_full_buffer_returns_how_far_it_got(sockets):
 def test_an_icmp_answer_harms_nothing(sockets):
     sender, receiver, gone = sockets(), sockets(), sockets()
     # With IP_RECVERR Linux reports ICMP answers on unconnected sockets too, as other systems always do.
-    sender._socket.setsockopt(socket.IPPROTO_IP, 11, 1)
+    with socket.socket(fileno=os.dup(sender.fileno())) as same:
+        same.setsockopt(socket.IPPROTO_IP, 11, 1)
     nobody = gone.address
     gone.close()
     sender.send(b"x", nobody)

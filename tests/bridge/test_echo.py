@@ -1,6 +1,7 @@
 import socket
 
 import pytest
+from deep_size import deep_size
 
 from skytether.bridge.echo import (
     ADDRESS_BURST,
@@ -71,7 +72,10 @@ def test_invented_addresses_get_no_more_than_the_whole_and_no_memory():
     allowance = Allowance(0.0)
     got = sum(said(allowance, LARGEST, f"10.{i >> 16}.{i >> 8 & 255}.{i & 255}", i / 20_000) for i in range(20_000))
     assert got <= 2 * RATE + LARGEST
-    assert len(allowance._addresses) <= ADDRESSES
+    full = deep_size(allowance)
+    for i in range(ADDRESSES):
+        said(allowance, SMALLEST, f"10.200.{i >> 8 & 255}.{i & 255}", 1.0)
+    assert deep_size(allowance) <= full
 
 
 def test_a_doctor_is_answered_all_that_it_asks():

@@ -90,7 +90,7 @@ def test_what_a_stranger_sends_is_counted_and_changes_nothing(ends, seen, strang
         robot.publish("camera", os.urandom(5000))
     service.graph.wait_messages(40)
     make, reason = KINDS[kind]
-    injected = make(list(seen[robot.address[1]]), service._spec)[-50:]
+    injected = make(list(seen[robot.address[1]]), service.spec)[-50:]
     assert injected
     before = service.stats()
     for i, one in enumerate(injected):

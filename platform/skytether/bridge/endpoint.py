@@ -148,7 +148,7 @@ class Bridge:
             )
             if self._peer is not None:
                 session.set_peer(self._resolve(*self._peer))
-            self._loop = _new_loop(self._socket)
+            self._loop = new_loop(self._socket)
             undo.callback(self._loop.close)
             self._driver = Driver(session, self._socket, self._port, self._calls, self._loop)
             self._paths = LocalPaths(self._driver)
@@ -363,7 +363,7 @@ class Bridge:
             raise BridgeError(f"peer {host}:{port} has no address: {error.strerror or error}") from error
 
 
-def _new_loop(sock: DatagramSocket) -> asyncio.AbstractEventLoop:
+def new_loop(sock: DatagramSocket) -> asyncio.AbstractEventLoop:
     """An event loop that keeps time to some microseconds.
 
     The default's epoll has its time-outs rounded up to milliseconds, which would be added to every copy and every
