@@ -24,7 +24,9 @@ ID, OTHER = "f" * 64, "e" * 64
 CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
 "CapDrop": ["ALL"], "SecurityOpt": ["no-new-privileges"], "ReadonlyRootfs": true, "PidsLimit": 9}}"""
 WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
-    b'"CapDrop"', b'"Mounts": [{"Type": "volume", "Source": "skytether-main_state", "Target": "/d"}], "CapDrop"'
+    b'"CapDrop"',
+    b'"Mounts": [{"Type": "volume", "Source": "skytether-main_state", "Target": "/d", '
+    b'"VolumeOptions": {"NoCopy": true}}], "CapDrop"',
 )
 
 
@@ -153,9 +155,9 @@ def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine
 
 def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
     archive = bytes(range(256)) * 1000
-    assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Frun", archive))
+    assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive))
     line, _, got = engine.asked[-1]
-    assert (line, got) == (f"PUT /containers/{ID}/archive?path=%2Frun", archive)
+    assert (line, got) == (f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
 
 
 @pytest.mark.parametrize(
@@ -222,13 +224,14 @@ def volume(path: str, name: str = ID) -> dict[str, str]:
         (MOUNTED, {}, {"/etc"}, b"/etc is a link in its image"),
         (MOUNTED, {}, {"/run/skytether"}, b"/run/skytether is a link in its image"),
         ([*MOUNTED, volume("/var/lib/a")], {}, {"/var/lib"}, b"/var/lib is a link in its image"),
+        ([*MOUNTED, volume("/a&path=b/c")], {}, {"/a&path=b"}, b"/a&path=b is a link in its image"),
     ],
 )
 def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     engine: Engine, mounts: list[Any], changes: dict[str, Any], links: set[str], says: bytes
 ) -> None:
     engine.container, engine.links = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": mounts, **changes}, links
-    sent = request(f"GET /containers/{ID}/archive?path=/run")
+    sent = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
     got = say(engine, sent + sent)
     if not says:
         assert got.count(b"200 OK") == 2
@@ -299,7 +302,7 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
         (request(f"POST /containers/{ID[:12]}/kill"), b"nothing that a site needs"),
         (request("GET /containers/database/json"), b"nothing that a site needs"),
         (request("DELETE /networks/bridge"), b"bridge is not of an orchestrator"),
-        (request(f"PUT /containers/%65{OTHER[1:]}/archive", b"tar"), b"is not of an orchestrator"),
+        (request(f"PUT /containers/%65{OTHER[1:]}/archive?path=/run/skytether", b"tar"), b"is not of an orchestrator"),
         (request("POST /containers/create", CREATED % b"bridge"), b"bridge is not of an orchestrator"),
         (request("POST /containers/create", CREATED % b"0123456789ab"), b"its network is"),
         (request("POST /containers/create", CREATED % f"container:{OTHER}".encode()), b"is not of an orchestrator"),

@@ -12,7 +12,17 @@ from skytether.api.manifest import ServiceSpec
 from skytether.node.engine_rules import Call, judge
 from skytether.node.seccomp_rules import holds
 from skytether.orchestrator.runtimes.base import Launch
-from skytether.orchestrator.runtimes.docker.objects import Declared, Namespace, container, epoch_volume, guard, holder
+from skytether.orchestrator.runtimes.docker.objects import (
+    READY,
+    REPORTS,
+    Declared,
+    Namespace,
+    container,
+    epoch_volume,
+    grant_archive,
+    guard,
+    holder,
+)
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 OWNER = {"skytether.io/owner": "edge"}
@@ -20,7 +30,7 @@ SECURITY = ["no-new-privileges", 'seccomp={"defaultAction": "SCMP_ACT_ERRNO"}']
 ID = "f" * 64
 
 
-def asked(method: str, path: str, body: Any = None, devices: tuple[str, ...] = (), **query: str) -> str | None:
+def asked(method: str, path: str, body: Any = None, devices: tuple[str, ...] = (), /, **query: str) -> str | None:
     return judge(Call(method, path, query, body), devices)[0]
 
 
@@ -66,10 +76,8 @@ def test_what_the_runtime_makes_is_passed_on(body: dict[str, Any]) -> None:
     ("method", "path"),
     [
         *(("GET", f"/v1.41/{path}") for path in ("version", "info", "system/df")),
-        *(("GET", f"/v1.41/containers/{ID}/{what}") for what in ("json", "logs", "stats", "archive")),
+        *(("GET", f"/v1.41/containers/{ID}/{what}") for what in ("json", "logs", "stats")),
         *(("POST", f"/v1.41/containers/{ID}/{what}") for what in ("start", "kill", "wait")),
-        ("HEAD", f"/v1.41/containers/{ID}/archive"),
-        ("PUT", f"/v1.41/containers/{ID}/archive"),
         ("DELETE", f"/v1.41/containers/{ID}"),
         ("GET", "/v1.41/images/registry.example:5000/skytether/guard@sha256:aa/json"),
         ("GET", "/networks/skytether"),
@@ -81,6 +89,17 @@ def test_what_the_runtime_asks_of_them_is_passed_on(method: str, path: str) -> N
     refused, subjects = judge(Call(method, path, {}, None))
     assert refused is None
     assert bool(subjects) == any(kind in path for kind in ("containers", "networks", "volumes"))
+
+
+def test_of_files_in_containers_those_are_passed_on_that_the_runtime_asks_for() -> None:
+    path = f"/v1.41/containers/{ID}/archive"
+    for file in (READY, REPORTS):
+        assert asked("HEAD", path, path=file) is asked("GET", path, path=file) is None
+    assert asked("PUT", path, path=grant_archive(launch())[0]) is None
+    for odd in ("/", "/etc/shadow", "/run/skytether/data/a", f"{READY}/..", ""):
+        assert {"is no file" in str(asked(method, path, path=odd)) for method in ("HEAD", "GET", "PUT")} == {True}
+    assert asked("GET", path)
+    assert asked("PUT", path, path=READY)
 
 
 @pytest.mark.parametrize("path", ["events", "containers/json", "volumes"])
@@ -126,6 +145,10 @@ def gpu(*numbers: str) -> dict[str, Any]:
     return {"Driver": "nvidia", "DeviceIDs": list(numbers), "Capabilities": [["gpu"]]}
 
 
+def named(**options: Any) -> dict[str, Any]:
+    return {"Type": "volume", "Source": "skytether-a", "Target": "/d", "VolumeOptions": options}
+
+
 HOST: dict[str, Any] = {
     "NetworkMode": "skytether",
     "CapDrop": ["ALL"],
@@ -167,6 +190,10 @@ HOST: dict[str, Any] = {
             {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"DriverConfig": {"Options": {}}}}]},
             "a volume has 'DriverConfig'",
         ),
+        ({"Mounts": [named()]}, "it copies files of its image"),
+        ({"Mounts": [named(NoCopy=False)]}, "it copies files of its image"),
+        ({"Mounts": [named(nocopy=True)]}, "it copies files of its image"),
+        ({"Mounts": [named(NoCopy=True, nocopy=False)]}, "a volume has 'nocopy'"),
         ({"Devices": [{"PathOnHost": "/dev/sda"}]}, "by `site join --device /dev/sda`"),
         ({"Devices": [{"PathOnHost": "/dev/video0", "pathonhost": "/dev/sda"}]}, "a device has 'pathonhost'"),
         ({"DeviceRequests": [{"Driver": "cdi", "DeviceIDs": ["vendor.com/all=all"]}]}, "odd devices"),
@@ -249,8 +276,8 @@ def test_nothing_else_is_passed_on(method: str, path: str, body: Any, query: dic
 
 
 def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are() -> None:
-    volume = {"Type": "volume", "Source": "skytether-a", "Target": "/d"}
-    held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": [volume]}
+    mounts = [named(NoCopy=True)]
+    held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": mounts}
     made = {"Image": "a", "Labels": OWNER, "HostConfig": held}
     assert judge(Call("POST", "/containers/create", {}, made)) == (
         None,
@@ -259,7 +286,10 @@ def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are()
     made["HostConfig"] = HOST
     assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
     assert judge(Call("DELETE", "/networks/n", {}, None)) == (None, (("networks", "n"),))
-    assert judge(Call("PUT", f"/containers/{ID}/archive", {}, None)) == (None, (("containers", ID),))
+    assert judge(Call("PUT", f"/containers/{ID}/archive", {"path": "/run/skytether"}, None)) == (
+        None,
+        (("containers", ID),),
+    )
 
 
 @pytest.mark.parametrize("name", ["database", "0123456789ab", ID, "skytether", ""])
@@ -284,7 +314,7 @@ def test_a_container_is_named_by_its_whole_id_alone(name: str) -> None:
     assert asked("POST", "/networks/n/connect", {"Container": name})
     for call in ("start", "kill", "wait", "update"):
         assert asked("POST", f"/containers/{name}/{call}", {})
-    assert asked("PUT", f"/containers/{name}/archive")
+    assert asked("PUT", f"/containers/{name}/archive", path="/run/skytether")
     assert asked("DELETE", f"/containers/{name}")
 
 

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from pathlib import PurePosixPath
 from typing import Any
+from urllib.parse import urlencode
 
 from .engine_rules import OLD_GUARD
 from .machine import ask
@@ -92,7 +93,7 @@ class Images:
             ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE")
 
     def _is_link(self, container: str, path: str) -> bool:
-        answer = ask(self._engine, f"/containers/{container}/archive?path={path}", method="HEAD")
+        answer = ask(self._engine, f"/containers/{container}/archive?{urlencode({'path': path})}", method="HEAD")
         if answer.status == HTTPStatus.NOT_FOUND:
             return False
         if answer.status != HTTPStatus.OK:

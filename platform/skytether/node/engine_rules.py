@@ -15,6 +15,8 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
+from skytether.api.service_report import FILE_NAME
+
 from .seccomp_rules import holds, once
 
 OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
@@ -47,7 +49,7 @@ _CALLS = tuple(
         ("GET", r"/containers/CID/logs", "container", "stdout stderr timestamps follow tail since until"),
         ("GET", r"/containers/CID/stats", "container", "stream one-shot"),
         ("GET", r"/containers/(skytether-[A-Za-z0-9_.-]+)/json", "container", ""),
-        ("GET HEAD PUT", r"/containers/CID/archive", "container", "path"),
+        ("GET HEAD PUT", r"/containers/CID/archive", "archive", "path"),
         ("POST", r"/containers/CID/start", "container", ""),
         ("POST", r"/containers/CID/kill", "container", "signal"),
         ("POST", r"/containers/CID/wait", "container", "condition"),
@@ -79,6 +81,9 @@ ids, and by name where a container starts."""
 _NETWORK, _BRIDGE = r"skytether(?:-[A-Za-z0-9_.-]+)?", "skt-[0-9A-Za-z]{1,11}"
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
 _TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
+FOLDER = "/run/skytether"
+"""In containers: what is put there is for the service, and what it says of itself is in files in there."""
+_READ = {f"{FOLDER}/instance/{name}" for name in ("ready.json", FILE_NAME)}
 _MOST_PIDS = 1 << 15
 """Of a container's processes and threads."""
 _MOST_PORTS = 1
@@ -174,6 +179,10 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             return _network_name(name), (("seen networks", name),)
         case "network":
             return _network_name(name), (("networks", name),)
+        case "archive":
+            path = call.query.get("path")
+            known = path == FOLDER if call.method == "PUT" else path in _READ
+            return None if known else f"{str(path)[:80]} is no file that a site asks for", (("containers", name),)
         case "container" | "volume":
             return None, ((f"{kind}s", name),)
     return None, ()
@@ -233,8 +242,13 @@ def _mount(mount: Any) -> str | None:
     name = mount.get("Source") or _OURS
     if not str(name).startswith(_OURS):
         return f"it mounts the volume '{str(name)[:80]}', which is not ours"
-    labels_only = _only(_at(mount, "VolumeOptions"), {"Labels"}, "a volume")
-    return labels_only or _only(mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount")
+    options = _at(mount, "VolumeOptions")
+    if mount.get("Source") and options.get("NoCopy") is not True:
+        # An engine writes into it from the outside, and follows a link that somebody who has it too puts there.
+        return "it copies files of its image into a volume that others may have"
+    return _only(options, {"Labels", "NoCopy"}, "a volume") or _only(
+        mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount"
+    )
 
 
 def _device(device: Any, devices: set[str]) -> str | None:

@@ -298,8 +298,11 @@ def container(
 
 def _volume(path: str, labels: Mapping[str, str], name: str | None = None) -> dict[str, Any]:
     """``name``: of one that stays; None: it goes with its container."""
-    named = {"Source": name} if name else {}
-    return {"Type": "volume", **named, "Target": path, "VolumeOptions": {"Labels": dict(labels)}}
+    options: dict[str, Any] = {"Labels": dict(labels)}
+    if name is None:
+        return {"Type": "volume", "Target": path, "VolumeOptions": options}
+    # With a copy of what the image has there, an engine would follow links that another container puts there meanwhile.
+    return {"Type": "volume", "Source": name, "Target": path, "VolumeOptions": {**options, "NoCopy": True}}
 
 
 def _reached(options: DockerOptions, port: int | None, hosts: Mapping[str, Iterable[str]]) -> dict[str, Any]:
