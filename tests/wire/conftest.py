@@ -22,6 +22,9 @@ TOPICS = (
 class World:
     """Makes sessions and links with made-up randomness."""
 
+    key = KEY
+    """Of a session that is made without another."""
+
     def __init__(self, seed=0):
         self.random = Random(seed)
 

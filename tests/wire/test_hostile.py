@@ -151,7 +151,7 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
             common = packet.push_common(packet.SHARD, packet_id, epoch, number, 1 + i % 2, length)
             rows = b"".join(common + packet.push_shard(0, j, 0, j, 0) + bytes(1168) for j in range(6))
             link.inject(SERVICE, rows, segment=1200)
-            assert link.sessions[SERVICE]._receiver.messages.used <= 25_000  # of real messages only
+            assert link.sessions[SERVICE].stats(link.now).reassembly_bytes <= 25_000  # of real messages only
 
     def publish():
         sent.append(world.random.randbytes(20_000))
@@ -162,7 +162,7 @@ def test_a_flood_stays_in_its_bound_and_real_messages_arrive(make_world):
     link.run(1.5)
     assert [bytes(m.payload) for _, m in link.messages[SERVICE]] == sent
     assert link.sessions[SERVICE].stats(link.now).rejected["forged"] >= 600 * 39
-    assert link.sessions[SERVICE]._receiver.messages.used == 0
+    assert link.sessions[SERVICE].stats(link.now).reassembly_bytes == 0
 
 
 def test_a_closed_session_takes_nothing(world):

@@ -10,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from skytether.emulator.link_model import LinkConditions
 from skytether.testing.link import LossyLink
 from skytether.wire import Config, Direction, Role, Session, Topic
+from skytether.wire.connect.handshake import MAX_HANDSHAKE
 from skytether.wire.events import Connected
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
@@ -100,14 +101,15 @@ class TwoEnds(RuleBasedStateMachine):
 
     @invariant()
     def memory_is_bounded(self):
-        for session in self.link.sessions.values():
-            assert session._receiver.messages.used <= CONFIG.reassembly_limit
+        for role, session in self.link.sessions.items():
+            used = session.stats(self.link.time_of(role)).reassembly_bytes
+            assert used <= CONFIG.reassembly_limit + 2 * MAX_HANDSHAKE
 
     def teardown(self):
         """On a network that works again, so does the session."""
         for role in Role:
             self.link.models[role].conditions = LinkConditions()
-        self.link._corrupt = 0.0
+        self.link.corrupt = 0.0
         self.link.run(12.0)
         for role, topic in ((ROBOT, "every"), (SERVICE, "map")):
             payload = len(self.published).to_bytes(4, "big")

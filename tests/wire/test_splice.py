@@ -32,12 +32,14 @@ def shards_of(packets):
 
 def state(link, role):
     """What none of it may change."""
-    session = link.sessions[role]
-    stats = session.stats(link.time_of(role))
+    stats = link.sessions[role].stats(link.time_of(role))
     topics = [(t.topic, t.delivered, t.lost, t.late, t.duplicate, t.expired) for t in stats.topics]
     paths = [(p.address, p.packets_received, p.bytes_received, p.loss_in, p.packets_sent) for p in stats.paths]
-    memory = session._receiver.messages.used, session._receiver._handshakes.used
-    return topics, paths, memory, stats.connected, stats.handshakes, len(link.events[role])
+    return topics, paths, stats.reassembly_bytes, stats.connected, stats.handshakes, len(link.events[role])
+
+
+def address_of_peer(link, role):
+    return link.sessions[role].stats(link.time_of(role)).paths[0].address
 
 
 def refused(link, role):
@@ -70,7 +72,7 @@ def rekeyed(make_world):
         for road in link.roads.values():
             road.set(LinkConditions())
         if turn == 0:
-            link.sessions[ROBOT]._reconnector.rekey(link.now)
+            link.sessions[ROBOT].rekey(link.now)
         link.run(0.3)
     for role in Role:
         first, second = link.lost[role]
@@ -84,7 +86,7 @@ def test_what_an_end_sent_is_nothing_that_it_takes(rekeyed):
         before, counts = state(rekeyed, role), refused(rekeyed, role)
         returned = rekeyed.lost[role][1]
         for one in returned:
-            rekeyed.inject(role, one, rekeyed.sessions[role]._paths.get(0).address)
+            rekeyed.inject(role, one, address_of_peer(rekeyed, role))
         assert state(rekeyed, role) == before
         assert refused(rekeyed, role) - counts == {"forged": len(returned)}
 
@@ -147,10 +149,10 @@ def test_batches_of_shards_again_whole_reversed_and_in_part(world):
 
 def test_handshakes_in_any_order_later_end_nothing_and_make_no_keys(world, monkeypatch):
     """All packets of six handshakes again, the last first, shuffled, from elsewhere and from the peer's address."""
-    link = world.link(record=True, robot={"config": Config(rekey_after=0.5)}, up=DELAY, down=DELAY)
-    link.run(3.0)
-    link.sessions[ROBOT]._rekey_at = link.now + 60.0
-    link.run(0.5)
+    link = world.link(record=True, up=DELAY, down=DELAY)
+    for _ in range(5):
+        link.sessions[ROBOT].rekey(link.now)
+        link.run(0.5)
     before = [link.sessions[role].stats(link.now).handshakes for role in Role]
     assert min(before) >= 5
     exchanged = []
@@ -160,7 +162,7 @@ def test_handshakes_in_any_order_later_end_nothing_and_make_no_keys(world, monke
         shuffled = world.random.sample(seen, len(seen))
         counts, packets = refused(link, role), len(link.sent[role])
         for one in (*reversed(seen), *shuffled):
-            for address in ("elsewhere", link.sessions[role]._paths.get(0).address):
+            for address in ("elsewhere", address_of_peer(link, role)):
                 link.inject(role, one, address)
         assert refused(link, role) - counts == {reason: 4 * len(seen)}
         assert len(link.sent[role]) == packets  # no answer
@@ -183,7 +185,7 @@ def test_questions_after_keys_of_then_make_no_keys_later(world, monkeypatch):
     link.run(1.0)
     seen = [p for at, p in link.sent[ROBOT] if p[0] == packet.HELLO and at >= start]
     assert len(set(seen)) >= 2
-    link.sessions[ROBOT]._reconnector.rekey(link.now)
+    link.sessions[ROBOT].rekey(link.now)
     link.run(0.5)
     assert link.sessions[SERVICE].stats(link.now).handshakes == 2
     exchanged = []
@@ -239,11 +241,15 @@ def test_hellos_of_four_lives_that_no_service_heard_cost_a_robot_half_a_second_o
 
 def test_an_old_welcome_answers_no_new_hello(world):
     """While the robot asks for new keys, all answers that it ever got come again, before the right one."""
-    link = world.link(record=True, robot={"config": Config(rekey_after=0.5)}, up=DELAY, down=DELAY)
-    link.run(2.0)
+    link = world.link(record=True, up=DELAY, down=DELAY)
+    for _ in range(3):
+        link.sessions[ROBOT].rekey(link.now)
+        link.run(0.5)
     old = [p for _, p in link.sent[SERVICE] if p[0] == packet.WELCOME]
-    link.run(link.sessions[ROBOT]._rekey_at - link.now + 0.005)
-    assert link.sessions[ROBOT]._reconnector.hello is not None
+    start = link.now
+    link.sessions[ROBOT].rekey(link.now)
+    link.run(0.005)
+    assert any(p[0] == packet.HELLO for at, p in link.sent[ROBOT] if at >= start)
     handshakes, counts = link.sessions[ROBOT].stats(link.now).handshakes, refused(link, ROBOT)
     for one in old:
         link.inject(ROBOT, one)

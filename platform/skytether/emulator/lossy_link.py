@@ -73,6 +73,7 @@ class LossyLink:
         events: What each end told, without messages: (time, event).
         messages: What each end received, payloads copied: (time, message).
         sent: Packets that each end sent, if ``record`` is set: (time, bytes).
+        corrupt: Share of packets in which a bit is flipped or the end is cut off; set it at any time.
         dropped: Packets larger than ``mtu``.
     """
 
@@ -97,7 +98,7 @@ class LossyLink:
             service: The service's end, made at ``service_time(start)``.
             up: From the robot; perfect unless given.
             down: From the service; perfect unless given.
-            corrupt: Share of packets in which a bit is flipped or the end is cut off.
+            corrupt: At the beginning.
             mtu: Largest datagram that passes.
             seed: Of corruption and of how packets are batched. The conditions have their own.
             start: Robot's clock at the beginning.
@@ -114,7 +115,7 @@ class LossyLink:
         self.messages: dict[Role, list[tuple[float, MessageReceived]]] = {role: [] for role in Role}
         self.sent: dict[Role, list[tuple[float, bytes]]] = {role: [] for role in Role}
         self.dropped: Counter[Role] = Counter()
-        self._corrupt = corrupt
+        self.corrupt = corrupt
         self._random = Random(seed)
         self._offset, self._drift = service_clock
         self._record = record
@@ -248,7 +249,7 @@ class LossyLink:
                 heapq.heappush(self._arrivals, entry)
 
     def _damage(self, packet: bytes) -> bytes:
-        if not self._corrupt or self._random.random() >= self._corrupt:
+        if not self.corrupt or self._random.random() >= self.corrupt:
             return packet
         if self._random.random() < 0.3:
             return packet[: self._random.randrange(len(packet))]

@@ -194,6 +194,16 @@ class Session:
             self._paths.ping(each, now)
         self._paths.choose(now)
 
+    def rekey(self, now: float) -> None:
+        """Ask for new keys at once; the robot's end does so by itself as ``Config.rekey_after`` and others say.
+
+        Raises:
+            ValueError: This is the service's end, which never asks.
+        """
+        if self._responder is not None:
+            raise ValueError("only the robot's end asks for new keys")
+        self._reconnector.rekey(now)
+
     def close_path(self, path: int, now: float) -> None:
         """The path is gone. The last one stays until another is opened."""
         self._paths.close(path, now)
@@ -236,7 +246,7 @@ class Session:
         paths = self._paths.stats(*self._counters.overhead(), now)
         return SessionStats(
             self._connected, self._counters.stats(table), paths, dict(rejected), clock.offset,
-            clock.error_at(now), self._handshakes, now - self._last_heard,
+            clock.error_at(now), self._handshakes, now - self._last_heard, self._receiver.memory,
         )  # fmt: skip
 
     # --- what the owner of the socket calls

@@ -114,3 +114,5 @@ class SessionStats:
     handshakes: int = 0
     last_heard: float = float("nan")
     """Seconds since the last authenticated packet."""
+    reassembly_bytes: int = 0
+    """Memory that messages take which are not complete yet, of handshakes too."""

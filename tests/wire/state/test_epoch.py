@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import pytest
+from insider import epoch_of
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Disconnected, Role, Topic
@@ -97,14 +98,12 @@ def test_reliable_topics_lose_repeat_and_reorder_nothing(world):
 
 def test_a_large_message_under_way_is_finished_under_the_keys_that_it_began_with(world):
     slow = Config(rate_bps=4e6, rekey_after=1.5, old_keys=0.2)
-    link = world.link(robot={"config": slow}, service={"config": Config(old_keys=0.2)}, record=True, **LINK)
+    table = Topic("log", "a/msg/B", Direction.IN, lifespan=10.0), Topic("map", "a/msg/B", Direction.OUT, lifespan=5.0)
+    robot, service = {"config": slow, "topics": table}, {"config": Config(old_keys=0.2), "topics": table}
+    link = world.link(robot=robot, service=service, record=True, **LINK)
     link.run(0.2)
     payload = world.random.randbytes(900_000)  # some 2 s
     link.publish(SERVICE, "map", payload[:1000])
-    row = link.sessions[ROBOT]._epoch.send["log"]
-    row.lifespan = 10.0
-    for receiver in link.sessions[SERVICE]._epoch.receive.values():
-        receiver.lifespan = 10.0
     link.publish(ROBOT, "log", payload)
     link.run(5.0)
     assert [bytes(m.payload) for _, m in link.messages[SERVICE]] == [payload]
@@ -127,10 +126,10 @@ def test_the_id_before_is_good_for_nothing_afterwards(world):
 
 
 def test_a_link_that_is_cut_while_keys_change_comes_back(world):
-    link = world.link(robot={"config": Config(rekey_after=1.0)}, record=True, **LINK)
+    link = world.link(record=True, **LINK)
     for cut in (0.01, 0.04, 0.07):  # HELLO, WELCOME or the first packet under the new keys is lost
-        at = link.sessions[ROBOT]._rekey_at
-        link.run(at + cut - link.now)
+        link.sessions[ROBOT].rekey(link.now)
+        link.run(cut)
         for road in link.roads.values():
             road.set(LinkConditions(cut=True))
         link.run(3.0)
@@ -141,11 +140,17 @@ def test_a_link_that_is_cut_while_keys_change_comes_back(world):
         link.publish(SERVICE, "cmd_vel", b"y")
         link.run(0.2)
         assert [bytes(link.messages[role][-1][1].payload) for role in (SERVICE, ROBOT)] == [b"x", b"y"]
+    assert [stats.handshakes for stats in ends(link)] == [4, 4]
+
+
+def test_only_the_robots_end_asks_for_new_keys(world):
+    with pytest.raises(ValueError, match="only the robot's end"):
+        world.link().sessions[SERVICE].rekey(1.0)
 
 
 def test_nothing_is_sent_with_keys_that_are_used_up(world):
     link = world.link(record=True, **LINK)
-    link.sessions[SERVICE]._epoch.bytes_sent = MAX_BYTES
+    epoch_of(link.sessions[SERVICE]).bytes_sent = MAX_BYTES  # 128 GiB take a while
     sent = len(link.sent[SERVICE])
     link.publish(SERVICE, "map", b"x")
     link.run(0.05)
@@ -155,7 +160,7 @@ def test_nothing_is_sent_with_keys_that_are_used_up(world):
 
 
 def test_a_copy_of_the_message_that_confirmed_new_keys_is_no_new_message(world):
-    before = world.link(**LINK).sessions[SERVICE]._epoch
+    before = epoch_of(world.link(**LINK).sessions[SERVICE])
     after = Epoch(before.id + 1, before.ciphers, before.topics, [], [], before.life)
     number = before.replay.highest + 3
     assert after.replay.accept(number)

@@ -101,6 +101,11 @@ class Receiver:
         self.messages = Reassembly(config.reassembly_limit, on_expired)
         self._handshakes = Reassembly(2 * MAX_HANDSHAKE, _nothing)
 
+    @property
+    def memory(self) -> int:
+        """Bytes that incomplete messages take, of handshakes too."""
+        return self.messages.used + self._handshakes.used
+
     def receive(
         self,
         data: memoryview,
