@@ -58,6 +58,8 @@ class Node:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
+        self.heard: list[Any] = []
+        """For a test to keep what it has read too early."""
         self._said: queue.Queue[Any] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -71,7 +73,7 @@ class Node:
 
     def next(self, limit_s: float = LIMIT_S) -> Any:
         """What it says next."""
-        said = self._said.get(timeout=limit_s)
+        said = self._said.get(timeout=max(limit_s, 0.0))
         if isinstance(said, EOFError):
             raise said
         return said
