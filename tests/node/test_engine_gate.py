@@ -42,6 +42,8 @@ class Engine:
         self.links: set[str] = set()
         """In its images."""
         self.volumes: list[dict[str, Any]] = []
+        self.emptied = False
+        """What is made there is removed at once by somebody."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
         engine = self
@@ -62,8 +64,8 @@ class Engine:
                 if "/images/" in self.path and self.command == "GET":
                     said = {"RepoDigests": engine.digests}
                 text = json.dumps(said).encode()
-                missing = self.path.startswith("/images/new")
-                self.send_response(404 if missing else 201 if self.path == "/containers/create" else 200)
+                missing = self.path.startswith("/images/new") or (engine.emptied and self.command in ("HEAD", "DELETE"))
+                self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {"mode": 1 << 27 if asked in engine.links else 0}
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
@@ -235,11 +237,28 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     got = say(engine, sent + sent)
     if not says:
         assert got.count(b"200 OK") == 2
-        assert engine.lines.count("POST /containers/create") == 1  # looked at once
+        assert len([line for line in engine.lines if line.startswith("POST /containers/create")]) == 1  # once
         assert f"DELETE /containers/{ID}?force=1&v=1" in engine.lines
     else:
         assert says in got
         assert sent.split(b" HTTP")[0].decode() not in engine.lines
+
+
+def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Engine) -> None:
+    """Where nothing is any more no link is found."""
+    engine.emptied = True
+    sent = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    assert b"was removed meanwhile" in say(engine, sent)
+    engine.emptied = False
+    assert b"200 OK" in say(engine, sent)
+
+
+def test_no_orchestrator_starts_what_the_node_made_to_look_at_an_image(engine: Engine) -> None:
+    """That image may say of itself whose it is, and have volumes that make the look a false one."""
+    say(engine, request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json"))
+    (made,) = (json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create"))
+    engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
+    assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
 
 
 def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> None:

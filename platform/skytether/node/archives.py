@@ -11,13 +11,14 @@ import base64
 import json
 import posixpath
 import re
+import secrets
 from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from .engine_rules import OLD_GUARD
+from .engine_rules import NOBODY, OWNER
 from .machine import ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
@@ -58,6 +59,7 @@ class Images:
     def __init__(self, engine: str) -> None:
         """``engine``: path of its socket."""
         self._engine = engine
+        self._name = f"skytether-look-{secrets.token_hex(4)}"
         self._known: dict[tuple[str, str], bool] = {}
 
     def link(self, image: str, paths: Iterable[str]) -> str | None:
@@ -80,17 +82,32 @@ class Images:
         body = {
             "Image": image,
             "Entrypoint": ["/never-started"],
-            "Labels": {OLD_GUARD: ""},  # so that orchestrators prune it, should this end before it removes it
-            "HostConfig": {"NetworkMode": "none", "ReadonlyRootfs": True},
+            "Labels": {OWNER: NOBODY},  # or the image could say that it is an orchestrator's, which could start it
+            "HostConfig": {
+                "NetworkMode": "none",
+                "ReadonlyRootfs": True,
+                "CapDrop": ["ALL"],
+                "SecurityOpt": ["no-new-privileges"],
+            },
         }
-        made = ask(self._engine, "/containers/create", method="POST", body=body)
+        self._remove(self._name)  # should it have been left
+        made = ask(self._engine, f"/containers/create?name={self._name}", method="POST", body=body)
         if made.status != HTTPStatus.CREATED:
             raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
         container = json.loads(made.content)["Id"]
         try:
-            return {(image, path): self._is_link(container, path) for path in paths}
-        finally:
-            ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE")
+            found = {(image, path): self._is_link(container, path) for path in paths}
+        except BaseException:
+            self._remove(container)
+            raise
+        if not self._remove(container):
+            raise ValueError("what was made of its image was removed meanwhile")  # and nothing was found there
+        return found
+
+    def _remove(self, container: str) -> bool:
+        return (
+            ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE").status < HTTPStatus.BAD_REQUEST
+        )
 
     def _is_link(self, container: str, path: str) -> bool:
         answer = ask(self._engine, f"/containers/{container}/archive?{urlencode({'path': path})}", method="HEAD")

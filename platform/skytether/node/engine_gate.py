@@ -20,7 +20,7 @@ from skytether.api.printable import printable
 from skytether.api.splice import PIECE, Stream
 
 from .archives import Images, moved, ways
-from .engine_rules import NETWORK, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
+from .engine_rules import NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
 from .machine import ask, ask_json
 
 log = logging.getLogger(__name__)
@@ -223,7 +223,7 @@ class EngineGate:
         document = found if isinstance(found, dict) else {}
         config = document.get("Config") if what == "containers" else document
         labels = config.get("Labels") if isinstance(config, dict) else None
-        if not isinstance(labels, dict) or not _MARKS[kind] & labels.keys():
+        if not isinstance(labels, dict) or not _MARKS[kind] & labels.keys() or labels.get(OWNER) == NOBODY:
             return False
         if what == "containers" and name == document.get("Id"):  # its labels never change
             self._ours = self._ours if len(self._ours) < _KNOWN else set()

@@ -21,6 +21,8 @@ from .seccomp_rules import holds, once
 
 OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
 """Labels of what orchestrators made."""
+NOBODY = "-"
+"""As an owner: the node itself made it, and no orchestrator touches it."""
 OPEN = "skytether.io/open"
 """Label of a network that the machine's owner made, and that containers of sites may be in."""
 WEIGHED = "/system/df"
