@@ -72,10 +72,10 @@ def test_robots_vanish_in_every_phase(programs: Any) -> None:
         for instance in set(vanished) - {scene.stopping}:  # that one may have ended by now
             client.renew_instance(instance, Renew(lease_s=1))
         left = assert_nothing_lost(told(client), dict.fromkeys(vanished, State.STOPPED), runs)
-        spares = [i.id for i in client.instances() if i.id not in vanished]
-        assert len(spares) == 1
-        assert set(left) <= set(spares)
-        assert_nothing_lost(told(client), {spares[0]: State.RUNNING}, runs)
+        standbys = [i.id for i in client.instances() if i.id not in vanished]
+        assert len(standbys) == 1
+        assert set(left) <= set(standbys)
+        assert_nothing_lost(told(client), {standbys[0]: State.RUNNING}, runs)
 
 
 def test_two_orchestrators_that_were_given_the_same_folder_by_mistake(programs: Any, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def assert_nothing_lost(
 
     Args:
         states: What the orchestrator tells.
-        expected: The state that each instance that was asked for comes to. More may be there: spares, successors.
+        expected: The state that each instance that was asked for comes to. More may be there: standbys, successors.
         places: All where anything may run.
         left: What else may be left behind.
         patience: Seconds.

@@ -61,10 +61,10 @@ def test_with_the_size_it_had_or_what_its_manifest_says(new_record: NewRecord) -
 
 
 def test_a_standby_that_takes_over_is_to_have_what_the_other_had(new_record: NewRecord) -> None:
-    standby = new_record("i2", state=State.RUNNING, spare=True, robot="")
+    standby = new_record("i2", state=State.RUNNING, standby=True, robot="")
     wanted = new_record("i3", replaces="i1", size=Size(cpu=3.0, memory_mb=900).model_dump())
     taken = drafted(transitions.takes_over(standby, wanted, NOW))
-    assert (taken.robot, taken.spare, taken.replaces, taken.wants) == (
+    assert (taken.robot, taken.standby, taken.replaces, taken.wants) == (
         *(wanted.robot, False, "i1", Size(cpu=3.0, memory_mb=900)),
     )
 

@@ -286,7 +286,7 @@ def test_a_standby_that_cannot_be_started_waits_for_no_room(
     add(b, new_record("i0", pinned="other", lease_expires_at=b.clock() + 1000))
     b.step()
     b.reconciler.site_step(other)
-    add(b, new_record("i1", robot="", spare=True, lease_expires_at=b.clock() + 1e9))
+    add(b, new_record("i1", robot="", standby=True, lease_expires_at=b.clock() + 1e9))
     for _ in range(40):
         b.step()
         b.clock.forward(0.25)
@@ -349,14 +349,14 @@ def test_what_runs_at_a_site_that_is_blocked_stays_as_good_as_it_was(
     b = bench(BlockedRuntime)
     b.runtime.obstacle = ""
     monkeypatch.setattr(b.standbys, "keep", lambda: None)
-    add(b, new_record("i1", robot="", spare=True, lease_expires_at=b.clock() + 1e9))
+    add(b, new_record("i1", robot="", standby=True, lease_expires_at=b.clock() + 1e9))
     near = {"lab": {"rtt_ms": 5.0}, "other": {"rtt_ms": 300.0}}
     add(b, new_record("i2", measurements=near, lease_expires_at=b.clock() + 1e9))
     b.step(2)
     b.runtime.obstacle = "the network is missing"
     b.beside(tmp_path)
     successors = b.successors
-    assert [spare.id for spare in b.standbys.fitting(new_record("i3", measurements=near))] == ["i1"]
+    assert [standby.id for standby in b.standbys.fitting(new_record("i3", measurements=near))] == ["i1"]
     report = {"control_source": "fallback", "rtt_s": 0.005}
     monkeypatch.setattr(b.store, "reports", lambda _: {"i2": report})
     for _ in range(2):
@@ -565,12 +565,12 @@ def test_what_was_placed_while_its_site_was_deleted_is_given_up(
     assert (b.record().state, b.record().reason) == (after, "site 'deleted' was deleted: ask again")
 
 
-@pytest.mark.parametrize("spare", [False, True], ids=["at a site", "waiting for one"])
+@pytest.mark.parametrize("standby", [False, True], ids=["at a site", "waiting for one"])
 def test_while_robots_are_refused_no_lease_runs_out_and_then_all_count_anew(
-    bench: Any, new_record: NewRecord, spare: bool
+    bench: Any, new_record: NewRecord, standby: bool
 ) -> None:
     b = bench()
-    add(b, new_record("i0", pinned="nowhere" if spare else None))
+    add(b, new_record("i0", pinned="nowhere" if standby else None))
     b.step(2)
     state = b.record("i0").state
     for _ in range(60):  # four leases long

@@ -427,10 +427,10 @@ def test_a_standby_that_takes_over_gets_the_size_that_was_there(served: Any, man
     made = ask(served)
     served.operator.resize_instance(made.id, Resize(cpu=2))
     until(lambda: served.operator.get_instance(made.id).size.cpu == 2)
-    spare = until(warm)
+    standby = until(warm)
     fake.crash(made.id)
-    until(lambda: served.operator.get_instance(made.id).successor == spare)
-    coming = until(lambda: (i := served.operator.get_instance(spare)).size.cpu == 2 and i)
+    until(lambda: served.operator.get_instance(made.id).successor == standby)
+    coming = until(lambda: (i := served.operator.get_instance(standby)).size.cpu == 2 and i)
     assert (coming.replaces, coming.restarts) == (made.id, 0)
-    events = [event.reason for event in served.core.store.events(spare, 0)]
+    events = [event.reason for event in served.core.store.events(standby, 0)]
     assert events[-1].endswith(f"instead of 1 core and 128 MiB: instance {made.id} had that")

@@ -1,4 +1,4 @@
-"""Successors and spares, over REST, with runtimes whose failures are staged."""
+"""Successors and standbys, over REST, with runtimes whose failures are staged."""
 
 from __future__ import annotations
 
@@ -100,19 +100,19 @@ def put(served: Any, manifest: Any, **needs: Any) -> None:
     served.operator.put_service("toy", manifest(needs={"cpu": 0.1} | needs, params={"properties": {"n": {}}}))
 
 
-def spares(served: Any) -> list[Any]:
+def standbys(served: Any) -> list[Any]:
     return [i for i in served.operator.instances() if not i.robot and i.state is State.RUNNING]
 
 
 def test_a_request_gets_the_warm_one_at_once_and_another_is_made(two: Any, manifest: Any) -> None:
     put(two, manifest, standby=1)
-    spare = until(lambda: spares(two))[0]
+    standby = until(lambda: standbys(two))[0]
     body = InstanceCreate(robot="walker", service="toy", lease_s=1000)
     made = two.operator.create_instance(body, idempotency_key="one")
-    assert (made.id, made.state, made.robot) == (spare.id, State.RUNNING, "walker")
+    assert (made.id, made.state, made.robot) == (standby.id, State.RUNNING, "walker")
     assert made.session.port is not None
     assert two.operator.create_instance(body, idempotency_key="one").id == made.id
-    other = until(lambda: [s for s in spares(two) if s.id != made.id])
+    other = until(lambda: [s for s in standbys(two) if s.id != made.id])
     assert len(other) == 1
     two.operator.delete_instance(made.id)
     put(two, manifest, standby=0)
@@ -121,15 +121,15 @@ def test_a_request_gets_the_warm_one_at_once_and_another_is_made(two: Any, manif
 
 def test_a_request_with_other_parameters_starts_its_own(two: Any, manifest: Any) -> None:
     put(two, manifest, standby=1)
-    spare = until(lambda: spares(two))[0]
+    standby = until(lambda: standbys(two))[0]
     made = ask(two, params={"n": 1})
-    assert made.id != spare.id
-    assert [s.id for s in spares(two)] == [spare.id]  # parameters that change often do not wear it out
+    assert made.id != standby.id
+    assert [s.id for s in standbys(two)] == [standby.id]  # parameters that change often do not wear it out
 
 
 def test_requests_at_once_get_one_each(two: Any, manifest: Any) -> None:
     put(two, manifest, standby=1)
-    until(lambda: spares(two))
+    until(lambda: standbys(two))
     made: list[Any] = []
     body = [InstanceCreate(robot=f"r{n}", service="toy", lease_s=1000) for n in range(8)]
     threads = [threading.Thread(target=lambda b=b: made.append(two.operator.create_instance(b))) for b in body]
@@ -143,16 +143,16 @@ def test_requests_at_once_get_one_each(two: Any, manifest: Any) -> None:
 
 def test_when_a_site_falls_silent_the_standby_elsewhere_takes_over(two: Any, manifest: Any) -> None:
     put(two, manifest, standby=1)
-    until(lambda: spares(two))
+    until(lambda: standbys(two))
     first = ask(two)
-    spare = until(lambda: [s for s in spares(two) if s.id != first.id])[0]
-    if spare.placement.site == first.placement.site:  # both fit anywhere: have it elsewhere
+    standby = until(lambda: [s for s in standbys(two) if s.id != first.id])[0]
+    if standby.placement.site == first.placement.site:  # both fit anywhere: have it elsewhere
         two.operator.delete_instance(first.id)
         until(lambda: two.operator.get_instance(first.id).state.final)
         pytest.fail("a standby was put beside what it stands by for")
     two.fleet.made[first.placement.site].silent = True
     successor = until(lambda: two.operator.renew_instance(first.id).successor)
-    assert successor == spare.id
+    assert successor == standby.id
     taken = two.operator.get_instance(successor)
     assert (taken.state, taken.robot, taken.replaces) == (State.RUNNING, "walker", first.id)
 
@@ -238,12 +238,12 @@ def test_what_nothing_else_takes_stays_and_says_why_until_something_does(two: An
 
 def test_a_standby_takes_over_from_what_leaves_and_none_is_kept_where_it_would_end(two: Any, manifest: Any) -> None:
     put(two, manifest, standby=1)
-    spare = until(lambda: spares(two))[0]
-    leaves(two, spare.id)
-    other = until(lambda: [s for s in spares(two) if s.id != spare.id])[0]
-    until(lambda: two.operator.get_instance(spare.id).state.final)
+    standby = until(lambda: standbys(two))[0]
+    leaves(two, standby.id)
+    other = until(lambda: [s for s in standbys(two) if s.id != standby.id])[0]
+    until(lambda: two.operator.get_instance(standby.id).state.final)
     first = ask(two)
     assert first.id == other.id
-    warm = until(lambda: spares(two))[0]
+    warm = until(lambda: standbys(two))[0]
     leaves(two, first.id)
     assert successor(two, first.id).successor == warm.id

@@ -97,11 +97,11 @@ def test_looking_again_reads_only_what_changed(store: Store, new_record: NewReco
     assert [old is new for old, new in zip(now, listed, strict=True)] == [True, True, False]
 
 
-def test_spares_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:
-    store.add(new_record("warm", spare=True, state=State.RUNNING), "", None, "")
-    store.add(new_record("cold", spare=True, state=State.STARTING), "", None, "")
-    store.add(new_record("other", spare=True, state=State.RUNNING, service="other"), "", None, "")
-    assert [r.id for r in store.spares("toy")] == ["warm"]
+def test_standbys_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:
+    store.add(new_record("warm", standby=True, state=State.RUNNING), "", None, "")
+    store.add(new_record("cold", standby=True, state=State.STARTING), "", None, "")
+    store.add(new_record("other", standby=True, state=State.RUNNING, service="other"), "", None, "")
+    assert [r.id for r in store.standbys("toy")] == ["warm"]
     for name, source in (("a", "cloud"), ("b", "stop"), ("c", None)):
         store.add(new_record(name, state=State.RUNNING), "operator", None, "")
         store.hear({name: (NOW, {"control_source": source})}, {("walker", "toy"): [("robot:a", {})]})
@@ -258,7 +258,7 @@ def test_what_ends_is_not_renewed(store: Store, new_record: NewRecord) -> None:
 def test_leases_are_whole_again_after_a_time_without_orchestrator(store: Store, new_record: NewRecord) -> None:
     store.add(new_record("short", lease_s=10, lease_expires_at=NOW + 1), "operator", None, "")
     store.add(new_record("dated", lease_s=10, lease_expires_at=NOW + 5000), "operator", None, "")
-    store.add(new_record("nobody's", lease_s=10, lease_expires_at=FOREVER, spare=True), "operator", None, "")
+    store.add(new_record("nobody's", lease_s=10, lease_expires_at=FOREVER, standby=True), "operator", None, "")
     store.extend_leases(NOW + 1000)
     leases = {r.id: r.lease_expires_at for r in store.all()}
     assert leases == {"short": NOW + 1010, "dated": NOW + 1010, "nobody's": FOREVER}
@@ -313,11 +313,11 @@ def test_nor_does_it_in_postgresql(postgres: str, new_record: NewRecord) -> None
 
 def test_an_instance_is_replaced_by_one_at_a_time(store: Store, new_record: NewRecord) -> None:
     store.add(new_record("old"), "operator", None, "")
-    spare = store.add(new_record("spare", robot="", spare=True), "", None, "")
+    standby = store.add(new_record("standby", robot="", standby=True), "", None, "")
     first = store.add(new_record("first", replaces="old"), "operator", None, "")
     assert store.add(new_record("second", replaces="old"), "operator", None, "") == first
     assert store.get("second") is None
-    taken = Change(spare, {"robot": "walker", "replaces": "old", "spare": False})
+    taken = Change(standby, {"robot": "walker", "replaces": "old", "standby": False})
     assert store.claim(taken, NOW, "", None, "") is None
     assert store.change(Change(first, {"state": State.STOPPED}), NOW) is not None
     assert store.claim(taken, NOW, "", None, "") is not None, "the first one serves no more"

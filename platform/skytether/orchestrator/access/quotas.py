@@ -48,10 +48,10 @@ def use_of(records: Iterable[Record]) -> RobotUse:
 
 
 def use_by_robot(records: Iterable[Record]) -> dict[str, RobotUse]:
-    """The same by robot; spares are nobody's."""
+    """The same by robot; standbys are nobody's."""
     of: dict[str, list[Record]] = {}
     for record in records:
-        if not record.spare:
+        if not record.standby:
             of.setdefault(record.robot, []).append(record)
     return {robot: use_of(theirs) for robot, theirs in of.items()}
 

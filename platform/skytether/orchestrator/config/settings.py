@@ -59,7 +59,7 @@ class Timing(Group):
     """A robot that has driven by itself for this long gets its service moved, if another site would be better."""
     replace_pause: Seconds = 60.0
     """An instance runs for at least this long before it is moved so."""
-    spare_lease: Seconds = 15.0
+    standby_lease: Seconds = 15.0
     """Lease of a standby when it is given to a robot that names none."""
     gate_silent: Seconds = 15.0
     """A robot that has not said for this long how its gate is has no series of it, and an unknown state in the list of

@@ -90,7 +90,7 @@ class Record:
     """The instance whose robot is to change to this one as soon as it runs."""
     pinned: str | None = None
     """The one site where it may run; None: any but that of the one it replaces."""
-    spare: bool = False
+    standby: bool = False
     """Warm, and nobody's yet: it has no robot and no lease."""
     key_id: str = ""
     """Fingerprint of the secret key that its session's is derived from; empty: from before they were noted."""

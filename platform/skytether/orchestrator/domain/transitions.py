@@ -177,7 +177,7 @@ def claimed(standby: Record, wanted: Record, now: float) -> Change:
             "lease_expires_at": wanted.lease_expires_at,
             "created_at": wanted.created_at,
             "updated_at": now,
-            "spare": False,
+            "standby": False,
         },
     )
 

@@ -99,7 +99,7 @@ class Demand:
             wanted |= {one.id: (one, machine.since) for one in running if self._store.successor(one.id) is None}
         found = []
         for record, since in wanted.values():
-            if record.spare or record.pinned is not None or record.lease_expires_at <= now:
+            if record.standby or record.pinned is not None or record.lease_expires_at <= now:
                 continue
             groups = self._could_take(record, offers)
             if groups:

@@ -149,9 +149,9 @@ class Instances:
 
     def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:
         """A warm instance instead of a new one, if there is one that fits."""
-        for spare in self._standbys.fitting(record):
+        for standby in self._standbys.fitting(record):
             now = self._clock()
-            taken = self._store.claim(claimed(spare, record, now), now, owner, key, digest)
+            taken = self._store.claim(claimed(standby, record, now), now, owner, key, digest)
             if taken is not None:
                 self._metrics.phase(taken, "total", self._clock() - record.created_at)
                 return taken
@@ -171,7 +171,7 @@ class Instances:
         record = self.get(principal, instance)
         if record.state.final or record.state is State.STOPPING:
             raise ConflictError(f"instance '{instance}' is {record.state}: ask for a new one")
-        if record.spare:
+        if record.standby:
             raise ConflictError(
                 f"instance '{instance}' is a standby, which nobody uses: delete it, and another is made"
             )
@@ -228,7 +228,7 @@ class Instances:
     def _site_of_running(self, record: Record) -> Site:
         if record.state.final or record.state is State.STOPPING:
             raise ConflictError(f"instance '{record.id}' is {record.state}: ask for a new one")
-        if record.spare:
+        if record.standby:
             raise ConflictError(
                 f"instance '{record.id}' is a standby, which nobody uses: it has what its service needs"
             )

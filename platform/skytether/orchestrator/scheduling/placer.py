@@ -105,7 +105,7 @@ class Placer:
             sites = [replace(site, blocked=None, unfit=None) for site in sites]
         spec = record.spec
         decision = place(spec.needs, measured, sites, image=spec.image, weights=self._weights)
-        if decision.site is not None or record.pinned is not None or record.spare:
+        if decision.site is not None or record.pinned is not None or record.standby:
             return decision
         prospects = self._prospects(record)
         return replace(

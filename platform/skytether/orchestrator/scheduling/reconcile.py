@@ -307,7 +307,7 @@ class Reconciler:
             instance=record.id,
             service=record.service,
             robot=record.robot or "standby",
-            idle_exit_s=_SPARE_IDLE if record.spare else Grant.model_fields["idle_exit_s"].default,
+            idle_exit_s=_SPARE_IDLE if record.standby else Grant.model_fields["idle_exit_s"].default,
             params=record.params,
             session_id=record.session_id,
             session_key=base64.b64encode(self._secrets.session_key(record.session_id, record.key_id)).decode(),
@@ -349,7 +349,7 @@ class Reconciler:
         self._successors.fail_over(after, after.reason)
         if after.site is None or after.state.final:
             self._placer.release(after)
-            if after.state.final and after.spare:
+            if after.state.final and after.standby:
                 self._standbys.failed(after)
             self._wake_placer()
             site.runtime.stop(after.id, force=True)  # what its main process left behind
@@ -366,7 +366,7 @@ class Reconciler:
             site.fitness.failed(record, crash.why, self._steady(), self._clock())
             refused.append(Refusal(site=site.name, reason=UNSTARTED, detail=crash.why).model_dump())
         decision = self._placer.weigh(replace(record, refused=refused), self._placer.promised())
-        if decision.site is None and (decision.hopeless or record.spare or not gives_up):  # a spare never waits
+        if decision.site is None and (decision.hopeless or record.standby or not gives_up):  # a standby never waits
             if gives_up and len(decision.refused) > 1:
                 why = f"no site can start it: {told(record, decision.refused)}"
                 return crashed(record, change.after.failures, why)

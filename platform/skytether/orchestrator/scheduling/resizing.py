@@ -113,7 +113,7 @@ class Resizing:
         return wanted if wanted.memory_mb > has.memory_mb else None
 
     def _keep(self, site: Site, record: Record, seen: Observation, now: float) -> None:
-        follows = record.spec.needs.scaling is not None and not record.spare
+        follows = record.spec.needs.scaling is not None and not record.standby
         if record.resize is None and record.size is None and not follows:
             return  # as almost all
         known = self._known.setdefault(record.id, _Known(site.name))

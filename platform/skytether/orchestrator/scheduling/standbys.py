@@ -58,7 +58,7 @@ class Standbys:
 
     def fitting(self, record: Record) -> list[Record]:
         """Warm instances that could be this one, the best site's first; none at a site that is much worse."""
-        same = [spare for spare in self._store.spares(record.service) if _alike(spare, record)]
+        same = [standby for standby in self._store.standbys(record.service) if _alike(standby, record)]
         if not same:
             return []
         others = self._placer.promised(same)
@@ -68,35 +68,35 @@ class Standbys:
         at = {s.id: self._sites.find(s.site) for s in same}
         here = [s for s in same if reachable(at[s.id]) and not about_to_end(at[s.id], s.id)]
         good = [s for s in here if s.site in scores and scores[s.site] <= limit]
-        return sorted(good, key=lambda spare: (scores[spare.site or ""], spare.created_at))
+        return sorted(good, key=lambda standby: (scores[standby.site or ""], standby.created_at))
 
     def keep(self) -> None:
         """Start those that are missing, and end those that nobody would get."""
         now = self._clock()
         kept: dict[str, int] = {}
         catalog = {manifest.metadata.name: manifest for manifest in self._catalog.all()}
-        spares = self._store.live_spares()
-        self.warms = bool(spares) or any(manifest.spec.needs.standby for manifest in catalog.values())
-        for spare in spares:
-            if spare.state is State.STOPPING:
+        standbys = self._store.live_standbys()
+        self.warms = bool(standbys) or any(manifest.spec.needs.standby for manifest in catalog.values())
+        for standby in standbys:
+            if standby.state is State.STOPPING:
                 continue
-            manifest = catalog.get(spare.service)
+            manifest = catalog.get(standby.service)
             wanted = manifest.spec.needs.standby if manifest else 0
-            current = manifest is not None and _document(manifest) == spare.manifest
-            if current and (self._stale(spare, now) or self._leaves(spare)):
+            current = manifest is not None and _document(manifest) == standby.manifest
+            if current and (self._stale(standby, now) or self._leaves(standby)):
                 current = False
-            if current and kept.get(spare.service, 0) < wanted:
-                kept[spare.service] = kept.get(spare.service, 0) + 1
+            if current and kept.get(standby.service, 0) < wanted:
+                kept[standby.service] = kept.get(standby.service, 0) + 1
             else:
-                self._end(spare, now)
+                self._end(standby, now)
         for name, manifest in catalog.items():
             if kept.get(name, 0) < manifest.spec.needs.standby and now >= self._not_before.get(name, 0.0):
                 self._add(manifest, now)
 
-    def _stale(self, spare: Record, now: float) -> bool:
+    def _stale(self, standby: Record, now: float) -> bool:
         """It has other parameters than the last request, and has had its time."""
-        params = self._store.last_params(spare.service)
-        return params is not None and params != spare.params and abs(now - spare.created_at) > _SETTLED
+        params = self._store.last_params(standby.service)
+        return params is not None and params != standby.params and abs(now - standby.created_at) > _SETTLED
 
     def _add(self, manifest: Manifest, now: float) -> None:
         name = manifest.metadata.name
@@ -105,23 +105,23 @@ class Standbys:
             check_params(params, manifest.spec.params, name)
         except InvalidError:
             return  # parameters are needed, and nobody has asked yet
-        spare = new_record(
+        standby = new_record(
             robot="",
             service=name,
             manifest=_document(manifest),
             params=params,
             created_at=now,
             updated_at=now,
-            lease_s=self._timing.spare_lease,
+            lease_s=self._timing.standby_lease,
             lease_expires_at=FOREVER,
-            spare=True,
+            standby=True,
         )
         # Robots come first: a standby does not wait for room.
-        if self._placer.weigh(spare, self._placer.promised()).site is not None:
-            self._store.add(spare, "", None, "")
+        if self._placer.weigh(standby, self._placer.promised()).site is not None:
+            self._store.add(standby, "", None, "")
 
-    def _end(self, spare: Record, now: float) -> None:
-        self._store.change(stopping(spare, now, "this standby is not needed any more"), now)
+    def _end(self, standby: Record, now: float) -> None:
+        self._store.change(stopping(standby, now, "this standby is not needed any more"), now)
 
     def failed(self, record: Record) -> None:
         """Do not try another one at once."""
@@ -131,15 +131,15 @@ class Standbys:
         """Nothing is known any more of how long things have been as they are."""
         self._not_before = {}
 
-    def _leaves(self, spare: Record) -> bool:
+    def _leaves(self, standby: Record) -> bool:
         """Its site takes nothing more, or is about to end it."""
-        site = self._sites.find(spare.site)
-        return site is not None and (site.draining or site.evacuating or about_to_end(site, spare.id) != "")
+        site = self._sites.find(standby.site)
+        return site is not None and (site.draining or site.evacuating or about_to_end(site, standby.id) != "")
 
 
-def _alike(spare: Record, record: Record) -> bool:
+def _alike(standby: Record, record: Record) -> bool:
     """Same service, same version, same parameters."""
-    return (spare.service, spare.manifest, spare.params) == (record.service, record.manifest, record.params)
+    return (standby.service, standby.manifest, standby.params) == (record.service, record.manifest, record.params)
 
 
 def _document(manifest: Manifest) -> dict[str, Any]:

@@ -79,20 +79,20 @@ class Successors:
 
     def fail_over(self, record: Record, why: str) -> None:
         """Give the robot of an instance that does not serve a standby, if there is one."""
-        if record.spare or self._store.successor(record.id) is not None:
+        if record.standby or self._store.successor(record.id) is not None:
             return
         wanted = self.successor_of(record)
-        for spare in self._standbys.fitting(replace(wanted, replaces=None, refused=[])):
+        for standby in self._standbys.fitting(replace(wanted, replaces=None, refused=[])):
             now = self._clock()
-            if self._store.claim(takes_over(spare, wanted, now), now, "", None, ""):
-                log.warning("%s for %s: %s; standby %s takes over", record.service, record.robot, why, spare.id)
+            if self._store.claim(takes_over(standby, wanted, now), now, "", None, ""):
+                log.warning("%s for %s: %s; standby %s takes over", record.service, record.robot, why, standby.id)
                 return
 
     def watch(self, live: Sequence[Record]) -> None:
         """Fail over from sites that do not answer, and move what is about to be ended, or serves its robot badly."""
         now = self._clock()
         for record in live:
-            if record.state is not State.RUNNING or record.spare:
+            if record.state is not State.RUNNING or record.standby:
                 continue
             if not reachable(self._sites.find(record.site)):
                 self.fail_over(record, f"site {record.site} does not answer")
@@ -133,7 +133,7 @@ class Successors:
         if record.state is State.STOPPING:
             self._store.change(stopped(record, why), now)
             return
-        if record.spare:
+        if record.standby:
             self._store.change(failed(record, why), now)
             return
         self.fail_over(record, why)

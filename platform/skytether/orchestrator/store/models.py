@@ -208,7 +208,8 @@ instances = Table(
     Column("stopping_at", Float),
     Column("replaces", String(32), index=True),
     Column("pinned", String(63)),
-    Column("spare", Boolean, nullable=False, server_default=false()),
+    # The column keeps the name that it was made with: orchestrators of the version before may run still.
+    Column("spare", Boolean, key="standby", nullable=False, server_default=false()),
     Column("claim", String(64), comment="SHA-256 of the claim that got the session's key; NULL: nobody did"),
     Column("key_id", String(32), nullable=False, server_default=""),
     Column("size", JSON(none_as_null=True), comment="What it has; NULL: what its manifest says"),

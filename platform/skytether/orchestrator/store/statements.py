@@ -117,8 +117,10 @@ COUNT_LIVE = select(func.count()).where(LIVE, instances.c.service == bindparam("
 LIVE_AT = versions(LIVE, instances.c.site == bindparam("site"))
 CHANGING_AT = versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
 WAITING = versions(instances.c.state.in_([State.PENDING, State.PLACING]))
-LIVE_SPARES = versions(LIVE, instances.c.spare)
-SPARES = versions(instances.c.spare, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
+LIVE_STANDBYS = versions(LIVE, instances.c.standby)
+STANDBYS = versions(
+    instances.c.standby, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING
+)
 
 
 def values(record: Record) -> dict[str, Any]:

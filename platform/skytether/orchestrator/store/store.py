@@ -179,13 +179,13 @@ class Store(GroupStore):
         """All that has no site yet, oldest first."""
         return self._look(sql.WAITING)
 
-    def live_spares(self) -> list[Record]:
+    def live_standbys(self) -> list[Record]:
         """Those that are nobody's and have not ended, oldest first."""
-        return self._look(sql.LIVE_SPARES)
+        return self._look(sql.LIVE_STANDBYS)
 
-    def spares(self, service: str) -> list[Record]:
+    def standbys(self, service: str) -> list[Record]:
         """Those of a service that run and are nobody's, oldest first."""
-        return self._look(sql.SPARES, service=service)
+        return self._look(sql.STANDBYS, service=service)
 
     def robots_at(self, site: str) -> frozenset[str]:
         """Robots of all instances at a site of which the store has a row, ended or not."""
@@ -270,14 +270,14 @@ class Store(GroupStore):
 
     def claim(self, asked: Change, now: float, owner: str, key: str | None, body_sha256: str) -> Record | None:
         """Give a standby to a robot; None if another was quicker, or what it would replace has a successor."""
-        spare = asked.record
-        changes = {**asked.columns, "version": spare.version + 1}
-        new = spare.after(changes)
+        standby = asked.record
+        changes = {**asked.columns, "version": standby.version + 1}
+        new = standby.after(changes)
         try:
             with self._writing() as connection:
                 if self._coming(connection, new.replaces) is not None:
                     return None
-                if connection.execute(sql.CHANGE, {**changes, **sql.as_seen(spare)}).rowcount == 0:
+                if connection.execute(sql.CHANGE, {**changes, **sql.as_seen(standby)}).rowcount == 0:
                     return None
                 if key is not None:
                     row = {"owner": owner, "key": key, "body_sha256": body_sha256, "instance": new.id}
@@ -310,7 +310,7 @@ class Store(GroupStore):
 
     def last_params(self, service: str) -> dict[str, Any] | None:
         """What the last robot that asked for a service asked for; None: nobody did."""
-        newest = select(instances.c.params).where(instances.c.service == service, instances.c.spare.is_(False))
+        newest = select(instances.c.params).where(instances.c.service == service, instances.c.standby.is_(False))
         with self._reader.connect() as connection:
             return connection.scalar(newest.order_by(instances.c.created_at.desc()).limit(1))
 
@@ -401,7 +401,7 @@ class Store(GroupStore):
             }
 
     def extend_leases(self, now: float, *, at_least: bool = False) -> None:
-        """Give every live instance its whole lease from now, no less and no more; spares keep theirs, which never ends.
+        """Give every live instance its whole lease from now, no less and no more; a standby keeps its own.
 
         For nobody could renew, or nobody can say when they did. ``at_least``: those that last longer stay as they are;
         for who does not lead, and may be late.
@@ -409,7 +409,7 @@ class Store(GroupStore):
         full: ColumnElement[float] = now + instances.c.lease_s
         if at_least:
             full = case((instances.c.lease_expires_at > full, instances.c.lease_expires_at), else_=full)
-        statement = update(instances).where(instances.c.state.not_in(sql.FINAL), instances.c.spare.is_(False))
+        statement = update(instances).where(instances.c.state.not_in(sql.FINAL), instances.c.standby.is_(False))
         with self._writing() as connection:
             connection.execute(statement.values(lease_expires_at=full, version=instances.c.version + 1))
 

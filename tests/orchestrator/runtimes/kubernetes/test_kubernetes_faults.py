@@ -233,12 +233,12 @@ def test_a_standby_is_given_out_without_a_start_and_a_service_that_is_not_well_i
     def warm() -> list[Instance]:
         return [one for one in scene.operator.instances() if not one.robot and one.state is State.RUNNING]
 
-    spare = until(warm)[0]
+    standby = until(warm)[0]
     pods = {one["metadata"]["uid"] for one in scene.pods()}
     given = scene.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=3600))
-    assert (given.id, given.state, given.restarts) == (spare.id, State.RUNNING, 0)
+    assert (given.id, given.state, given.restarts) == (standby.id, State.RUNNING, 0)
     assert pods <= {one["metadata"]["uid"] for one in scene.pods()}
-    until(lambda: [one for one in warm() if one.id != spare.id])
+    until(lambda: [one for one in warm() if one.id != standby.id])
     scene.put(standby=0)
     until(lambda: scene.running() == [given.id])
     (pod,) = [one for one in scene.pods() if one["metadata"]["labels"]["skytether.io/instance"] == given.id]
