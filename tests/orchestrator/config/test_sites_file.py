@@ -14,7 +14,7 @@ from skytether.orchestrator.access.access import Principal
 from skytether.orchestrator.config.settings import Settings
 from skytether.orchestrator.config.sites_file import read_sites
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.domain.errors import ForbiddenError, InvalidError
+from skytether.orchestrator.domain.errors import ForbiddenError, InvalidError, UnauthenticatedError
 from skytether.orchestrator.domain.security import new_token
 from skytether.orchestrator.runtimes.base import Observation, Phase
 from skytether.orchestrator.runtimes.docker import DockerRuntime
@@ -133,8 +133,10 @@ def test_without_that_file_nobody_has_such_a_token(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path}/state.db")
     store.close()
     core = Orchestrator(Settings(state_dir=tmp_path / "state"))
-    assert not core.access._secrets.may_measure("")
-    assert core.access._secrets.is_operator((tmp_path / "state" / "operator.token").read_text().strip())
+    core.store.migrate()
+    with pytest.raises(UnauthenticatedError):
+        core.access.verify("")
+    assert core.access.verify((tmp_path / "state" / "operator.token").read_text().strip()).owns_state
     assert Principal(None).owns_state
     core.store.close()
 

@@ -517,6 +517,7 @@ def test_a_leader_that_was_overtaken_changes_nothing(made: Made) -> None:
     bench.ask("a")
     with bench.store._engine.begin() as connection:
         connection.execute(text("UPDATE leadership SET epoch = 2"))
-    bench.scaler._lead = Deposed()
+    bench.lead = Deposed()
+    bench.restart()
     bench.step(3)
     assert (bench.store.machines(), bench.cloud.orders) == ([], [])
