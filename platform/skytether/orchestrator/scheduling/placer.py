@@ -19,7 +19,7 @@ from ..domain.records import Record
 from ..runtimes.base import Capacity
 from ..store.leader import ALONE, Lead
 from ..store.store import Store
-from .placement import UNSTARTED, Decision, Prospect, lacks, place
+from .placement import UNSTARTED, Candidate, Decision, Prospect, lacks, place
 from .promises import NOTHING, Promises, Sums
 from .site import Site
 from .sites import Sites
@@ -79,28 +79,7 @@ class Placer:
         if promised is None:
             promised = Promises(self._store.live()).sums(self._leaving())
         measured = {site: Measurement.model_validate(m) for site, m in record.measurements.items()}
-        allowed = [site for site in self._sites.all() if self._allows(record, site)]
-        tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
-        now = self._steady()
-        sites = [
-            site.candidate(
-                record.spec,
-                promised.get(site.name, NOTHING).capacity,
-                tried.get(site.name),
-                None if record.pinned else site.fitness.objection(record, now),
-            )
-            for site in allowed
-        ]
-        most = self._site_instances
-        if self._disk_usage is not None:
-            full = self._disk_usage.full()
-            sites = [replace(s, full=full[s.name]) if s.name in full else s for s in sites]
-        sites = [
-            replace(s, full=f"{there} instances are there, and {most} may be (quotas.site_instances)")
-            if (there := promised.get(s.name, NOTHING).instances) >= most
-            else s
-            for s in sites
-        ]
+        sites = self._candidates(record, promised)
         if runs:
             sites = [replace(site, blocked=None, unfit=None) for site in sites]
         spec = record.spec
@@ -113,6 +92,25 @@ class Placer:
             refused=(*decision.refused, *(prospect.refusal for prospect in prospects)),
             hopeless=decision.hopeless and all(prospect.hopeless for prospect in prospects),
         )
+
+    def _candidates(self, record: Record, promised: Sums) -> list[Candidate]:
+        """Sites where it may be, as they are now."""
+        tried = {refusal["site"]: refusal["detail"] for refusal in record.refused if refusal["reason"] == UNSTARTED}
+        full = self._disk_usage.full() if self._disk_usage is not None else {}
+        now, most, found = self._steady(), self._site_instances, list[Candidate]()
+        for site in self._sites.all():
+            if not self._allows(record, site):
+                continue
+            has = promised.get(site.name, NOTHING)
+            unfit = None if record.pinned else site.fitness.objection(record, now)
+            one = site.candidate(record.spec, has.capacity, tried.get(site.name), unfit)
+            if has.instances >= most:
+                text = f"{has.instances} instances are there, and {most} may be (quotas.site_instances)"
+                one = replace(one, full=text)
+            elif site.name in full:
+                one = replace(one, full=full[site.name])
+            found.append(one)
+        return found
 
     def _allows(self, record: Record, site: Site) -> bool:
         """One that replaces another does not go where that is.

@@ -150,15 +150,53 @@ class Reconciler:
         if whole:
             before = self._store.robots_at(site.name) if site.hosted is None else site.hosted
             site.hosted = before | {record.robot for record in live}
+        due = whole and time.monotonic() - site.tidied_at >= _TIDY
+        ids = {record.id for record in live}
+        looked = self._look(site, ids, led, whole=whole, due=due)
+        if looked is None:
+            return self._timing.place
+        self._keep_seen(site, live, looked, whole=whole)
+        if not self._leases.leads():
+            return self._timing.observe
+        now = self._leases.now()
+        if times_set != self._leases.times_set:
+            return 0.0  # what was read is dated by another clock
+        if site.seen_since is None or site.seen_since[0] != times_set:
+            site.seen_since = (times_set, now)
+        if whole:
+            site.ended = self._ended_of(looked.keys() - ids, frozenset() if due else site.ended)
+            looked = self._bounded(site, live, looked)
+        live = self._service_events.keep(live, looked, now)
+        actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
+        if whole:
+            site.pass_took = time.thread_time() - began
+        done = self._act_on(site, actions)
+        if whole and not site.balks:
+            self._resizing.keep(site, live, looked, now)
+        if due:
+            self._tidy(site)
+        if site.balks:
+            return self._timing.place  # it is not asked again and again what it does not do
+        changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
+        changing -= {action.record.id for action in done if isinstance(action, Ready | End)}
+        if len(done) == len(actions):
+            site.awaited = changing
+            if whole:
+                site.passed_at = site.watched_at = self._steady()
+        return self._timing.observe_changing if actions or changing else self._timing.observe
+
+    def _look(self, site: Site, ids: Set[str], led: int, *, whole: bool, due: bool) -> Mapping[str, Observation] | None:
+        """What is at a site: all of it, or these only; None: it does not answer, and is noted as silent.
+
+        ``led``: the epoch that it is to be told first; 0: none.
+        """
         try:
             if led and site.led != led:
                 site.runtime.lead(led)
                 site.led, site.ended, site.seen_since = led, frozenset(), None
                 site.fitness.forget()
-            due = whole and time.monotonic() - site.tidied_at >= _TIDY
             if site.capacity is None or due:
                 site.capacity = believable(site.runtime.capacity())  # nodes come and go
-            ids = {record.id for record in live}
             if whole:
                 site.runtime.expect(len(ids))
             looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
@@ -173,45 +211,26 @@ class Reconciler:
             site.capacity = site.load = None  # it may come back as another machine
             site.seen_since = None
             site.passed_at = -math.inf
-            return self._timing.place
+            return None
+        return looked
+
+    def _keep_seen(self, site: Site, live: Sequence[Record], looked: Mapping[str, Observation], *, whole: bool) -> None:
+        """From now on this is what is known of the site; what runs had used that are over is counted."""
         if self._leases.leads():
             for record, seen in _ended(live, site.observed, looked):
                 self._store.count(record, [of_run(record, seen)])
+        ids = {record.id for record in live}
         others = {} if whole else {i: seen for i, seen in site.observed.items() if i not in ids}
         site.observed, site.failure, site.looked_at = {**others, **looked}, "", time.monotonic()
         site.leaving = {i: seen.leaving for i, seen in site.observed.items() if seen.leaving}
-        if not self._leases.leads():
-            return self._timing.observe
-        now = self._leases.now()
-        if times_set != self._leases.times_set:
-            return 0.0  # what was read is dated by another clock
-        if site.seen_since is None or site.seen_since[0] != times_set:
-            site.seen_since = (times_set, now)
-        if whole:
-            site.ended = self._ended_of(looked.keys() - ids, frozenset() if due else site.ended)
-        looked = self._bounded(site, live, looked) if whole else looked
-        live = self._service_events.keep(live, looked, now)
-        actions = plan(live, looked, site.ended, now, self._timing, site.seen_since[1])
-        if whole:
-            site.pass_took = time.thread_time() - began
-        done = self._act_on(site, actions)
-        if whole and not site.balks:
-            self._resizing.keep(site, live, looked, now)
-        if due:
-            site.tidied_at = time.monotonic()
-            try:
-                site.runtime.tidy()
-            except RuntimeFailure as error:
-                log.warning("site %s: %s", site.name, error)
-        if site.balks:
-            return self._timing.place  # it is not asked again and again what it does not do
-        changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
-        changing -= {action.record.id for action in done if isinstance(action, Ready | End)}
-        if len(done) == len(actions):
-            site.awaited = changing
-            if whole:
-                site.passed_at = site.watched_at = self._steady()
-        return self._timing.observe_changing if actions or changing else self._timing.observe
+
+    @staticmethod
+    def _tidy(site: Site) -> None:
+        site.tidied_at = time.monotonic()
+        try:
+            site.runtime.tidy()
+        except RuntimeFailure as error:
+            log.warning("site %s: %s", site.name, error)
 
     def _bounded(
         self, site: Site, live: Sequence[Record], looked: Mapping[str, Observation]
