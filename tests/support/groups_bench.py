@@ -9,17 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from reconcile_bench import Passes
-
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Limits, Timing, Weights
 from skytether.orchestrator.domain.records import Change, Record
+from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.groups.demand import Demand
 from skytether.orchestrator.groups.groups import Groups
 from skytether.orchestrator.groups.scaler import Scaler
 from skytether.orchestrator.providers.base import Invitation, Provider
 from skytether.orchestrator.runtimes.base import Capacity, Runtime, RuntimeFailure
+from skytether.orchestrator.scheduling.catalog import Catalog
+from skytether.orchestrator.scheduling.passes import Passes
 from skytether.orchestrator.scheduling.placer import Placer
 from skytether.orchestrator.scheduling.site import Site
 from skytether.orchestrator.scheduling.sites import Sites
@@ -68,7 +69,19 @@ class GroupsBench:
             prospects=lambda record: self.demand.prospects(record),
         )
         self.passes = Passes(
-            self.folder, store, self.sites, self.placer, self.metrics, clock, lambda: None, Limits(), self.lead
+            store,
+            Catalog(store),
+            self.sites,
+            self.placer,
+            Secrets(self.folder),
+            self.metrics,
+            Timing(),
+            Limits(),
+            Weights(),
+            clock,
+            lambda: None,
+            self.lead,
+            clock.steady,
         )
         self.demand: Demand = Demand(
             store, lambda: self.groups, lambda: self.sites, self.placer.promised, clock, Weights(), steady=clock.steady

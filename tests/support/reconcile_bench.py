@@ -12,20 +12,14 @@ from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.scheduling.catalog import Catalog
-from skytether.orchestrator.scheduling.leases import Leases
-from skytether.orchestrator.scheduling.placement_pass import PlacementPass
+from skytether.orchestrator.scheduling.passes import Passes
 from skytether.orchestrator.scheduling.placer import Placer
-from skytether.orchestrator.scheduling.reconcile import Reconciler
+from skytether.orchestrator.scheduling.reconcile import PLENTY
 from skytether.orchestrator.scheduling.site import Site
-from skytether.orchestrator.scheduling.sites import Sites
-from skytether.orchestrator.scheduling.standbys import Standbys
-from skytether.orchestrator.scheduling.successors import Successors
 from skytether.orchestrator.store.leader import ALONE, Lead
 from skytether.orchestrator.store.store import Store
 from skytether.orchestrator.telemetry.metrics import Metrics
 from skytether.testing.runtimes import FakeOptions, FakeRuntime
-
-PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
 
 
 class FixedSites:
@@ -51,38 +45,6 @@ class FixedSites:
         """None is drained."""
 
 
-class Passes:
-    """The placement pass and the pass over a site, with what they share, over sites that are there."""
-
-    def __init__(
-        self,
-        folder: Path,
-        store: Store,
-        sites: Sites,
-        placer: Placer,
-        metrics: Metrics,
-        clock: Any,
-        wake_placer: Callable[[], None],
-        limits: Limits,
-        lead: Lead = ALONE,
-        overload: Overload | None = None,
-        left: Callable[[str], Size] = lambda _: PLENTY,
-    ) -> None:
-        timing, weights = Timing(), Weights()
-        self.standbys = Standbys(store, Catalog(store), sites, placer, clock, timing, weights)
-        self.successors = Successors(store, sites, placer, self.standbys, clock, timing, weights)
-        self.leases = Leases(store, clock, timing.place, self._forget, lead, clock.steady, overload)
-        both = self.leases, self.standbys, self.successors, metrics, timing
-        self.placement = PlacementPass(store, sites, placer, *both, limits, clock, clock.steady)
-        self.reconciler = Reconciler(
-            store, Secrets(folder), placer, *both, clock, wake_placer, lead, clock.steady, left=left
-        )
-
-    def _forget(self) -> None:
-        self.standbys.clock_was_set()
-        self.successors.clock_was_set()
-
-
 class Bench:
     """Passes over one site, ``lab``; a test may add others."""
 
@@ -104,17 +66,21 @@ class Bench:
         sites: Any = self.sites
         self.placer = Placer(self.store, sites, Weights(), self.lead, self.clock.steady)
         passes = Passes(
-            self.folder,
             self.store,
+            Catalog(self.store),
             sites,
             self.placer,
+            Secrets(self.folder),
             self.metrics,
+            Timing(),
+            self.limits,
+            Weights(),
             self.clock,
             self._wake,
-            self.limits,
             self.lead,
+            self.clock.steady,
             self.overload,
-            lambda robot: self.left(robot),
+            left=lambda robot: self.left(robot),
         )
         self.placement, self.reconciler, self.leases = passes.placement, passes.reconciler, passes.leases
         self.standbys, self.successors = passes.standbys, passes.successors

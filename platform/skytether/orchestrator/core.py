@@ -42,15 +42,11 @@ from .runtimes.base import Runtime
 from .scheduling.catalog import Catalog
 from .scheduling.events import Broker
 from .scheduling.instances import Instances
-from .scheduling.leases import Leases
 from .scheduling.loops import Loop
-from .scheduling.placement_pass import PlacementPass
+from .scheduling.passes import Passes
 from .scheduling.placer import Placer
-from .scheduling.reconcile import Reconciler
 from .scheduling.runtime_entry_points import load_runtime
 from .scheduling.sites import Sites
-from .scheduling.standbys import Standbys
-from .scheduling.successors import Successors
 from .store.engine import GONE
 from .store.leader import Leadership
 from .store.store import Store
@@ -117,7 +113,7 @@ class Orchestrator:
             lambda: self.leadership.epoch,
             self._group_gauges,
         )
-        self.leadership = Leadership(self.store.lock(), lambda: self._leases.owe())
+        self.leadership = Leadership(self.store.lock(), lambda: self._passes.leases.owe())
         self.catalog = Catalog(self.store, settings.catalog)
         self.overload = Overload()
         limiter = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
@@ -126,7 +122,7 @@ class Orchestrator:
         self.sites: Sites = Sites(
             settings.state_dir / "sites",
             self.store,
-            self._unless_outdated(lambda site: self.reconciler.site_turn(site)),
+            self._unless_outdated(lambda site: self._passes.reconciler.site_turn(site)),
             settings.timing,
             find_runtime,
         )
@@ -139,43 +135,24 @@ class Orchestrator:
             disk_usage=self.disk_usage,
             prospects=lambda record: demand.prospects(record),
         )
-        standbys = Standbys(self.store, self.catalog, self.sites, placer, clock, settings.timing, settings.weights)
-        successors = Successors(self.store, self.sites, placer, standbys, clock, settings.timing, settings.weights)
-
-        def forget() -> None:
-            standbys.clock_was_set()
-            successors.clock_was_set()
-
-        self._leases: Leases = Leases(
-            self.store, clock, settings.timing.place, forget, self.leadership, overload=self.overload
-        )
-        placement = PlacementPass(
+        passes: Passes = Passes(
             self.store,
+            self.catalog,
             self.sites,
             placer,
-            self._leases,
-            standbys,
-            successors,
+            secrets,
             self.metrics,
             settings.timing,
             settings.limits,
-            clock,
-        )
-        self.reconciler: Reconciler = Reconciler(
-            self.store,
-            secrets,
-            placer,
-            self._leases,
-            standbys,
-            successors,
-            self.metrics,
-            settings.timing,
+            settings.weights,
             clock,
             self._wake_placer,
             self.leadership,
+            overload=self.overload,
             disk_usage=self.disk_usage,
             left=self.quotas.left,
         )
+        self._passes: Passes = passes
         self.authority: Authority | None = None
         self.nodes: Enrolment | None = None
         """Machines that joined; None: none can."""
@@ -200,7 +177,7 @@ class Orchestrator:
             self.store,
             lambda: self.groups,
             lambda: self.sites,
-            successors,
+            passes.successors,
             demand,
             self.leadership,
             clock,
@@ -215,7 +192,7 @@ class Orchestrator:
             find_provider,
             invites.lacks,
         )
-        self.placer = Loop("placer", self._unless_outdated(placement.turn), time.monotonic)
+        self.placer = Loop("placer", self._unless_outdated(passes.placement.turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
         self.elector = Loop("elector", self._elect, time.monotonic)
         self.instances = Instances(
@@ -223,8 +200,8 @@ class Orchestrator:
             self.catalog,
             self.sites,
             placer,
-            standbys,
-            successors,
+            passes.standbys,
+            passes.successors,
             self.metrics,
             self.reports,
             self.gates,

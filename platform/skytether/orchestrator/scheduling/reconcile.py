@@ -62,7 +62,8 @@ _ACTING = 0.5
 """Seconds for which a pass over a site acts, at most: of a crowd some are ready before the last ones are started."""
 _BALKS = 5
 """Acts in a row that a site did not answer, after which a pass asks it for nothing more: nor would it answer that."""
-_PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
+PLENTY = Size(cpu=1e9, memory_mb=1_000_000_000)
+"""More than any robot may have."""
 
 
 class Reconciler:
@@ -83,7 +84,7 @@ class Reconciler:
         lead: Lead = ALONE,
         steady: Callable[[], float] = time.monotonic,
         disk_usage: DiskUsage | None = None,
-        left: Callable[[str], Size] = lambda _: _PLENTY,
+        left: Callable[[str], Size] = lambda _: PLENTY,
     ) -> None:
         """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets.
 
