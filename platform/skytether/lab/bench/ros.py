@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 
 from .pair import LOOPBACK, BenchError, free_port
-from .ros2_node import Node, check_python
+from .ros2_node import Node, check_python, ros2_python
 from .ros2_program.schedule import Order
 from .rows import percentiles_ms
 from .traffic import Flow
@@ -36,7 +36,10 @@ _TYPES = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
 }
 PLAIN, BRIDGED = "plain", "skytether"
+_ROLES = ("service", "robot")
 _ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+_DEPTH = 10
+"""Of all queues: ROS 2's default."""
 _LEAD_S = 0.1
 _WARM_UP_S = 0.5
 _TRY_S = 0.3
@@ -87,14 +90,16 @@ class RosRow:
 class _Scene:
     talker: Node
     listener: Node
-    ends: tuple[psutil.Process, ...]
+    ends: tuple[psutil.Process, ...] = ()
+    logs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """Of one order: messages sent, delays [s] of those that arrived, processor seconds of both nodes, of each end."""
+    """What came of one order: kinds of message that arrived, delays [s], processor seconds of nodes and ends."""
 
     seconds: float
+    kinds: set[int]
     sent: int
     delays: tuple[float, ...]
     nodes_s: float
@@ -125,7 +130,7 @@ def bench_ros(
                 for index, flow in enumerate(MESSAGES):
                     on_progress(f"{way}: {flow.name} at {flow.hz:g} Hz")
                     rows.append(_row(way, index, _run(scene, [index], seconds, _WARM_UP_S), rest))
-    except TransportError as error:
+    except (TransportError, psutil.Error) as error:
         raise BenchError(str(error)) from error
     return rows
 
@@ -136,9 +141,9 @@ def _scene(way: str) -> Iterator[_Scene]:
         folder = undo.enter_context(tempfile.TemporaryDirectory(prefix="skytether-bench-"))
         # Whoever else measures here is in other domains.
         domains = (first := 2 * (os.getpid() % 50), first if way == PLAIN else first + 1)
-        ends: tuple[psutil.Process, ...] = ()
+        ends: list[psutil.Process] = []
         if way == BRIDGED:
-            ends = tuple(undo.enter_context(_bridge_ends(Path(folder), domains)))
+            ends = undo.enter_context(_bridge_ends(Path(folder), domains))
         numbers = list(range(len(MESSAGES)))
         made = []
         for name, domain, sends, receives in (
@@ -147,7 +152,8 @@ def _scene(way: str) -> Iterator[_Scene]:
         ):
             made.append(Node(_wanted(domain, sends, receives), folder, name, _ALONE))
             undo.callback(made[-1].stop)
-        yield _Scene(made[0], made[1], ends)
+        logs = (Path(folder) / f"{role}.log" for role in _ROLES) if ends else ()
+        yield _Scene(made[0], made[1], tuple(ends), tuple(logs))
 
 
 def _wanted(domain: int, sends: list[int], receives: list[int]) -> dict[str, Any]:
@@ -161,13 +167,13 @@ def _bridge_ends(folder: Path, domains: tuple[int, int]) -> Iterator[list[psutil
     program = [sys.executable, "-m", "skytether.cli", "bridge"]
     subprocess.run([*program, "--new-key", str(folder / "bridge.key")], check=True, capture_output=True)
     address = {"host": LOOPBACK, "port": free_port()}
-    topics = [{"name": f.name.lower(), "type": _TYPES[f.name], "direction": "in"} for f in MESSAGES]
+    topics = [{"name": f.name.lower(), "type": _TYPES[f.name], "direction": "in", "depth": _DEPTH} for f in MESSAGES]
     common = {"id": "00000000000000ff", "key_file": "bridge.key", "topics": topics}
     with ExitStack() as undo:
         ends = []
-        for role, where, domain in (("service", "bind", domains[1]), ("robot", "peer", domains[0])):
+        for role, where, domain in zip(_ROLES, ("bind", "peer"), reversed(domains), strict=True):
             config = folder / f"{role}.yaml"
-            graph = {"domain": domain, "namespace": "/bench"}
+            graph = {"domain": domain, "namespace": "/bench", "python": ros2_python()}
             config.write_text(json.dumps({"role": role, where: address, "ros2": graph, **common}))  # YAML, too
             log = undo.enter_context((folder / f"{role}.log").open("w"))
             process = subprocess.Popen(
@@ -185,16 +191,15 @@ def _wait(scene: _Scene) -> None:
     for node in (scene.talker, scene.listener):
         while not node.connected():
             _look(scene, deadline)
-    missing = set(range(len(MESSAGES)))
-    while missing:
+    indices = list(range(len(MESSAGES)))
+    while _run(scene, indices, _TRY_S, 0.0).kinds != set(indices):
         _look(scene, deadline)
-        for index in sorted(missing):
-            missing -= {index} if _run(scene, [index], _TRY_S, 0.0).delays else set()
 
 
 def _look(scene: _Scene, deadline: float) -> None:
-    if not all(end.is_running() and end.status() != psutil.STATUS_ZOMBIE for end in scene.ends):
-        raise BenchError("an end of the bridge ended; see `skytether bridge` with dialect rclpy")
+    for end, log in zip(scene.ends, scene.logs, strict=True):
+        if not end.is_running() or end.status() == psutil.STATUS_ZOMBIE:
+            raise BenchError(f"an end of the bridge ended: {log.read_text().strip()}")
     if time.monotonic() > deadline:
         raise BenchError(f"talker and listener did not find each other within {_CONNECT_S:.0f} s")
     time.sleep(_LOOK_S)
@@ -238,7 +243,7 @@ def _run(scene: _Scene, indices: list[int], seconds: float, warm_up: float) -> _
     sent = [(i, n) for i in indices for n, at in enumerate(talker.sent[i]) if order.start <= at < order.end]
     arrived = {(i, n): now - at for i in indices for n, at, now in listener.received[i]}
     delays = tuple(arrived[message] for message in sent if message in arrived)
-    return _Seen(seconds, len(sent), delays, talker.cpu_s + listener.cpu_s, ends_s)
+    return _Seen(seconds, {i for i, _ in arrived}, len(sent), delays, talker.cpu_s + listener.cpu_s, ends_s)
 
 
 def _cpu_s(process: psutil.Process) -> float:
