@@ -2,9 +2,10 @@ import pytest
 
 from skytether.api.config_file import ConfigError
 from skytether.robot.config.gate_config import load_safety
-from skytether.robot.config.robot_config import DEFAULT_MASTER, load_config, load_token
+from skytether.robot.config.robot_config import load_config, load_token
 from skytether.robot.control.arbiter import Needs
 from skytether.ros.permissions import Allowed
+from skytether.ros.ros1.config import DEFAULT_MASTER
 
 LEAST = """
 robot: walker

@@ -28,9 +28,8 @@ from skytether.robot.safety.protected import protected_names as safety_names
 from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
 from skytether.ros.permissions import Access, Allowed, Permissions
 from skytether.ros.ros1.arguments import RosArguments
-from skytether.ros.ros2.config import Ros2Graph
-
-DEFAULT_MASTER = "http://localhost:11311"
+from skytether.ros.ros1.config import Ros1Link
+from skytether.ros.ros2.config import Ros2Graph, Ros2Velocity
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
@@ -96,26 +95,15 @@ class GraphConfig(Strict):
                 raise ValueError(f"{key}: {error}") from None
 
 
-class Ros1Config(GraphConfig):
+class Ros1Config(GraphConfig, Ros1Link):
     """A ROS 1 graph."""
 
-    master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
-    """Address of the master; without it ``ROS_MASTER_URI``, or this machine's."""
-    host: str | None = None
-    """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
     node: Annotated[str, Field(min_length=1)] = "skytether"
     """Name of the node; below the robot's namespace unless it is absolute."""
     params: tuple[str, ...] = ()
     """Parameters that the service's graph gets, by name or namespace: ``/robot_description``."""
     use_sim_time: bool | None = None
     """Whether /clock tells the time; null: as the master's parameter /use_sim_time says."""
-
-    @field_validator("master")
-    @classmethod
-    def _an_address(cls, uri: str) -> str:
-        if not uri.startswith("http://"):
-            raise ValueError(f"must be an address such as {DEFAULT_MASTER}, not '{uri}'")
-        return uri
 
     @model_validator(mode="after")
     def _names_are_legal(self) -> Ros1Config:
@@ -132,13 +120,8 @@ class Ros1Config(GraphConfig):
         return self
 
 
-class Ros2Config(GraphConfig, Ros2Graph):
+class Ros2Config(GraphConfig, Ros2Graph, Ros2Velocity):
     """A ROS 2 graph."""
-
-    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
-    """What the wheels take; nav2 and ros2_control have stamped velocities from Jazzy on."""
-    frame: str = "base_link"
-    """Coordinate frame of stamped velocities."""
 
     @model_validator(mode="after")
     def _names_are_legal(self) -> Ros2Config:

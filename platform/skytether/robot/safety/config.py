@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -16,7 +15,8 @@ from skytether.guard.kinematics import Bounds
 from skytether.messages import Bool, Message, String
 from skytether.robot.control.supervisor import Limits
 from skytether.ros.names import check_name, resolve
-from skytether.ros.ros2.join import Way, check_keys
+from skytether.ros.ros1.config import Ros1Link
+from skytether.ros.ros2.config import Ros2Link, Ros2Velocity
 
 from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
@@ -35,8 +35,6 @@ from .sensor_config import ContactConfig, SensorConfig, UnseenConfig
 from .source_config import SourcesConfig
 from .stopping import Stages, shortfall
 from .zones import ZoneParams
-
-DEFAULT_MASTER = "http://localhost:11311"
 
 
 class SocketsConfig(Numbers):
@@ -57,12 +55,9 @@ class SocketsConfig(Numbers):
         return text
 
 
-class Ros1Way(Numbers):
+class Ros1Way(Numbers, Ros1Link):
     """A robot that is a ROS 1 graph: names are absolute, or in ``namespace``."""
 
-    master: str = Field(default_factory=lambda: os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER)
-    host: str | None = None
-    """Address of this machine that other nodes can reach; null: ROS_HOSTNAME, ROS_IP, or found out."""
     namespace: str = "/"
     node: Topic = "skytether"
     """The nodes are called so, in ``namespace``, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
@@ -75,35 +70,17 @@ class Ros1Way(Numbers):
         return check_name(name)
 
 
-class Ros2Way(Numbers):
-    """A robot that is a ROS 2 graph; the keys are those of the section ``ros2``."""
+class Ros2Way(Numbers, Ros2Link, Ros2Velocity):
+    """A robot that is a ROS 2 graph. Its nodes are called ``node`` with ``_guard``, ``_gate``, ``_sensors`` after."""
 
-    dialect: Way = "rclpy"
-    python: str | None = None
-    ros_args: tuple[str, ...] = ()
-    router: Annotated[str, Field(pattern=r"^[a-z]+/.+")] | None = None
-    zenoh_config: Path | None = None
-    domain: Annotated[int, Field(ge=0, le=232)] | None = None
-    type_hashes: bool = True
-    bridge_namespace: str = "/"
     namespace: str = "/"
-    node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
-    """The nodes are called so, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
     cmd_vel: Topic = "cmd_vel"
     """What the wheels listen to; nobody else may publish it."""
-    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
-    frame: str = "base_link"
-    """Coordinate frame of stamped velocities."""
 
-    @field_validator("namespace", "bridge_namespace", "cmd_vel")
+    @field_validator("namespace", "cmd_vel")
     @classmethod
     def _a_name(cls, name: str) -> str:
         return check_name(name, 2)
-
-    @model_validator(mode="after")
-    def _keys_of_one_way(self) -> Self:
-        check_keys(self, self.zenoh_config)
-        return self
 
 
 class SafetyConfig(SourcesConfig):

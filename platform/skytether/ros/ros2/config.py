@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -21,8 +21,8 @@ from .seam import GraphNode, Ros2Error
 _EXTRA = "a ROS 2 graph with a Zenoh router needs the extra 'ros2': pip install 'skytether[ros2]'"
 
 
-class Ros2Graph(Strict):
-    """A ROS 2 graph: of the ROS 2 on this machine, or by its Zenoh router."""
+class Ros2Link(Strict):
+    """How a ROS 2 graph is joined: as one of the ROS 2 on this machine, or by its Zenoh router."""
 
     dialect: Way = "rclpy"
     """``rclpy``: as a node of the ROS 2 that is installed, with its RMW. Without ROS 2 on this machine, by a Zenoh
@@ -46,8 +46,6 @@ class Ros2Graph(Strict):
     """The ``namespace`` that zenoh-bridge-ros2dds is configured with; of ``ros2dds``."""
     node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
     """Name of our node in the graph."""
-    parameters: dict[str, dict[str, Any]] = {}
-    """Values that nodes of the graph get whenever they show up, by the node's full name and the parameter's."""
 
     @field_validator("bridge_namespace")
     @classmethod
@@ -58,6 +56,22 @@ class Ros2Graph(Strict):
     def _keys_of_one_way(self) -> Self:
         check_keys(self, self.zenoh_config)
         return self
+
+
+class Ros2Graph(Ros2Link):
+    """A ROS 2 graph."""
+
+    parameters: dict[str, dict[str, Any]] = {}
+    """Values that nodes of the graph get whenever they show up, by the node's full name and the parameter's."""
+
+
+class Ros2Velocity(Strict):
+    """What the wheels of a ROS 2 graph take."""
+
+    cmd_vel_type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"] = "geometry_msgs/msg/Twist"
+    """nav2 and ros2_control have stamped velocities from Jazzy on."""
+    frame: str = "base_link"
+    """Coordinate frame of stamped velocities."""
 
 
 def need_extra() -> None:
