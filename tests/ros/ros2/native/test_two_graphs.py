@@ -5,8 +5,8 @@ import time
 import pytest
 from networks import Program
 from ros2_nodes import far_nodes, ros2_nodes
-from skytether.emulator.link_model import LinkConditions
 
+from skytether.emulator.link_model import LinkConditions
 from skytether.lab.tun import ROBOT, SERVICE, TunEmulator
 
 __all__ = ["far_nodes", "ros2_nodes"]
