@@ -244,11 +244,16 @@ def test_a_rebind_gives_clients_a_new_address_at_the_target(udp):
     with LinkEmulator(target.getsockname()) as link:
         client.sendto(b"1", link.address)
         _, before = target.recvfrom(10)
+        after = before
         link.rebind()
-        wait_for(lambda: not link._clients)
-        client.sendto(b"2", link.address)
-        _, after = target.recvfrom(10)
-        assert after != before
+
+        def moved():
+            nonlocal after
+            client.sendto(b"2", link.address)
+            _, after = target.recvfrom(10)
+            return after != before
+
+        wait_for(moved)
         target.sendto(b"hello", after)
         assert client.recv(10) == b"hello"
 

@@ -375,11 +375,11 @@ class Nemesis:
         for fault in reversed(faults):
             fault.heal()
         self._history.add("fault", fault=told, step="heal")
-        well = wait_for(self._well, _PATIENCE)
+        well = wait_for(self.well, _PATIENCE)
         time.sleep(_REST_S)
         self._history.add("fault", fault=told, step="over", well=well)
 
-    def _well(self) -> bool:
+    def well(self) -> bool:
         """What has ended is started again, as a supervisor of services does."""
         for member in self._cluster.members:
             if not member.runs:

@@ -78,10 +78,10 @@ def test_orchestrators_that_ended_are_started_again() -> None:
     made: Any = Cluster()
     nemesis = Nemesis(made, made, History(), 1)
     FAULTS["rolling-restart"](made, made, random.Random(1)).begin()
-    assert not nemesis._well()
+    assert not nemesis.well()
     assert [member.runs for member in made.members] == [False] * 3
     made.database_is_back()
-    assert nemesis._well()
+    assert nemesis.well()
     assert [member.runs for member in made.members] == [True] * 3
 
 

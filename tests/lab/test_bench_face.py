@@ -27,7 +27,7 @@ def test_a_head_that_turns_is_seen_to_turn(gl: None, monkeypatch: pytest.MonkeyP
 
 
 def test_without_a_face_there_is_no_error_to_tell() -> None:
-    nothing = bench._row([math.nan], [look([_grey()], 1.0)[0]])
+    nothing = bench.row_of([math.nan], [look([_grey()], 1.0)[0]])
     assert nothing["detected_percent"] == 0
     assert nothing["yaw_error_mean_deg"] is None
 

@@ -14,7 +14,7 @@ def test_nothing_is_lost_in_accounting():
     row = bench_fleet(LEAST_ROBOTS, 4)
     assert (row.lost_in_accounting, row.miscounted, row.fallen, row.left_over) == (0, 0, 0, 0)
     assert row.messages > 3000  # of four seconds of Table 4: some 600 a robot
-    assert row.renewals > LEAST_ROBOTS * fleet._PHASES
+    assert row.renewals > LEAST_ROBOTS * fleet.PHASES
 
 
 @pytest.mark.slow

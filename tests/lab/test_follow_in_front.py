@@ -96,7 +96,7 @@ def test_figures_are_drawn_also_of_trials_that_lack_things(tmp_path: Path) -> No
 
 
 def test_a_run_of_kept_trials_only_prints_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "_width", 200)  # whatever the environment said when it was made
+    monkeypatch.setattr(console, "width", 200)  # whatever the environment said when it was made
     file = tmp_path / "trials.jsonl"
     settings = replace(SCENARIOS["edge"], params={"predict": True})
     KeptTrials(file, FollowResult).put(FollowSettings(settings).document(), RESULT)

@@ -383,10 +383,7 @@ def test_a_result_that_is_asked_for_again_and_again_takes_no_room() -> None:
     harness, client = served("cdr")
     goal_id, goal = sent(harness, client)
     goal.accept()
-    asked = []
-    for _ in range(MAX_ASKED + 1):
-        client.ask_result(goal_id)
-        asked.append(client._results[goal_id])
+    asked = [client.ask_result(goal_id) for _ in range(MAX_ASKED + 1)]
     with pytest.raises(CallError, match="asked for again"):
         asked[0].result(0)
     goal.succeed()
@@ -398,7 +395,7 @@ def test_a_service_that_ends_leaves_nobody_waiting() -> None:
     goal_id, goal = sent(harness, client)
     goal.accept()
     assert client.end(goal_id) is None
-    harness._port.close()
+    harness.port.close()
     assert client.end(goal_id) == ("failed", "the service ends", None)
     goal.succeed()  # nobody is told any more, and nothing breaks
 

@@ -73,13 +73,13 @@ def test_what_can_go_wrong_is_said() -> None:
     harness.disconnect()
     with pytest.raises(CallError, match="no robot is there"):
         harness.service.go.ask(TriggerRequest()).result(0)
-    waiting = harness._port.desk.ask("switch", b"nonsense", "cdr")
-    harness._port.desk.work()
+    waiting = harness.port.desk.ask("switch", b"nonsense", "cdr")
+    harness.port.desk.work()
     with pytest.raises(CallError, match="are no std_srvs/srv/SetBool_Request"):
         waiting.result(0)
-    waiting = harness._port.desk.ask("switch", b"", "cdr")
-    harness._port.close()
-    for late in (waiting, harness._port.desk.ask("switch", b"", "cdr")):
+    waiting = harness.port.desk.ask("switch", b"", "cdr")
+    harness.port.close()
+    for late in (waiting, harness.port.desk.ask("switch", b"", "cdr")):
         with pytest.raises(CallError, match="the service ends"):
             late.result(0)
 
@@ -91,9 +91,9 @@ def test_a_handler_that_breaks_ends_the_service_and_the_robot_is_told() -> None:
             raise ZeroDivisionError
 
     harness = Harness(Broken)
-    waiting = harness._port.desk.ask("switch", encode(SetBoolRequest()), "cdr")
+    waiting = harness.port.desk.ask("switch", encode(SetBoolRequest()), "cdr")
     with pytest.raises(ZeroDivisionError):
-        harness._port.desk.work()
+        harness.port.desk.work()
     with pytest.raises(CallError, match="its handler failed: ZeroDivisionError"):
         waiting.result(0)
 

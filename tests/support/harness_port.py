@@ -39,14 +39,14 @@ class HarnessPort:
             publisher.answer(name, partial(self._answer, name))
 
     def deliver(self, message: MessageReceived) -> None:
-        self._harness._port.deliver(message)
+        self._harness.port.deliver(message)
 
     def notify(self, event: Event) -> None:
         pass
 
     def _answer(self, name: str, request: bytes) -> bytes:
         try:
-            return self._harness._port.desk.ask(name, request, self._harness.encoding).result()
+            return self._harness.port.desk.ask(name, request, self._harness.encoding).result()
         except Refused as error:
             raise CallError(str(error)) from error
 

@@ -49,7 +49,8 @@ def files(values: Values, kube: str = NEWEST, apis: tuple[str, ...] = (), *, upg
     asked: Values = {"name": "demo", "namespace": "ns", "kube_version": kube, "api_versions": list(apis)}
     asked |= {"is_install": not upgrade, "is_upgrade": upgrade}
     # `Chart.render` has no word for the cluster's version, which the library underneath takes.
-    text = helm_python._native.call_string("helm_render", _chart()._raw(), json.dumps(values), json.dumps(asked))
+    chart = _chart()._raw()  # noqa: SLF001
+    text = helm_python._native.call_string("helm_render", chart, json.dumps(values), json.dumps(asked))  # noqa: SLF001
     rendered: dict[str, str] = json.loads(text)
     return {name.removeprefix("skytether/templates/"): one for name, one in rendered.items()}
 

@@ -55,10 +55,11 @@ class ActionClient:
         self._decisions[goal_id] = self._harness.ask(f"{self._name}/_action/send_goal", request)
         return goal_id
 
-    def ask_result(self, goal_id: str) -> None:
+    def ask_result(self, goal_id: str) -> Future[Any]:
         """Wait for the end of a goal, as a client of ROS 2 does once it is accepted; `end` does it where it was not."""
         request = self._made["GetResult_Request"](_uuid(goal_id))
-        self._results[goal_id] = self._harness.ask(f"{self._name}/_action/get_result", request)
+        asked = self._results[goal_id] = self._harness.ask(f"{self._name}/_action/get_result", request)
+        return asked
 
     def cancel(self, goal_id: str = "", stamp: float = 0.0) -> int:
         """Call off one goal, all up to a time [Unix time, s], or without either all; gives ROS 2's return code."""

@@ -82,6 +82,7 @@ class Harness(Generic[S]):
         service: The service itself.
         now: Made-up time, s.
         outputs: By topic, every message published so far.
+        port: The service's end of a bridge: a test may put a real session there.
     """
 
     def __init__(
@@ -116,8 +117,8 @@ class Harness(Generic[S]):
         self.service = cls(read_params(cls.params_type, params or {}), context)
         self._types = {name: sender.type_name for name, sender in self.service.senders.items()}
         self._robots: dict[str, Callable[[Any], Message]] = {}
-        self._port = ServicePort(self.service, lambda: None, _at_once)
-        self._port.attach(_Robot(self))
+        self.port = ServicePort(self.service, lambda: None, _at_once)
+        self.port.attach(_Robot(self))
         self.connect()
         self.service.start()
 
@@ -136,11 +137,11 @@ class Harness(Generic[S]):
         served = [d for d in self.service.declared if isinstance(d, Action) and d.kind == kind]
         rows = [TopicSpec(name=d.topic, kind=kind, type=d.type_name, direction="in") for d in served]
         parts = [replace(topic, encoding=self._encoding) for topic in topics_from_api(rows)]
-        self._port.notify(Connected((*typed, *asked, *parts, *extra)))
+        self.port.notify(Connected((*typed, *asked, *parts, *extra)))
 
     def disconnect(self) -> None:
         """The robot is gone."""
-        self._port.notify(Disconnected("silent"))
+        self.port.notify(Disconnected("silent"))
 
     def send(self, topic: str, message: Message | bytes, *, age: float = 0.0, clock_error: float = 0.0) -> None:
         """A message arrives now, published ``age`` seconds ago; bytes arrive as they are.
@@ -150,7 +151,7 @@ class Harness(Generic[S]):
         payload = message if isinstance(message, bytes) else encode(message, self._encoding)
         sequence = self._sequence[topic]
         self._sequence[topic] += 1
-        self._port.deliver(MessageReceived(topic, payload, sequence, self.now - age, clock_error, self.now))
+        self.port.deliver(MessageReceived(topic, payload, sequence, self.now - age, clock_error, self.now))
 
     def skip(self, topic: str) -> None:
         """The link loses the topic's next message."""
@@ -176,10 +177,10 @@ class Harness(Generic[S]):
             else:
                 answer.set_result(decode(srv.response, raw.result(), self._encoding))
 
-        asked = self._port.desk.ask(name, encode(request, self._encoding), self._encoding)
+        asked = self.port.desk.ask(name, encode(request, self._encoding), self._encoding)
         asked.add_done_callback(on_answer)
-        self._port.settle(self.now)
-        self._port.desk.work()
+        self.port.settle(self.now)
+        self.port.desk.work()
         return answer
 
     def answers(self, name: str, robot: Callable[[Any], Message]) -> None:
@@ -193,8 +194,8 @@ class Harness(Generic[S]):
         """Let time pass (one period of the rate; nothing for a service with a trigger), then step once."""
         rate = self.service.rate_hz
         self.now += elapsed if elapsed is not None else 1 / rate if rate else 0.0
-        self._port.settle(self.now)
-        self._port.desk.work()
+        self.port.settle(self.now)
+        self.port.desk.work()
         self.service.step(self.now)
 
     def newest(self, topic: str) -> Any:

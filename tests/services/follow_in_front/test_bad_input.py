@@ -32,6 +32,7 @@ from skytether.messages import (
     Vector3,
 )
 from skytether_services.follow_in_front.camera_image import PictureError, decode
+from skytether_services.follow_in_front.face_landmarks import FaceMesh
 from skytether_services.follow_in_front.face_tracker import FaceTracker
 from skytether_services.follow_in_front.formation import Formation, FormationParams, State
 from skytether_services.follow_in_front.tracker import PeopleTracker
@@ -136,21 +137,21 @@ def test_pictures_may_change_their_size() -> None:
         tracker.step(np.asarray(GREY.resize((64, 3000))))
 
 
-def test_a_wall_of_portraits_takes_no_longer_than_a_few_faces() -> None:
+def test_a_wall_of_portraits_takes_no_longer_than_a_few_faces(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = GREY.copy()
     head = HEAD.resize((70, 70 * HEAD.height // HEAD.width))
     for x in range(0, 570, 71):
         for y in range(0, 400, 95):
             wall.paste(head, (x, y))
     tracker, looked = FaceTracker(1.08), 0
-    look = tracker._mesh.look
+    look = FaceMesh.look
 
     def counted(*args: Any) -> Any:
         nonlocal looked
         looked += 1
         return look(*args)
 
-    tracker._mesh.look = counted  # type: ignore[method-assign]
+    monkeypatch.setattr(FaceMesh, "look", counted)
     for _ in range(6):
         looked = 0
         assert len(tracker.step(np.asarray(wall))) <= 3

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from deep_size import deep_size
 from numpy.typing import NDArray
 
 from skytether_services.navigation.costmap import FREE, LETHAL, UNKNOWN, Costmap, Costs
@@ -210,15 +211,18 @@ def test_a_crowd_is_read_one_by_one_and_nobody_is_passed_over() -> None:
     for _ in range(6):
         me.read(1.0)
     assert len(me.names(1.0)) == 10, "what came meanwhile did not begin anew"
-    assert all(one.at == -0.5 for one in me._heard.values()), "it is as old as it is, however long it waited"
+    assert len(me.names(9.5)) == 10
+    assert me.names(9.6) == {}, "it is as old as it is, however long it waited"
 
 
 def test_no_more_robots_than_the_bound_are_kept_the_newest() -> None:
     me = neighbours()
+    sizes = []
     for n in range(40):
         hear(me, float(n), [Said(f"r{n}", 0.0, tells())])
+        sizes.append(deep_size(me))
     assert len(me.names(39.0)) == 11, "those of the last ten seconds"
-    assert len(me._heard) == 15
+    assert sizes[39] < 1.1 * sizes[15], "one that is forgotten takes no memory"
 
 
 @pytest.mark.parametrize("which", ["tell", "listen"])

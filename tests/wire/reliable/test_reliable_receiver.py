@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from skytether.wire.codec.frames import Ack, push_ack
 from skytether.wire.codec.plaintext import PREFIX
-from skytether.wire.reliable.reliable_receiver import WINDOW_BYTES, ReliableReceiver
+from skytether.wire.reliable.reliable_receiver import HELD_LIMIT, ReliableReceiver
 
 numbers = st.integers(0, 2**64 - 1)
 indices = st.integers(0, 2**16 - 1)
@@ -42,13 +42,21 @@ def test_gaps_are_told_and_what_is_given_up_is_skipped():
     assert receiver.acknowledgement() == Ack(0, 10, b"\x02")
 
 
+def test_what_waits_for_a_gap_is_bounded():
+    receiver = ReliableReceiver(set())
+    for sequence in range(1, 60):
+        receiver.receive_message(PREFIX.pack(sequence, sequence) + bytes(100_000), 0, 0.0)
+        assert deep_size(receiver) <= HELD_LIMIT + 20_000
+    assert deep_size(receiver) > HELD_LIMIT - 100_000
+
+
 @given(st.lists(st.tuples(numbers, st.integers(0, 2**32 - 1), st.integers(0, 300_000)), max_size=30), numbers)
 def test_whatever_an_authentic_peer_says_is_bounded(messages, base):
     receiver = ReliableReceiver(set())
     for sequence, below, size in messages:
         receiver.receive_message(PREFIX.pack(sequence, below) + bytes(size), 0, 0.0)
         receiver.forward(base)
-        assert deep_size(receiver) <= 2 * WINDOW_BYTES + size + 20_000
+        assert deep_size(receiver) <= HELD_LIMIT + size + 20_000
         ack = receiver.acknowledgement()
         assert ack is None or len(push_ack(ack)) < 200
     receiver.receive_message(b"short", 0, 0.0)

@@ -84,10 +84,10 @@ def bench_face(distances: Sequence[float], most: float, seeds: Sequence[int]) ->
             off += [math.degrees(one.angle - yaw) for one, yaw in zip(found, yaws, strict=True)]
             here += found
             size += sum(map(len, pictures))
-        rows.append({"distance_m": distance, "picture_kb": round(size / len(here) / 1e3, 1), **_row(off, here)})
+        rows.append({"distance_m": distance, "picture_kb": round(size / len(here) / 1e3, 1), **row_of(off, here)})
         errors += off
         seen += here
-    return {"faces": NOTE, "most_deg": round(math.degrees(most), 1), **_row(errors, seen), "distances": rows}
+    return {"faces": NOTE, "most_deg": round(math.degrees(most), 1), **row_of(errors, seen), "distances": rows}
 
 
 def _pictures(distance: float, most: float, seed: int) -> tuple[list[float], list[bytes]]:
@@ -110,7 +110,8 @@ def _pictures(distance: float, most: float, seed: int) -> tuple[list[float], lis
     return yaws, pictures
 
 
-def _row(off: Sequence[float], seen: Sequence[Seen]) -> dict[str, Any]:
+def row_of(off: Sequence[float], seen: Sequence[Seen]) -> dict[str, Any]:
+    """Of one distance: by how much each face was taken to be turned [deg; NaN: none was found], and how looks went."""
     known = np.array([value for value in off if not math.isnan(value)])
     cpu, wall = (np.array([getattr(one, name) for one in seen]) for name in ("cpu_ms", "wall_ms"))
     return {

@@ -30,7 +30,7 @@ from .observe import Spread, cpu_seconds, instance_of
 from .pair import BenchError
 from .requests import SERVICE
 
-_PHASES = 4
+PHASES = 4
 _QUIET_S = 5.0
 """Made-up seconds without traffic at the end, in which what is under way arrives and is told of."""
 _LIMIT_S = 60.0
@@ -111,13 +111,13 @@ def bench_fleet(robots: int, seconds: float, on_progress: Callable[[str], None] 
         fleet = _Fleet(orchestrator, operator, clients, on_progress)
         began = time.monotonic()
         fleet.wait(fleet.robots, "start")
-        fleet.drive(seconds / _PHASES, "all is well")
+        fleet.drive(seconds / PHASES, "all is well")
         fleet.disturb()
-        fleet.drive(seconds / _PHASES, "after the disturbances")
+        fleet.drive(seconds / PHASES, "after the disturbances")
         fleet.kill_orchestrator()
-        fleet.drive(seconds / _PHASES, "without an orchestrator")
+        fleet.drive(seconds / PHASES, "without an orchestrator")
         fleet.start_orchestrator()
-        fleet.drive(seconds / _PHASES, "with the next orchestrator")
+        fleet.drive(seconds / PHASES, "with the next orchestrator")
         fleet.drive(_QUIET_S, "quiet", traffic=False)
         fleet.wait(fleet.robots, "last report")
         return fleet.row(seconds, time.monotonic() - began)
