@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
+import subprocess
+import tarfile
 from collections.abc import Callable, Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 from docker.errors import APIError
@@ -18,7 +24,7 @@ from skytether.orchestrator.config.settings import Nodes, Settings, Timing
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.http.app import create_app
 from skytether.orchestrator.runtimes.docker.client import Client as Engine
-from skytether.orchestrator.runtimes.docker.objects import holder
+from skytether.orchestrator.runtimes.docker.objects import READY, holder
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
@@ -95,6 +101,58 @@ def refuses_to_be_had(house: NodeScene, docker_site: DockerSite, ours: str) -> N
         with pytest.raises(APIError, match="something else of this machine"):
             client.create_volume("skytether-x", driver_opts={"type": "none", "o": "bind", "device": "/"})
         assert docker_site.docker("inspect", "-f", "{{.State.Status}}", stranger) == "created"
+        gets_nothing_by_a_way_around(client, good, docker_site, image)
+        assert docker_site.docker("inspect", "-f", "{{.State.Status}}", stranger) == "created"
     finally:
         client.close()
         docker_site.docker("rm", "-f", stranger)
+
+
+def gets_nothing_by_a_way_around(client: Engine, good: dict[str, Any], docker_site: DockerSite, image: str) -> None:
+    """All of these were ways to the machine, at an engine of version 20.10."""
+
+    def asked(method: str, path: str, **more: Any) -> tuple[int, str]:
+        answer = client.request(method, f"{client.base_url}{path}", timeout=30, **more)
+        return answer.status_code, answer.text
+
+    def refused(method: str, path: str, **more: Any) -> bool:
+        status, text = asked(method, path, **more)
+        return status == HTTPStatus.FORBIDDEN and (method == "HEAD" or "this machine's node refuses it" in text)
+
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    guards = quote(json.dumps({"label": ["skytether.io/guard"]}))
+    assert refused("POST", f"/v1.41/containers/prune?filters={guards}", data='"a&filters={}&"', headers=form)
+    source = quote("http://127.0.0.1:9/")
+    assert refused(
+        "POST", "/v1.41/images/create?fromImage=a&tag=1", data=f'"a&fromImage=&fromSrc={source}&"', headers=form
+    )
+    name, _, tag = image.rpartition(":")
+    assert refused("POST", f"/v1.41/images/create?fromImage={name}&tag={tag}")  # it was made on this machine
+    assert refused("GET", "/v1.41/containers/json?all=1")
+    assert refused("GET", "/v1.41/networks/bridge")
+    made = client.create_container_from_config(good)["Id"]
+    try:
+        assert refused("POST", f"/v1.23/containers/{made}/start", json={"Binds": ["/:/host"], "Privileged": True})
+        assert docker_site.docker("inspect", "-f", "{{.HostConfig.Binds}}", made) == "[]"
+    finally:
+        client.remove_container(made)
+    # An engine mounts the inner one from the outside: where the outer one's links point by then.
+    tar = io.BytesIO()
+    with tarfile.open(fileobj=tar, mode="w") as files:
+        link = tarfile.TarInfo("alias")
+        link.type, link.linkname = tarfile.SYMTYPE, "outer"
+        files.addfile(link)
+    imported = subprocess.run(["docker", "import", "-"], input=tar.getvalue(), capture_output=True, check=True)
+    linked = imported.stdout.decode().strip()
+    try:
+        for of, inner, says in ((image, "/outer/a/b", False), (linked, "/alias/a/b", False), (linked, "/b", True)):
+            mounts = [{"Type": "volume", "Target": path} for path in ("/outer", inner)]
+            body = {**good, "Image": of, "HostConfig": {**good["HostConfig"], "Mounts": mounts}}
+            made = client.create_container_from_config(body)["Id"]
+            try:
+                status, _ = asked("HEAD", f"/v1.41/containers/{made}/archive?path={quote(READY)}")
+                assert status == (HTTPStatus.NOT_FOUND if says else HTTPStatus.FORBIDDEN), inner
+            finally:
+                client.remove_container(made, v=True)
+    finally:
+        docker_site.docker("rmi", "-f", linked)
