@@ -61,6 +61,10 @@ class RawReceived(Arrived):
     type: str
     encoding: Encoding
     payload: bytes
+    hash: str = ""
+    """Of the type, as the robot says; empty if it does not."""
+    definition: str = ""
+    """Of a type that the robot's graph alone knows, as its publisher tells it."""
 
 
 class Mailbox(Generic[M]):
@@ -140,7 +144,14 @@ class RawQueue:
         self._taken_bytes += len(message.payload)
         return message
 
-    def put(self, received: MessageReceived, type_name: str, encoding: Encoding) -> None:
+    def put(
+        self,
+        received: MessageReceived,
+        type_name: str,
+        encoding: Encoding,
+        type_hash: str = "",
+        definition: str = "",
+    ) -> None:
         """From the bridge's thread: append, and drop the oldest beyond the bounds."""
         payload = bytes(received.payload)
         self._put_bytes += len(payload)
@@ -154,6 +165,8 @@ class RawQueue:
                 type_name,
                 encoding,
                 payload,
+                type_hash,
+                definition,
             )
         )
         # Each counter has one writing thread, so no lock: what the reader takes meanwhile only makes more room.

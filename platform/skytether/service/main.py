@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -24,6 +25,7 @@ from skytether.wire.topic import Role
 if TYPE_CHECKING:
     from skytether.bridge import Bridge
 
+from . import any_topics
 from .beat import beating
 from .clock import SystemClock
 from .errors import ConfigError, ServiceError
@@ -101,6 +103,7 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
     params = read_params(cls.params_type, grant.params)
     try:
         spec = SessionSpec.from_api(Role.SERVICE, grant.session_id, grant.session_key, grant.topics)
+        spec = replace(spec, topics=(*spec.topics, *any_topics.rows(topic.name for topic in grant.topics)))
     except ValueError as error:
         raise ConfigError(f"the grant is wrong: {error}") from None
     service = cls(params, Context(grant.robot, grant.instance, Path(grant.data_dir), time.time() - time.monotonic()))

@@ -11,6 +11,7 @@ from skytether.messages import Encoding, Message, warm
 from skytether.wire.events import Connected, Disconnected, Event, MessageReceived, PeerMoved, Refused
 from skytether.wire.topic import Topic
 
+from .any_topics import AnyTopics
 from .calls import CallPublisher, Desk, Spawn, Threads
 from .errors import CallError
 from .service import Service
@@ -54,6 +55,7 @@ class ServicePort:
         self._table: dict[str, tuple[str, Encoding]] = {}
         self._cold: list[tuple[list[type[Message]], Encoding]] = []
         self._refused = ""
+        self._any = None if service.anything is None else AnyTopics(service.anything)
 
     def attach(self, publisher: Publisher) -> None:
         for sender in self._service.senders.values():
@@ -69,14 +71,14 @@ class ServicePort:
         agreed = self._table.get(message.topic)
         if agreed is None:
             return
-        type_name, encoding = agreed
+        _, encoding = agreed
         mailbox = self._service.mailboxes.get(message.topic)
         if mailbox is not None:
             mailbox.put(message, encoding)
         elif (asked_for := self._service.asked_for.get(message.topic)) is not None:
             self._service.inbox.put(asked_for, message.payload, encoding)
-        elif self._service.anything is not None:
-            self._service.anything.put(message, type_name, encoding)
+        elif self._any is not None:
+            self._any.put(message, encoding)
         self._wake()
 
     def notify(self, event: Event) -> None:
@@ -133,6 +135,8 @@ class ServicePort:
                 self._log.error("topic %s: the robot's encoding '%s' is not known here", topic.name, topic.encoding)
         self.connected = bool(topics)
         self._table = table
+        if self._any is not None:
+            self._any.agree(topics)
         for name, sender in self._service.senders.items():
             sender.encoding = table[name][1] if name in table else None
         for name, caller in self._service.callers.items():

@@ -48,14 +48,14 @@ class File:
         self.path = path
         self._stream: BinaryIO = path.open("xb")
         self._writer = Writer(self._stream, chunk_size=chunk_bytes, compression=_COMPRESSION[compression])
-        self._channels: dict[tuple[str, str], int] = {}
+        self._channels: dict[tuple[str, str, str, str], int] = {}
         self._ended_at = 0
         self._writer.start(profile)
         self._writer.add_metadata("skytether", metadata)
 
     def write(self, message: RawReceived, epoch_ns: int) -> None:
         """Append a message; ``epoch_ns``: Unix time at which the monotonic clock of its times stood at 0."""
-        key = (message.topic, message.type)
+        key = (message.topic, message.type, message.hash, message.definition)
         if key not in self._channels:
             self._channels[key] = self._add_channel(message)
         logged = _nanoseconds(message.received_at)
@@ -112,7 +112,7 @@ class File:
         self._ended_at = end
 
     def _add_channel(self, message: RawReceived) -> int:
-        definition = definition_of(message.type, message.encoding)
+        definition = message.definition or definition_of(message.type, message.encoding)
         schema = self._writer.register_schema(
             name=message.type.replace("/msg/", "/") if message.encoding == "ros1" else message.type,
             encoding=_SCHEMA_ENCODING[message.encoding] if definition else "",
@@ -122,7 +122,7 @@ class File:
             topic=message.topic,
             message_encoding=message.encoding,
             schema_id=schema,
-            metadata={"topic_type_hash": hash_of(message.type, message.encoding)},
+            metadata={"topic_type_hash": message.hash or hash_of(message.type, message.encoding)},
         )
 
 

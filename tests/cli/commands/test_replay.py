@@ -74,7 +74,7 @@ def streamed(monkeypatch):
     """The command with a replay that delivered as many of two messages as the test says."""
 
     def prepare(delivered: int) -> None:
-        topics = (TopicResult("/talk", "std_msgs/msg/String", 2, 2, delivered, 2 - delivered, 0.00123456, nan),)
+        topics = (TopicResult("/talk", "std_msgs/msg/String", 2, 0, 0, 2, delivered, 2 - delivered, 0.00123456, nan),)
         monkeypatch.setattr(command, "_stream", lambda config, client: ReplayResult("i1", 1.23456, topics))
 
     return prepare
@@ -96,6 +96,8 @@ def test_what_arrived_is_printed_as_one_json_object(bag, token, streamed):
             "/talk": {
                 "type": "std_msgs/msg/String",
                 "messages": 2,
+                "refused": 0,
+                "dropped": 0,
                 "sent": 2,
                 "delivered": 2,
                 "lost": 0,

@@ -137,6 +137,8 @@ def _document(config: ReplayConfig, result: ReplayResult, files: list[Path]) -> 
             topic.topic: {
                 "type": topic.type,
                 "messages": topic.messages,
+                "refused": topic.refused,
+                "dropped": topic.dropped,
                 "sent": topic.sent,
                 "delivered": topic.delivered,
                 "lost": topic.lost,
@@ -159,10 +161,10 @@ def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) 
     table = Table(title=cell(f"{config.bag.name} to {config.service}, {result.seconds:.1f} s"))
     table.add_column("topic")
     table.add_column("type")
-    for name in ("messages", "sent", "delivered", "lost", "p50 ms", "p99 ms"):
+    for name in ("messages", "refused", "dropped", "sent", "delivered", "lost", "p50 ms", "p99 ms"):
         table.add_column(name, justify="right")
     for topic in result.topics:
-        counts = (topic.messages, topic.sent, topic.delivered, topic.lost)
+        counts = (topic.messages, topic.refused, topic.dropped, topic.sent, topic.delivered, topic.lost)
         delays = (_ms(topic.delay_p50_s), _ms(topic.delay_p99_s))
         table.add_row(
             cell(topic.topic),

@@ -18,7 +18,7 @@ from skytether.ros.ros1.master import MasterError, RefusedError
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.port import CLOCK, SIM_TIME, Ros1Port
 from skytether.ros.ros1.subscription import Listener
-from skytether.wire.topic import Role, Topic
+from skytether.wire.topic import ANY, Role, Topic
 
 from ..control.supervisor import Limits
 from ..session.topic_table import Offer, robot_table, spoken
@@ -182,12 +182,10 @@ class Ros1Robot:
             types = self._node.master.topic_types() if wanted else {}
         except (MasterError, RefusedError):
             types = {}
-        for name in wanted:
-            if types.get(name, "*") == "*":
-                _log.error("topic %s is not sent: nobody published it yet, so its type is not known", name)
         if not wanted:
             _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
-        return {n: bridge_type(types[n]) for n in wanted if types.get(n, "*") != "*" and n not in named}
+        # One that nobody publishes yet is waited for: its type is told to the service when it comes (`ros.notes`).
+        return {n: bridge_type(types.get(n, ANY)) for n in wanted if n not in named}
 
     def close(self) -> None:
         """Leave the graph; the node stays."""

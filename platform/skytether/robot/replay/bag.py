@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1 import ReaderError as Ros1Error
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -29,6 +30,8 @@ class BagTopic:
 
     offer: Offer
     messages: int
+    definition: str = field(default="", compare=False)
+    """Of the type, as the recording has it."""
 
 
 class Bag:
@@ -63,11 +66,11 @@ class Bag:
         self.topics: dict[str, BagTopic] = {}
         for connection in self._reader.connections:
             offer = Offer(connection.msgtype, connection.digest, encoding)
-            known = self.topics.get(connection.topic, BagTopic(offer, 0))
+            known = self.topics.get(connection.topic, BagTopic(offer, 0, _definition(connection.msgdef)))
             if known.offer != offer:
                 self.close()
                 raise BagError(f"{path}: topic {connection.topic} has two types, {known.offer.type} and {offer.type}")
-            self.topics[connection.topic] = BagTopic(offer, known.messages + connection.msgcount)
+            self.topics[connection.topic] = BagTopic(offer, known.messages + connection.msgcount, known.definition)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[float, str, bytes]]:
         """Everything of these topics in the order of recording: seconds from the recording's start, topic, bytes.
@@ -96,6 +99,10 @@ class Bag:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _definition(found: MessageDefinition) -> str:
+    return found.data if found.format is MessageDefinitionFormat.MSG else ""
 
 
 def _why(error: Exception) -> str:

@@ -22,6 +22,8 @@ from skytether.api.client import ApiError, Unreachable
 from skytether.bridge import Bridge, BridgeError, SessionSpec
 from skytether.bridge.port import Publisher
 from skytether.bridge.spec import parse_id, parse_key
+from skytether.ros import notes
+from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.wire.events import Connected, Event, MessageReceived, Refused
 from skytether.wire.stats import SessionStats, TopicStats
 from skytether.wire.topic import Direction, Role, Topic
@@ -83,9 +85,11 @@ class TopicResult:
         topic: Its name.
         type: Its type's.
         messages: In the recording.
-        sent: Handed to the network.
+        refused: Not taken by the bridge, which had no session just then.
+        dropped: Taken, but too old or too many before the network could have them.
+        sent: Handed to the network. ``messages == refused + dropped + sent``.
         delivered: Given to the service.
-        lost: Sent, and not delivered: whatever the reason.
+        lost: Sent, and not delivered: whatever the reason. ``sent == delivered + lost``.
         delay_p50_s: One way, median [s]; NaN if not measured.
         delay_p99_s: One way [s].
     """
@@ -93,6 +97,8 @@ class TopicResult:
     topic: str
     type: str
     messages: int
+    refused: int
+    dropped: int
     sent: int
     delivered: int
     lost: int
@@ -199,6 +205,7 @@ class _Replay:
         self._peer: Address | None = None
         self._settled = threading.Event()
         self._refused = ""
+        self._refused_messages: Counter[str] = Counter()
         self._stop = threading.Event()
         self._keeper: threading.Thread | None = None
         self._lease_client = LeaseClient(client, _request(config), on_instance=self._follow, report=self._report)
@@ -233,11 +240,18 @@ class _Replay:
         if bridge is None:
             raise ReplayError("the replay was not started")
         total = sum(self._bag.topics[name].messages for name in self._names)
+        types = {
+            self._sent_as(name): TypeNote(topic.offer.type, topic.offer.type_hash, topic.definition)
+            for name, topic in self._bag.topics.items()
+            if name in self._names
+        }
+        bridge.publish(NOTES[Role.ROBOT], Notes(types).pack())
         begin = time.monotonic()
         sent = 0
         for at, topic, data in self._bag.messages(self._names):
             self._sleep_until(begin + at / self._config.speed)
-            bridge.publish(self._sent_as(topic), data)
+            if not bridge.publish(self._sent_as(topic), data):
+                self._refused_messages[topic] += 1  # no session for the moment
             sent += 1
             self._progress(Progress("streaming", sent, total, at))
         self._progress(Progress("confirming", sent, total, self._bag.duration))
@@ -331,7 +345,7 @@ class _Replay:
                 f"it takes {takes}; the recording's names are changed with --remap OLD:=NEW"
             )
         self._names = frozenset(taken)
-        return table
+        return (*table, *(row for row in notes.topics() if row.direction is Direction.IN))
 
     def _sleep_until(self, when: float) -> None:
         while (left := when - time.monotonic()) > 0:
@@ -362,6 +376,8 @@ class _Replay:
             topic=name,
             type=self._bag.topics[name].offer.type,
             messages=self._bag.topics[name].messages,
+            refused=self._refused_messages[name],
+            dropped=max(0, self._bag.topics[name].messages - self._refused_messages[name] - topic.sent),
             sent=topic.sent,
             delivered=topic.delivered,
             lost=topic.sent - topic.delivered,

@@ -42,6 +42,7 @@ class Finding:
         kind: Its type.
         says: What was found.
         good: Whether that will do; a topic that nobody publishes yet will.
+        missing: It is waited for.
     """
 
     what: str
@@ -49,6 +50,7 @@ class Finding:
     kind: str
     says: str
     good: bool = True
+    missing: bool = False
 
 
 def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) -> list[Finding]:
@@ -59,6 +61,8 @@ def look(settings: RobotConfig, graph: Ros1RobotConfig, node: Node, token: str) 
         specs = spoken(manifest.spec.robot_topics, "action")
         names = graph.names(specs)
         findings += _topics(settings, names, node, specs)
+        if any(row.name == ANY_TOPIC for spec in specs for row in spec.rows()):
+            findings += _any(graph, node)
         findings += forbidden(graph.permissions(), specs, names, settings.command_topic)
         if graph.cmd_vel is not None:
             findings.append(_wheels(graph.cmd_vel, graph, node))
@@ -86,10 +90,15 @@ def show(findings: Sequence[Finding]) -> bool:
     for head in ("", "what", "in the graph", "type", "found"):
         table.add_column(head, overflow="fold")
     for f in findings:
-        table.add_row("ok" if f.good else "!!", *map(cell, (f.what, f.where, f.kind, f.says)))
+        table.add_row(
+            "!!" if not f.good else ".." if f.missing else "ok", *map(cell, (f.what, f.where, f.kind, f.says))
+        )
     print_whole(table)
     wrong = sum(not f.good for f in findings)
-    console.print("all is there" if not wrong else f"{wrong} to mend, marked !!", markup=False)
+    missing = [f.where or f.what for f in findings if f.missing]
+    said = f"{wrong} to mend, marked !!" if wrong else "all is there" if not missing else "nothing is to mend"
+    said += f"; not there yet, and waited for: {', '.join(missing)}" if missing else ""
+    console.print(said, markup=False, soft_wrap=True)
     return not wrong
 
 
@@ -140,6 +149,17 @@ def _topics(settings: RobotConfig, names: Names, node: Node, specs: Sequence[Top
     return found
 
 
+def _any(graph: Ros1RobotConfig, node: Node) -> list[Finding]:
+    """What a service gets that takes any topic."""
+    published = node.master.published()
+    found = []
+    for name in (resolve(name, graph.home) for name in graph.topics):
+        who = ", ".join(node.master.publishers(name)) if name in published else ""
+        says = f"from {who}" if who else "nobody publishes it yet; it is waited for"
+        found.append(Finding(name, name, published.get(name, "any"), says, missing=not who))
+    return found
+
+
 def _incoming(row: TopicSpec, name: str, node: Node, published: bool) -> Finding:
     connected, refused = node.look()[name]
     if refused:
@@ -148,7 +168,7 @@ def _incoming(row: TopicSpec, name: str, node: Node, published: bool) -> Finding
         return Finding(row.name, name, row.type, "from " + ", ".join(info.caller for info in connected.values()))
     if published:
         return Finding(row.name, name, row.type, "is published, but its publisher cannot be reached", good=False)
-    return Finding(row.name, name, row.type, "nobody publishes it yet; it is waited for")
+    return Finding(row.name, name, row.type, "nobody publishes it yet; it is waited for", missing=True)
 
 
 def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
@@ -159,7 +179,7 @@ def _call(spec: TopicSpec, name: str, node: Node) -> Finding:
     except (CallRefusedError, MasterError) as error:
         return Finding(spec.name, name, spec.type, str(error), good=False)
     says = "nobody offers it yet; it is waited for" if found is None else f"is offered, {found[1].type}"
-    return Finding(spec.name, name, spec.type, says)
+    return Finding(spec.name, name, spec.type, says, missing=found is None)
 
 
 def look_at_gate(settings: RobotConfig) -> Finding:
