@@ -60,6 +60,7 @@ TOGETHER = (
     "lab/test_bench_legs.py",
     "lab/test_bench_mapping.py",
     "lab/test_bench_migrate.py",
+    "lab/test_bench_ros.py",
     "lab/test_bench_scale.py",
     "lab/test_bench_join.py",
     "lab/test_bench_start.py",

@@ -18,7 +18,7 @@ def test_talker_and_listener_are_measured(ros2: str, monkeypatch: pytest.MonkeyP
     for rows in by_way:
         assert [row.message for row in rows] == [flow.name for flow in MESSAGES]
     for row, flow in zip(plain, MESSAGES, strict=True):
-        assert abs(row.sent - flow.hz * 0.5) <= 1
+        assert 0 < row.sent <= flow.hz * 0.5 + 1
         assert row.delivered == row.sent  # reliable, on one machine
         assert row.p50_ms is not None
         assert 0 < row.p50_ms < 500
