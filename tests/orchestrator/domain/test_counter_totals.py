@@ -72,7 +72,7 @@ def test_all_services_of_a_robot_share_its_names_also_over_a_restart(store: Stor
     def hear(robot: str, first: int) -> int:
         told = {(robot, f"s{n}"): n for n in range(first, first + 4)}
         counted = {owner: [("robot:a", {("control_objections", f"r{n}"): 1})] for owner, n in told.items()}
-        return few.hear({"i1": (1.0, {})}, counted)[robot]
+        return few.keep_robot_reports({"i1": (1.0, {})}, counted)[robot]
 
     assert [hear("walker", first) for first in (0, 4, 8, 0)] == [0, 0, 2, 0]
     few.close()
@@ -86,7 +86,7 @@ def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store,
     record = store.add(new_record(state=State.RUNNING), "robot:walker", None, "")
     now = record.created_at
     for value in (5, 4):
-        store.hear({record.id: (now, {})}, {("walker", "toy"): [("robot:a", {KEY: value})]})
+        store.keep_robot_reports({record.id: (now, {})}, {("walker", "toy"): [("robot:a", {KEY: value})]})
     store.count(record, [("run:i1:1", {("instance_cpu_seconds", "lab"): 2.5})])
     assert store.accounts()["walker", "toy"].sums() == {KEY: 5, ("instance_cpu_seconds", "lab"): 2.5}
     store.prune(now, ended_age=10, ended_count=10, events_count=10)

@@ -65,8 +65,8 @@ def test_what_comes_with_a_renewal_is_the_same(served: Any) -> None:
 
 def test_of_a_robot_that_nobody_registered_there_is_no_state_at_any_time(gates: Gates) -> None:
     """An operator's token renews for any name. What was neither kept nor hidden came and went in the metrics."""
-    gates.hear("nobody", STOPPED)
-    gates.hear("walker", DRIVES)
+    gates.keep_report("nobody", STOPPED)
+    gates.keep_report("walker", DRIVES)
     assert gates.fresh() == {"walker": DRIVES}
     gates.write()
     assert gates.fresh() == {"walker": DRIVES}
@@ -81,7 +81,7 @@ def test_only_the_robot_itself_says_how_its_gate_is(served: Any) -> None:
 
 
 def test_a_robot_that_falls_silent_has_no_state_after_a_while(gates: Gates, clock: Any) -> None:
-    gates.take(WALKER, "walker", STOPPED)
+    gates.receive_report(WALKER, "walker", STOPPED)
     gates.write()
     heard = clock()
     clock.forward(14.9)
@@ -92,21 +92,21 @@ def test_a_robot_that_falls_silent_has_no_state_after_a_while(gates: Gates, cloc
 
 
 def test_a_clock_that_was_set_back_keeps_nothing_fresh_and_refuses_nothing(gates: Gates, clock: Any) -> None:
-    gates.take(WALKER, "walker", STOPPED)
+    gates.receive_report(WALKER, "walker", STOPPED)
     gates.write()
     clock.set_by(-3600)
     assert gates.fresh() == {}
-    gates.take(WALKER, "walker", DRIVES)
+    gates.receive_report(WALKER, "walker", DRIVES)
     gates.write()
     assert gates.fresh() == {"walker": DRIVES}
 
 
 def test_any_of_several_orchestrators_may_be_told(gates: Gates, store: Store, clock: Any) -> None:
     other = Gates(store, 15.0, clock)
-    gates.take(WALKER, "walker", STOPPED)
+    gates.receive_report(WALKER, "walker", STOPPED)
     gates.write()
     clock.forward(2)
-    other.take(WALKER, "walker", DRIVES)
+    other.receive_report(WALKER, "walker", DRIVES)
     other.write()
     gates.write()
     assert gates.fresh() == other.fresh() == {"walker": DRIVES}
@@ -115,11 +115,11 @@ def test_any_of_several_orchestrators_may_be_told(gates: Gates, store: Store, cl
 def test_what_cannot_be_written_is_kept_and_what_came_meanwhile_is_newer(
     gates: Gates, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gates.take(WALKER, "walker", STOPPED)
-    gates.take(Principal("other"), "other", DRIVES)
+    gates.receive_report(WALKER, "walker", STOPPED)
+    gates.receive_report(Principal("other"), "other", DRIVES)
 
     def away(*_: Any) -> None:
-        gates.take(WALKER, "walker", DRIVES)
+        gates.receive_report(WALKER, "walker", DRIVES)
         raise OperationalError("", None, Exception("the database is away"))
 
     with monkeypatch.context() as patch:
@@ -131,8 +131,8 @@ def test_what_cannot_be_written_is_kept_and_what_came_meanwhile_is_newer(
 
 
 def test_a_robot_that_was_deleted_meanwhile_harms_nothing(gates: Gates, store: Store) -> None:
-    gates.take(Principal("other"), "other", DRIVES)
-    gates.take(WALKER, "walker", DRIVES)
+    gates.receive_report(Principal("other"), "other", DRIVES)
+    gates.receive_report(WALKER, "walker", DRIVES)
     store.delete_robot("other")
     gates.write()
     assert gates.fresh() == {"walker": DRIVES}
@@ -142,4 +142,4 @@ def test_a_robot_that_was_deleted_meanwhile_harms_nothing(gates: Gates, store: S
 
 def test_a_robot_says_nothing_for_another(gates: Gates) -> None:
     with pytest.raises(ForbiddenError):
-        gates.take(WALKER, "other", DRIVES)
+        gates.receive_report(WALKER, "other", DRIVES)

@@ -104,7 +104,7 @@ def test_standbys_and_reports_that_matter_alone(store: Store, new_record: NewRec
     assert [r.id for r in store.standbys("toy")] == ["warm"]
     for name, source in (("a", "cloud"), ("b", "stop"), ("c", None)):
         store.add(new_record(name, state=State.RUNNING), "operator", None, "")
-        store.hear({name: (NOW, {"control_source": source})}, {("walker", "toy"): [("robot:a", {})]})
+        store.keep_robot_reports({name: (NOW, {"control_source": source})}, {("walker", "toy"): [("robot:a", {})]})
     assert store.reports() == {n: {"control_source": s} for n, s in (("a", "cloud"), ("b", "stop"), ("c", None))}
     assert store.reports(("stop", "fallback")) == {"b": {"control_source": "stop"}}
 
@@ -281,7 +281,7 @@ def test_the_old_the_many_and_the_oldest_events_are_forgotten(store: Store, new_
 
 def tell(store: Store, record: Record, numbers: range) -> Record:
     for number in numbers:
-        record = store.tell(record, NOW, [ServiceReport(number, "said", str(number))]) or record
+        record = store.add_service_reports(record, NOW, [ServiceReport(number, "said", str(number))]) or record
     return record
 
 

@@ -95,14 +95,14 @@ def test_of_many_the_newest_are_told_and_few_a_minute(running: Bench) -> None:
 
 def test_what_a_renewal_overtakes_is_told_with_the_next_look(running: Bench) -> None:
     running.runtime.world["i1"].reports = reports(1)
-    tell = running.store.tell
+    tell = running.store.add_service_reports
 
     def overtaken(record: Record, now: float, said: Any) -> Record | None:
         running.store.renew("i1", now, None)
-        running.store.tell = tell  # type: ignore[method-assign]
+        running.store.add_service_reports = tell  # type: ignore[method-assign]
         return tell(record, now, said)
 
-    running.store.tell = overtaken  # type: ignore[method-assign]
+    running.store.add_service_reports = overtaken  # type: ignore[method-assign]
     running.step()
     assert told(running) == []
     running.step()

@@ -35,7 +35,7 @@ class Gates:
         self._taking = threading.Lock()
         self._writing = threading.Lock()
 
-    def take(self, by: Principal, robot: str, report: GateReport) -> None:
+    def receive_report(self, by: Principal, robot: str, report: GateReport) -> None:
         """Hear a robot.
 
         Raises:
@@ -43,9 +43,9 @@ class Gates:
         """
         if by.robot != robot:
             raise ForbiddenError(f"only robot '{robot}' itself can say how its gate is")
-        self.hear(robot, report)
+        self.keep_report(robot, report)
 
-    def hear(self, robot: str, report: GateReport) -> None:
+    def keep_report(self, robot: str, report: GateReport) -> None:
         """The same of what came with a renewal."""
         with self._taking:
             self._heard[robot] = GateRow(robot, self._clock(), report)

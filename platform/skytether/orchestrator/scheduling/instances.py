@@ -40,7 +40,7 @@ from ..store.store import KeyReusedError, Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.reports import Reports
 from .catalog import Catalog
-from .placement import Decision, told
+from .placement import Decision, explain_refusals
 from .placer import Placer
 from .site import Site
 from .sites import Sites
@@ -144,7 +144,7 @@ class Instances:
 
     def _no_site(self, record: Record, decision: Decision) -> NoSiteError:
         self._metrics.refused(record.service, decision.refused)
-        text = f"no site can run '{record.service}': {told(record, decision.refused)}"
+        text = f"no site can run '{record.service}': {explain_refusals(record, decision.refused)}"
         return NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])
 
     def _claim(self, record: Record, owner: str, key: str | None, digest: str) -> Record | None:
@@ -308,9 +308,9 @@ class Instances:
         if renew.report is not None:
             kept = self._metrics.bounded(renewed.record, renew.report)
             report = kept.model_dump(mode="json")
-            self._reports.take(renewed.record, now, report, of_robot(renew.report), counts_of(kept))
+            self._reports.add_report(renewed.record, now, report, of_robot(renew.report), counts_of(kept))
             if renew.report.gate is not None:
-                self._gates.hear(renewed.record.robot, renew.report.gate)
+                self._gates.keep_report(renewed.record.robot, renew.report.gate)
         return self._shown(renewed.record, self._session(renewed.record), renewed.successor)
 
     def claim_session(self, principal: Principal, instance: str, claim: str) -> SessionKey:

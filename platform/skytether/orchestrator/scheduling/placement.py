@@ -211,7 +211,7 @@ def lacks(needs: Needs, total: Capacity, used: Capacity) -> tuple[str, str, bool
     return None
 
 
-def told(record: Record, refused: Sequence[Refusal]) -> str:
+def explain_refusals(record: Record, refused: Sequence[Refusal]) -> str:
     """All refusals in one sentence."""
     none = "no other" if record.replaces else "none"
     return "; ".join(f"{r.site}: {r.detail}" for r in refused) or f"there is {none}: add one with `skytether site add`"

@@ -17,7 +17,7 @@ from ..store.store import Store
 from ..telemetry.metrics import Metrics
 from .leases import Leases
 from .loops import rest_of
-from .placement import UNSTARTED, told
+from .placement import UNSTARTED, explain_refusals
 from .placer import Placer
 from .plan import Expire, Place, plan
 from .sites import Sites
@@ -136,13 +136,13 @@ class PlacementPass:
             as_its_manifest_says = self._placer.weigh(replace(record, size=None), promised)
             if as_its_manifest_says.site is not None:
                 has, gets = record.has, replace(record, size=None).has
-                instead = f"has {gets} instead of {has}: {told(record, decision.refused)}"
+                instead = f"has {gets} instead of {has}: {explain_refusals(record, decision.refused)}"
                 decision = as_its_manifest_says
         refused = [refusal.model_dump() for refusal in decision.refused]
         if refused != record.refused:
             self._metrics.refused(record.service, decision.refused)
         if decision.site is None:
-            reason = f"waiting for a site: {told(record, decision.refused)}"
+            reason = f"waiting for a site: {explain_refusals(record, decision.refused)}"
             if reason != record.reason or record.state is not State.PENDING:
                 self._store.change(waiting(record, reason, decision.refused), self._clock())
             return []

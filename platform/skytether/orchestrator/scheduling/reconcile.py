@@ -25,7 +25,7 @@ from ..telemetry.metrics import Metrics
 from ..telemetry.service_events import ServiceEvents
 from .leases import Leases
 from .loops import rest_of
-from .placement import UNSTARTED, believable, told
+from .placement import UNSTARTED, believable, explain_refusals
 from .placer import Placer
 from .plan import (
     Action,
@@ -388,7 +388,7 @@ class Reconciler:
         decision = self._placer.weigh(replace(record, refused=refused), self._placer.promised())
         if decision.site is None and (decision.hopeless or record.standby or not gives_up):  # a standby never waits
             if gives_up and len(decision.refused) > 1:
-                why = f"no site can start it: {told(record, decision.refused)}"
+                why = f"no site can start it: {explain_refusals(record, decision.refused)}"
                 return crashed(record, change.after.failures, why)
             return change
         self._metrics.refused(record.service, decision.refused)

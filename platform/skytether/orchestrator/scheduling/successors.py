@@ -17,7 +17,7 @@ from ..config.settings import Timing, Weights
 from ..domain.records import Record, new_record
 from ..domain.transitions import displaced, explained, failed, stopped, takes_over
 from ..store.store import Store
-from .placement import UNSTARTED, told
+from .placement import UNSTARTED, explain_refusals
 from .placer import Placer
 from .site import about_to_end, reachable
 from .sites import Sites
@@ -123,7 +123,7 @@ class Successors:
                 )
                 reason = f"{why}: its robot is handed over"
             else:
-                reason = f"{why}, and nothing else takes it: {told(wanted, decision.refused)}"
+                reason = f"{why}, and nothing else takes it: {explain_refusals(wanted, decision.refused)}"
         if reason != record.reason:
             self._store.change(explained(record, reason), now)
 
@@ -151,7 +151,7 @@ class Successors:
         wanted = self.successor_of(record, size=size)
         decision = self._placer.weigh(wanted, self._placer.promised())  # both of them, for a while
         if decision.site is None:
-            return None, f"{why}, and nothing else takes it: {told(wanted, decision.refused)}"
+            return None, f"{why}, and nothing else takes it: {explain_refusals(wanted, decision.refused)}"
         self._store.add(wanted, "", None, "")
         return decision.site, f"{why}: its robot is handed over to another one at {decision.site}"
 

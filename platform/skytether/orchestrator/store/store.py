@@ -251,7 +251,7 @@ class Store(GroupStore):
                 connection.execute(sql.EVENT, said)
         return as_seen
 
-    def tell(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
+    def add_service_reports(self, record: Record, now: float, reports: Sequence[ServiceReport]) -> Record | None:
         """Keep what the present run of an instance reported, as events, if the instance is still as it was seen.
 
         Returns:
@@ -347,7 +347,7 @@ class Store(GroupStore):
         self._remember(renewed.record)
         return renewed
 
-    def hear(
+    def keep_robot_reports(
         self,
         heard: Mapping[str, tuple[float, Mapping[str, Any]]],
         counted: Mapping[Owner, Iterable[tuple[str, Counts]]],

@@ -43,7 +43,7 @@ class Reports:
         self._taking = threading.Lock()
         self._writing = threading.Lock()
 
-    def take(self, record: Record, now: float, report: Mapping[str, Any], life: str, counts: Counts) -> None:
+    def add_report(self, record: Record, now: float, report: Mapping[str, Any], life: str, counts: Counts) -> None:
         """Hear a robot.
 
         Args:
@@ -80,6 +80,8 @@ class Reports:
         counted: dict[Owner, list[tuple[str, Counts]]] = {}
         for one in heard.values():
             counted.setdefault(one.owner, []).extend(one.counted)
-        beyond = self._store.hear({instance: (one.at, one.report) for instance, one in heard.items()}, counted)
+        beyond = self._store.keep_robot_reports(
+            {instance: (one.at, one.report) for instance, one in heard.items()}, counted
+        )
         if beyond:
             self._beyond(beyond)

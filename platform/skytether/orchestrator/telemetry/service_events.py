@@ -56,7 +56,7 @@ class ServiceEvents:
         if not room:
             return record
         told = new[-room:]
-        after = self._store.tell(record, now, told)
+        after = self._store.add_service_reports(record, now, told)
         if after is None:
             return record  # changed meanwhile: the next pass tells it
         self._count(record.id, told)

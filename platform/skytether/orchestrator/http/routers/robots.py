@@ -119,4 +119,4 @@ def acknowledge_stop(core: Core, caller: Caller, robot: str, order: str) -> Stop
 @router.put("/{robot}/gate", status_code=204, responses=says(404, 422))
 def report_gate(core: Core, caller: Caller, robot: str, report: GateReport) -> None:
     """The robot says how the gate before its wheels is, with an instance or without; with its own token only."""
-    core.gates.take(caller, robot, report)
+    core.gates.receive_report(caller, robot, report)
