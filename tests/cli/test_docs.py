@@ -18,6 +18,7 @@ from skytether.api.manifest import Manifest
 from skytether.bridge.relay_config import RelayConfig
 from skytether.cli.app import app
 from skytether.cli.commands.bridge.config import BridgeConfig
+from skytether.cli.lazy import LazyGroup
 from skytether.orchestrator.runtimes.base import Runtime
 from skytether.robot.config.gate_config import inherit
 from skytether.robot.config.robot_config import RobotConfig
@@ -57,7 +58,7 @@ def test_a_command_of_the_documentation_is_there(page: str, line: str) -> None:
         if name == "...":
             return
         assert name in command.commands, f"{page}: {line}"
-        command = command.commands[name]
+        command = command.load(name) if isinstance(command, LazyGroup) else command.commands[name]
     known = {"-", "-h", "--help", "--install-completion"}  # every command has these, the last of them the first only
     options = known | {
         option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+import typer
 from rich.progress import Progress, TextColumn
 from typer.testing import CliRunner
 
@@ -16,6 +17,7 @@ from skytether.cli import main as entry
 from skytether.cli.app import app
 from skytether.cli.commands.demo import _told
 from skytether.cli.commands.robot.check import Finding, show
+from skytether.cli.lazy import LazyGroup
 from skytether.cli.output import SafeConsole, log_to_console, print_foreign, print_table
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
@@ -42,6 +44,26 @@ def test_the_entry_point_imports_nothing_that_takes_long():
     )
     result = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
     assert result.stdout == "[]\n"
+
+
+def test_help_says_of_each_command_what_the_command_says_of_itself():
+    root = typer.main.get_command(app)
+    assert isinstance(root, LazyGroup)
+    assert len(root.table) == len(root.commands) > 10
+    for name, shown in root.commands.items():
+        said = root.load(name).help.partition("\n\n")[0]
+        assert " ".join(said.split()) == shown.help
+        assert root.load(name).name == name
+
+
+def test_help_imports_no_command():
+    code = (
+        "import sys; from skytether.cli.app import app; app(['--help'], standalone_mode=False);"
+        "print([name for name in sys.modules if name.startswith('skytether.cli.commands')], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "orchestrator" in done.stdout
+    assert done.stderr == "[]\n"
 
 
 def test_warnings_are_one_line_on_standard_error_however_often_it_is_set_up(capsys):

@@ -1,4 +1,4 @@
-"""The command tree of ``skytether``; each command lives in a module of its own."""
+"""The command tree of ``skytether``; each command lives in a module of its own, which is imported when it is used."""
 
 from __future__ import annotations
 
@@ -8,58 +8,60 @@ import typer
 
 from skytether import __version__
 
-from .commands import (
-    apply,
-    demo,
-    doctor,
-    echo,
-    group,
-    instance,
-    orchestrator,
-    relay,
-    replay,
-    service,
-    site,
-    site_nodes,
-    token,
-)
-from .commands.bridge import bridge
-from .commands.lab import lab
-from .commands.robot import commission, gate, registry, run, status
+from .lazy import Lazy, LazyGroup
 from .output import log_to_console
 
+
+class _Commands(LazyGroup):
+    table = {
+        "demo": Lazy("demo", "demo", "Guide a simulated smart walker along the trail, across an emulated network."),
+        "replay": Lazy(
+            "replay",
+            "replay",
+            "Stream a recording to a service: through orchestrator and bridge, at its own times, byte for byte.",
+        ),
+        "bridge": Lazy(
+            "bridge.bridge",
+            "bridge",
+            "Join two graphs over UDP without an orchestrator: run it at each end with the same id, key and topics.",
+        ),
+        "relay": Lazy(
+            "relay",
+            "relay",
+            "Forward bridge sessions by their id, without a key: one public port for many services, or hop by hop.",
+        ),
+        "echo": Lazy(
+            "echo",
+            "echo",
+            "Answer UDP echoes until interrupted. Never sends more than it gets, little to each address, needs no"
+            " token.",
+        ),
+        "doctor": Lazy(
+            "doctor", "doctor", "Look for what usually goes wrong between a robot and its services, and say what to do."
+        ),
+        "apply": Lazy(
+            "apply",
+            "apply",
+            "Make the catalog's services as the files say: created, changed or left as they are. May be run again.",
+        ),
+        "orchestrator": Lazy("orchestrator", "app", "Run the orchestrator."),
+        "service": Lazy("service", "app", "What robots can ask for."),
+        "site": Lazy("site_nodes", "app", "Where instances run."),
+        "group": Lazy("group", "app", "Groups of sites, whose machines come and go as they are needed."),
+        "instance": Lazy("instance", "app", "What runs, for whom."),
+        "robot": Lazy("robot.app", "app", "Who may ask; and what runs on a robot: its agent and its gate."),
+        "token": Lazy("token", "app", "Tokens of robots and operators."),
+        "lab": Lazy("lab.lab", "app", "Experiments and benchmarks on this machine."),
+    }
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Cloud robotics: services for robots at the edge or in the cloud, and a bridge that holds.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(demo.demo)
-app.command()(replay.replay)
-app.command()(bridge.bridge)
-app.command()(relay.relay)
-app.command()(echo.echo)
-app.command()(doctor.doctor)
-app.command()(apply.apply)
-registry.app.command("status")(status.status)
-app.add_typer(orchestrator.app, name="orchestrator")
-app.add_typer(service.app, name="service")
-site_nodes.add_to(site.app)
-app.add_typer(site.app, name="site")
-app.add_typer(group.app, name="group")
-app.add_typer(instance.app, name="instance")
-registry.app.command("run")(run.run)
-app.add_typer(registry.app, name="robot")
-app.add_typer(token.app, name="token")
-registry.app.command("gate")(gate.gate)
-registry.app.command("mode")(gate.mode)
-registry.app.command("gate-status")(gate.gate_status)
-registry.app.command("safety-log")(gate.safety_log)
-registry.app.command("stop")(gate.stop)
-registry.app.command("reset")(gate.reset)
-registry.app.command("start")(gate.start)
-registry.app.command("commission")(commission.commission)
-app.add_typer(lab.app, name="lab")
 
 
 @app.callback()

@@ -7,14 +7,14 @@ import sys
 import time
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..connection import Json, TokenFile, Url, connected
 from ..names import SiteName
 from ..output import console, fail, fail_all, plain, print_json
-from .site import options_of
+from .site import app, options_of
 
 if TYPE_CHECKING:
     from skytether.api.client import Client
@@ -432,12 +432,10 @@ def _tell(text: str, told: str) -> str:
     return text
 
 
-def add_to(app: Any) -> None:
-    """Beside the other commands of sites."""
-    app.command("invite")(invite_node)
-    app.command("join")(join_node)
-    app.command("run")(run_node)
-    app.command("leave")(leave_node)
-    app.command("drain")(drain_site)
-    app.command("resume")(resume_site)
-    app.command("remove")(remove_site)
+app.command("invite")(invite_node)
+app.command("join")(join_node)
+app.command("run")(run_node)
+app.command("leave")(leave_node)
+app.command("drain")(drain_site)
+app.command("resume")(resume_site)
+app.command("remove")(remove_site)
