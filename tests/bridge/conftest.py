@@ -16,6 +16,14 @@ TOPICS = (
 )
 
 
+class End(Bridge):
+    """A bridge whose graph and session a test may look at."""
+
+    def __init__(self, spec, port, **options):
+        super().__init__(spec, port, **options)
+        self.graph, self.spec = port, spec
+
+
 class Ends:
     """Makes ends and stops what it made."""
 
@@ -29,8 +37,7 @@ class Ends:
         """A bridge that is not started yet; its port is its attribute `graph`, its session `spec`."""
         port = port or RecordingPort()
         spec = SessionSpec(session_id, key, role, topics)
-        bridge = Bridge(spec, port, **options)
-        bridge.graph, bridge.spec = port, spec
+        bridge = End(spec, port, **options)
         self.made.append(bridge)
         return bridge
 

@@ -60,7 +60,8 @@ def forged(real):
     """With a number that was not used, so that it must be opened to be found out."""
     fields = packet.pull_header(real)
     size = len(real) - packet.HEADER_SIZE
-    common = packet.push_common(*fields[:3], fields[3] + 5000, 1, size)
+    kind, session_id, epoch = fields[:3]
+    common = packet.push_common(kind, session_id, epoch, fields[3] + 5000, 1, size)
     return common + packet.push_shard(0, 0, 0, fields[9] + 1, fields[10]) + os.urandom(size)
 
 

@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from contextlib import contextmanager, suppress
+from operator import attrgetter
 
 import pytest
 
@@ -98,7 +99,7 @@ def open_files():
 
 @pytest.fixture
 def sensors(kernel, tmp_path):
-    topics = Topics({"scan": LaserScan, "estop": Bool}, {"estop": lambda message: message.data})
+    topics = Topics({"scan": LaserScan, "estop": Bool}, {"estop": attrgetter("data")})
     made = SocketSensors(str(tmp_path / "sensors.sock"), str(tmp_path / "estop.sock"), topics, lambda *_: None)
     yield made
     made.close()

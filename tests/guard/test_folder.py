@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -202,7 +203,7 @@ def sensors(folder):
     told = []
 
     def make():
-        topics = Topics({"estop": Bool, "lock": Bool}, {"estop": lambda message: message.data})
+        topics = Topics({"estop": Bool, "lock": Bool}, {"estop": attrgetter("data")})
         paths = str(folder / "sensors.sock"), str(folder / "estop.sock")
         made.append(SocketSensors(paths[0], bind(paths[1]), topics, lambda _, sentence: told.append(sentence)))
         return made[-1], told

@@ -11,7 +11,7 @@ from skytether.guard import loop
 from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
 from skytether.guard.loop import Guard
-from skytether.guard.protocol import Beat, pack_answer, pack_beat
+from skytether.guard.protocol import Answer, Beat, pack_answer, pack_beat
 from skytether.guard.record import decode
 from skytether.guard.settings import Settings
 from skytether.guard.velocity import STANDSTILL
@@ -65,7 +65,7 @@ def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, unread, before,
     """Also when it dies with answers unread, or between two looks of the guard."""
     (gate,) = Played.made
     if unread:
-        gate.socket.send(pack_answer(loop.Answer(0.0)))
+        gate.socket.send(pack_answer(Answer(0.0)))
     generation = guard._latch.generation
     for _ in range(before):
         gate.theirs.send(pack_beat(Beat(guard._clock(), STANDSTILL, generation)))

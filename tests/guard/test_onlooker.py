@@ -2,12 +2,12 @@
 
 import errno
 import os
+import socket
 import sys
 import time
 
 import pytest
 
-from skytether.guard import child
 from skytether.guard.log import Log
 from skytether.guard.onlooker import Onlooker
 
@@ -81,7 +81,7 @@ def test_without_a_descriptor_left_it_is_tried_again_later(look, monkeypatch):
 
     onlooker = look(LIVES)
     with monkeypatch.context() as patch:
-        patch.setattr(child.socket, "socketpair", none_left)
+        patch.setattr(socket, "socketpair", none_left)
         onlooker.turn(100.0)
     assert onlooker.trouble == "the display cannot be started: Too many open files"
     onlooker.turn(109.0)

@@ -6,6 +6,7 @@ import runpy
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,7 @@ def test_rosbags_reads_it(tmp_path: Path) -> None:
     harness.stop()
     with AnyReader([only_file(tmp_path)]) as reader:
         found = [
-            (connection.topic, time, reader.deserialize(data, connection.msgtype).ranges.tolist())
+            (connection.topic, time, attrgetter("ranges")(reader.deserialize(data, connection.msgtype)).tolist())
             for connection, time, data in reader.messages()
         ]
     assert found == [("scan", 1_700_000_100_000_000_000 + n * 50_000_000, [float(n)]) for n in range(3)]

@@ -116,8 +116,8 @@ class GroupsBench:
         bench = self
 
         class There(FakeRuntime):
-            def __init__(self, site: str, *rest: Any) -> None:
-                super().__init__(site, *rest, bench.worlds.setdefault(site, FakeWorld()))
+            def __init__(self, site: str, folder: Any, options: Any) -> None:
+                super().__init__(site, folder, options, bench.worlds.setdefault(site, FakeWorld()))
 
             def refuses(self, spec: Any) -> str | None:
                 return bench.refusing or super().refuses(spec)
@@ -132,8 +132,8 @@ class GroupsBench:
         bench = self
 
         class InCloud(FakeProvider):
-            def __init__(self, *given: Any) -> None:
-                super().__init__(*given, bench.cloud)
+            def __init__(self, group: str, owner: str, folder: Any, options: Any) -> None:
+                super().__init__(group, owner, folder, options, bench.cloud)
 
             def offer(self) -> Capacity:
                 offer = super().offer()

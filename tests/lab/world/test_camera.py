@@ -58,8 +58,8 @@ def test_the_face_is_in_view_and_turns_to_the_side_it_looks_to(gl: None) -> None
 def test_pictures_have_noise_by_a_seed_and_the_size_of_the_thesis(gl: None) -> None:
     def run(seed: int) -> tuple[np.ndarray, np.ndarray, int]:
         with FaceStudio(seed) as studio:
-            pair = [studio.draw(0.2, 1.0, robot=Pose(1.0, 0.5, 2.0)) for _ in range(2)]
-            return *pair, len(studio.sensor.jpeg(pair[0]))
+            first, second = (studio.draw(0.2, 1.0, robot=Pose(1.0, 0.5, 2.0)) for _ in range(2))
+            return first, second, len(studio.sensor.jpeg(first))
 
     (first, second, size), (again, _, _), (other, _, _) = run(1), run(1), run(2)
     assert (first == again).all()

@@ -79,7 +79,7 @@ def test_pictures(tmp_path) -> None:
     with Image.open(tmp_path / "run.png") as picture:
         assert picture.size[0] > 1000
     with Image.open(tmp_path / "run.gif") as moving:
-        assert moving.n_frames >= 3
+        moving.seek(2)  # there are three at least
 
 
 @pytest.mark.slow

@@ -15,10 +15,10 @@ from node_scene import NodeScene, ReachedRuntime, program, until
 from skytether.api.client import ApiError, Client
 from skytether.api.node import Issued, Join, Leave, Link, Linked, Stands
 from skytether.api.rest import InstanceCreate, Invite, SiteCreate, State, TokenCreate
-from skytether.node import calls, join
+from skytether.node import calls, checks, join, unit
 from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.join import ChecksError, leave
-from skytether.node.store import NodeError, new_key, request_for
+from skytether.node.store import NodeError, NodeStore, new_key, request_for
 
 DAY = 86_400.0
 
@@ -263,7 +263,7 @@ def test_a_folder_that_cannot_be_written_after_all_takes_everything_back(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(join.NodeStore, "save", full)
+        patch.setattr(NodeStore, "save", full)
         assert "No space left on device; nothing is left of the join" in said(
             lambda: join.join(nodes.options(nodes.invite()))
         )
@@ -400,10 +400,10 @@ class MadeUpSystemd:
         self.texts: list[str] = []
         self.trouble = ""
         self._nodes = nodes
-        monkeypatch.setattr(join.checks, "look_at_rights", lambda *_, **__: join.Finding("rights", "made up"))
-        monkeypatch.setattr(join.unit, "install", self.install)
-        monkeypatch.setattr(join.unit, "remove", self.stack.close)
-        monkeypatch.setattr(join.unit, "trouble", lambda: self.trouble)
+        monkeypatch.setattr(checks, "look_at_rights", lambda *_, **__: checks.Finding("rights", "made up"))
+        monkeypatch.setattr(unit, "install", self.install)
+        monkeypatch.setattr(unit, "remove", self.stack.close)
+        monkeypatch.setattr(unit, "trouble", lambda: self.trouble)
         monkeypatch.setattr(join, "_LOOK_S", 0.05)
 
     def install(self, text: str) -> None:

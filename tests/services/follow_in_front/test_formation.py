@@ -92,7 +92,8 @@ def test_speed_and_acceleration_keep_their_limits_and_it_never_drives_back() -> 
     for _ in range(600):
         now += float(random.uniform(0.01, 0.15))
         if random.random() < 0.8:
-            formation.legs(*random.uniform((-3, -1, -2, -2), (0.5, 1, 2, 2)).tolist(), now)
+            x, y, vx, vy = random.uniform((-3, -1, -2, -2), (0.5, 1, 2, 2)).tolist()
+            formation.legs(x, y, vx, vy, now)
         if random.random() < 0.8:
             formation.face(float(random.uniform(-2, 2)), now)
         linear, angular = formation.step(now).velocity

@@ -17,6 +17,7 @@ LIES[Twist.TYPE] = Twist(Vector3(x=5.0))
 
 class Attack(Service):
     rate_hz = 50.0
+    lies: dict = {}
 
     def step(self, now):
         del now

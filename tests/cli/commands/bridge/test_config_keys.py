@@ -28,7 +28,11 @@ RELAY = {
     "kubernetes": {"kubeconfig": "k", "context": "c", "namespace": "n", "owner": "o"},
     "limits": {"sessions": 1, "addresses": 1, "newcomers": 1, "rate_mbps": 1, "idle_s": 1},
 }  # fmt: skip
-ROOTS = {"robot": (BridgeConfig, ROBOT), "both": (BridgeConfig, BOTH), "relay": (RelayConfig, RELAY)}
+ROOTS: dict[str, tuple[type, dict]] = {
+    "robot": (BridgeConfig, ROBOT),
+    "both": (BridgeConfig, BOTH),
+    "relay": (RelayConfig, RELAY),
+}
 
 
 def leaves(document, place=()):

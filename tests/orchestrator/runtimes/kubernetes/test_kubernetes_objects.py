@@ -20,7 +20,6 @@ from skytether.orchestrator.runtimes.kubernetes.objects import (
     free_port,
     openings_policy,
     pod,
-    quantity,
     refusal,
     secret,
     site_policy,
@@ -29,6 +28,7 @@ from skytether.orchestrator.runtimes.kubernetes.objects import (
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 from skytether.orchestrator.runtimes.kubernetes.pods import Pods
 from skytether.orchestrator.runtimes.kubernetes.relayed import routes_of
+from skytether.orchestrator.runtimes.kubernetes.resize import quantity
 from skytether.orchestrator.runtimes.kubernetes.seen import Seen, observation, parse
 
 KEY = base64.b64encode(bytes(range(32))).decode()
