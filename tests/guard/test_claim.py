@@ -24,6 +24,13 @@ def claim(tmp_path):
     return claim
 
 
+def lock_of(folder):
+    """The descriptor that has the folder, which the kernel closes for a guard that dies."""
+    lock = str(folder / LOCK_FILE)
+    (held,) = (int(n) for n in os.listdir("/proc/self/fd") if os.path.realpath(f"/proc/self/fd/{n}") == lock)
+    return held
+
+
 @pytest.mark.parametrize("name", [LOCK_FILE, "stop.sock"])
 @pytest.mark.parametrize("again", [False, True])
 def test_a_file_that_is_removed_or_replaced_is_a_folder_that_is_lost(claim, tmp_path, name, again):
@@ -74,7 +81,7 @@ def test_a_guard_that_listens_is_not_waited_for(claim, tmp_path):
 
 def test_one_that_ends_is_waited_for(claim, tmp_path):
     """It has closed its sockets, and waits for its disk."""
-    ends = threading.Timer(0.2, os.close, [claim._lock])
+    ends = threading.Timer(0.2, os.close, [lock_of(tmp_path / "run")])
     ends.start()
     Claim(str(tmp_path / "run"), 60.0)
     ends.join()
@@ -90,9 +97,10 @@ def link():
 
 def test_what_is_left_of_a_guard_has_the_folder_until_it_ends(claim, link, tmp_path):
     folder = str(tmp_path / "run")
+    held = lock_of(tmp_path / "run")
     gate, writer = Heir(folder, link), Heir(folder, link)
     assert not gate.may()
-    os.close(claim._lock)  # it died
+    os.close(held)  # it died
     assert gate.may()
     assert writer.may()
     with pytest.raises(ClaimError):

@@ -175,21 +175,24 @@ def test_a_stop_outlives_a_reboot_that_empties_the_folder(tmp_path):
     path, lasting = tmp_path / "run" / "latch", lasting_file(str(tmp_path / "run"), str(tmp_path / "lib" / "record"))
     path.parent.mkdir()
 
-    def boot(name):
-        return KeptEstop(EstopFile(str(path), name, pytest.fail, lasting))
+    keepers = {}
 
-    def say(latch, act):
-        latch._keeper.start()
+    def boot(name):
+        keepers[name] = EstopFile(str(path), name, pytest.fail, lasting)
+        return KeptEstop(keepers[name])
+
+    def say(name, latch, act):
+        keepers[name].start()
         act(latch)
         wait(lambda: latch.kept)
         path.unlink()
 
     first = boot("first")
     assert first.reason == FIRST_ACT
-    say(first, lambda latch: latch.stop("somebody fell"))
+    say("first", first, lambda latch: latch.stop("somebody fell"))
     second = boot("second")
     assert second.reason == "somebody fell (before the guard was started again)"
-    say(second, lambda latch: latch.reset(latch.generation))
+    say("second", second, lambda latch: latch.reset(latch.generation))
     assert boot("third").reason == FIRST_ACT, "a machine that was started is reset by a person"
 
 
