@@ -1,9 +1,10 @@
 """The guard's loop and its children: what one that ends said last."""
 
+import json
 import os
 import socket
 import time
-from pathlib import Path
+from contextlib import suppress
 
 import pytest
 
@@ -11,10 +12,14 @@ from skytether.guard import loop
 from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
 from skytether.guard.loop import Guard
-from skytether.guard.protocol import Answer, Beat, pack_answer, pack_beat
+from skytether.guard.protocol import LARGEST, STOP_SOCKET, Answer, Beat, pack_answer, pack_beat, unpack_answer
 from skytether.guard.record import decode
 from skytether.guard.settings import Settings
 from skytether.guard.velocity import STANDSTILL
+
+LARGEST_ANSWER = 65_536
+NOW = 100.0
+"""Time stands still: a reset that waited for too long would not count."""
 
 
 class Played:
@@ -26,11 +31,31 @@ class Played:
         self.name, self.heard_at, self.gone, self.pid = name, None, False, 1
         self.socket, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.socket.setblocking(False)
-        self.why = ""
+        self.theirs.setblocking(False)
+        self.newest = None
+        self.dies = None
+        """What it does last, between two looks of the guard."""
         Played.made.append(self)
 
+    def say(self, **beat):
+        self.theirs.send(pack_beat(Beat(NOW, STANDSTILL, **beat)))
+
+    def heard(self):
+        """What the guard answered last."""
+        while True:
+            try:
+                self.newest = unpack_answer(self.theirs.recv(LARGEST))
+            except BlockingIOError:
+                return self.newest
+
     def ended(self, now):
-        return self.why or ("ended" if self.gone else "")
+        if self.dies:
+            self.dies()
+            return "ended with status -9"
+        return "ended" if self.gone else ""
+
+    def leave(self):
+        pass
 
     def end(self):
         self.socket.close()
@@ -49,54 +74,73 @@ def guard(tmp_path, monkeypatch):
     settings = Settings(
         str(run), str(tmp_path / "record"), 0.02, 0.1, bounds, str(run / "wheels.sock"), None, ("gate",), (), config
     )
-    made = Guard(settings, Log("guard", os.open(os.devnull, os.O_WRONLY)), [])
+    made = Guard(settings, Log("guard", os.open(os.devnull, os.O_WRONLY)), [], lambda: NOW)
     made.turn()  # starts the gate
-    made._latch.reset(made._latch.generation)
+    (gate,) = Played.made
+    gate.say()
     made.turn()
+    gate.say(seen=gate.heard().generation, reset=True)
+    made.turn()
+    assert gate.heard().stopped == ""
     yield made
-    made._requests.close()
+    made.run(lambda: True)
     os.close(config)
+
+
+def ask(guard, folder, **request):
+    """As a person does, on the guard's socket; its answer."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as person:
+        person.connect(str(folder / "run" / STOP_SOCKET))
+        person.send(json.dumps(request).encode())
+        person.setblocking(False)
+        end = time.monotonic() + 30
+        while time.monotonic() < end:
+            guard.turn()
+            with suppress(BlockingIOError):
+                return json.loads(person.recv(LARGEST_ANSWER))
+    pytest.fail("no answer")
 
 
 @pytest.mark.parametrize("unread", [False, True])
 @pytest.mark.parametrize("before", [0, 100])
 @pytest.mark.parametrize("reaped", [False, True])
-def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, unread, before, reaped):
+def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, tmp_path, unread, before, reaped):
     """Also when it dies with answers unread, or between two looks of the guard."""
     (gate,) = Played.made
+    generation = gate.heard().generation
     if unread:
         gate.socket.send(pack_answer(Answer(0.0)))
-    generation = guard._latch.generation
-    for _ in range(before):
-        gate.theirs.send(pack_beat(Beat(guard._clock(), STANDSTILL, generation)))
-    gate.theirs.send(pack_beat(Beat(guard._clock(), STANDSTILL, generation, stopped="somebody fell")))
-    gate.theirs.close()
+
+    def say_last():
+        for _ in range(before):
+            gate.say(seen=generation)
+        gate.say(seen=generation, stopped="somebody fell")
+        gate.theirs.close()
+        gate.dies = None
+
     if reaped:
-        gate.why = "ended with status -9"
-        guard._look_after(guard._clock())
+        gate.dies = say_last
     else:
+        say_last()
         guard.turn()
-        guard.turn()
-    assert guard._latch.reason == "somebody fell"
+    guard.turn()
+    assert ask(guard, tmp_path, do="status")["stopped"] == "somebody fell"
 
 
-def test_each_stop_reset_and_death_is_in_the_event_record(guard):
+def test_each_stop_reset_and_death_is_in_the_event_record(guard, tmp_path):
     (gate,) = Played.made
-    now = guard._clock()
-    guard._clock = lambda: now  # a reset that waited for too long would not count
-    gate.theirs.send(pack_beat(Beat(now, STANDSTILL, guard._latch.generation, stopped="somebody fell")))
+    generation = gate.heard().generation
+    gate.say(seen=generation, stopped="somebody fell")
     guard.turn()
-    gate.theirs.send(pack_beat(Beat(now, STANDSTILL, guard._latch.generation, reset=True)))
+    gate.say(seen=gate.heard().generation, reset=True)
     guard.turn()
-    guard._answer({"do": "stop", "reason": "a fire"})
-    gate.why = "ended with status -9"
-    guard._look_after(now)
-    end = time.monotonic() + 30
-    while not guard._record.written:
-        assert time.monotonic() < end
-        time.sleep(0.001)
-    found = [(e["who"], e["what"], e["detail"]) for e in decode(Path(guard._settings.record).read_bytes())]
-    assert [event for event in found if event[1] in ("stop", "reset", "death")] == [
+    ask(guard, tmp_path, do="stop", reason="a fire")
+    gate.dies = gate.theirs.close
+    guard.turn()
+    guard.run(lambda: True)  # until all is on disk
+    found = [(e["who"], e["what"], e["detail"]) for e in decode((tmp_path / "record").read_bytes())]
+    events = [event for event in found if event[1] in ("stop", "reset", "death")]
+    assert events[1:] == [  # after the reset of the start
         ("gate", "stop", "somebody fell"),
         ("person", "reset", "the emergency stop was reset"),
         ("person", "stop", "a fire"),
