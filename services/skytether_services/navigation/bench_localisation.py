@@ -33,6 +33,8 @@ RIGHT_M, RIGHT_RAD = 0.5, math.radians(10)
 """A pose as near as this is right, where the robot was found."""
 FOUND_S, FOUND_AGAIN_S = 10.0, 15.0
 """Of driving, within which it is to be found; and after it was carried away."""
+IN_MAP = 0.5
+"""Where less of the way is on floor that the map shows, nothing can be expected to find the robot: it counts apart."""
 WARM_UP = 20
 """First updates, which compile and fill caches; they are not among the update times of the first seed."""
 
@@ -234,6 +236,8 @@ def _global(
         "global_right": sum(row["right"] for row in rows),
         "global_sure": sum(row["sure"] for row in rows),
         "global_sure_and_wrong": sum(row["sure_and_wrong"] for row in rows),
+        "global_in_map": sum(row["way_in_map"] >= IN_MAP for row in rows),
+        "global_in_map_right": sum(row["way_in_map"] >= IN_MAP and row["right"] for row in rows),
         "global_each": rows,
         "search_p99_ms": round(float(np.percentile(search_ms, 99)), 1) if search_ms else None,
     }
@@ -247,8 +251,7 @@ def _kidnapped(
     mapped = _on_floor(field, data.truth)
     possible = np.nonzero(mapped & (driven >= 5) & (driven <= driven[-1] - FOUND_AGAIN_S))[0]
     random = np.random.default_rng((seed, 3))
-    found = 0
-    seconds: list[float] = []
+    rows: list[dict[str, Any]] = []
     for number in range(kidnaps):
         data = drive(2000 * seed + number)
         places = [
@@ -268,19 +271,43 @@ def _kidnapped(
         estimate = localisation.update(np.zeros(3), data.points[after])
         index = after
         when: float | None = None
+        noticed: float | None = None
+        wrong = False
         while index + 1 < len(driven) and driven[index + 1] - driven[after] <= FOUND_AGAIN_S:
             index += 1
             estimate = localisation.update(data.steps[index], data.points[index])
-            if not (estimate.sure and is_right(estimate, data.truth[index])):
+            now = round(float(driven[index] - driven[after]), 1)
+            right = is_right(estimate, data.truth[index])
+            if not estimate.sure and noticed is None:
+                noticed = now
+            # Until it is noticed it is sure of where it was.
+            wrong |= noticed is not None and estimate.sure and not right
+            if not (estimate.sure and right):
                 when = None
             elif when is None:
-                when = float(driven[index] - driven[after])
-        found += when is not None
-        if when is not None:
-            seconds.append(when)
+                when = now
+        seen = _on_floor(field, data.truth[after : index + 1])
+        rows.append(
+            {
+                "truth": np.round(data.truth[index], 2).tolist(),
+                "estimate": np.round(estimate.pose, 2).tolist(),
+                "noticed_after_s": noticed,
+                "found_after_s": when,
+                "sure": estimate.sure,
+                "sure_and_wrong": wrong or (estimate.sure and when is None),
+                "way_in_map": round(float(seen.mean()), 2),
+            }
+        )
         progress(f"kidnap {number}: found again after {when} s, sure {estimate.sure}")
+    seconds = [row["found_after_s"] for row in rows if row["found_after_s"] is not None]
     return {
         "kidnaps": kidnaps,
-        "kidnaps_found_again": int(found),
+        "kidnaps_found_again": len(seconds),
         "kidnaps_found_p95_s": round(float(np.percentile(seconds, 95)), 1) if seconds else None,
+        "kidnaps_sure_and_wrong": sum(row["sure_and_wrong"] for row in rows),
+        "kidnaps_in_map": sum(row["way_in_map"] >= IN_MAP for row in rows),
+        "kidnaps_in_map_found_again": sum(
+            row["way_in_map"] >= IN_MAP and row["found_after_s"] is not None for row in rows
+        ),
+        "kidnaps_each": rows,
     }

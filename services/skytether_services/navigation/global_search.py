@@ -145,9 +145,11 @@ def search(
     poses = np.array([hypothesis.pose for hypothesis in found])
     best = [found[index] for index in distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
     best = [_climb(field, hypothesis, starts[more], ends[more], floor, params) for hypothesis in best]
-    return sorted(
-        (judge(field, one.pose, starts, ends, floor) for one in best), key=lambda hypothesis: -hypothesis.score
-    )
+    best = [judge(field, one.pose, starts, ends, floor) for one in best]
+    best.sort(key=lambda hypothesis: -hypothesis.score)
+    # Two may have moved to the same place.
+    poses = np.array([hypothesis.pose for hypothesis in best])
+    return [best[index] for index in distinct(poses, params.apart, params.apart_turn, params.hypotheses)]
 
 
 def _coarse(field: LikelihoodField, points: Array, params: SearchParams) -> Array:

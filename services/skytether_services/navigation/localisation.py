@@ -35,12 +35,28 @@ from skytether_services.navigation.likelihood_field import (
     score_poses,
 )
 from skytether_services.navigation.motion_model import move_particles
-from skytether_services.navigation.particles import Cluster, bin_keys, heaviest_cluster, kld_count, low_variance_sample
+from skytether_services.navigation.particles import (
+    Cluster,
+    bin_keys,
+    bulk,
+    heaviest_cluster,
+    kld_count,
+    low_variance_sample,
+)
 from skytether_services.navigation.poses import between, compose, wrap
 from skytether_services.navigation.scan_matching import with_normals
 from skytether_services.navigation.scan_odometry import ScanOdometry, ScanOdometryParams
 
 Array = NDArray[np.float64]
+
+
+_BULK = 2.5
+"""Standard deviations of a cloud of particles within which one is looked for that the map explains: where it explains
+nothing, as in a room that it lacks, some particle far out finds walls that fit by chance."""
+
+
+_AS_USUAL = 0.8
+"""Of what scans continued before one that did not: then a robot that stood all the time is where it was."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +79,7 @@ class LocalisationParams:
         gathered: Up to this standard deviation the middle of the particles tells which beams the map explains [m].
         update_distance: The map is asked after so much motion [m].
         update_turn: Or after so much turning [rad].
+        renewed_distance: A match of scans errs independently of one so much motion before [m].
         cluster_radius: Particles as near as this are in the same place [m].
         cluster_turn: And in heading [rad].
         scans: How scans are matched with each other.
@@ -79,7 +96,8 @@ class LocalisationParams:
             robot is in a room that the map lacks.
         doubt_telling: And while at least this share of all beams is telling.
         doubt_distance: For so much motion [m]; motion with scans that agree is taken off.
-        doubt_search: Then the map is searched after so much motion, and each time in vain after twice as much [m].
+        doubt_search: Then the map is searched after so much motion, and each time in vain after twice as much; where it
+            seems to have been carried away, at most after so much [m].
         doubt_search_most: But after so much at most [m].
         carried_from: Share of all beams that the map explained before scans broke off, for a robot to be carried away.
         carried_to: And at most this share after it.
@@ -100,6 +118,7 @@ class LocalisationParams:
     gathered: float = 0.15
     update_distance: float = 0.05
     update_turn: float = 0.03
+    renewed_distance: float = 0.7
     cluster_radius: float = 0.6
     cluster_turn: float = math.radians(30)
     scans: ScanOdometryParams = field(default_factory=ScanOdometryParams)
@@ -165,9 +184,9 @@ class Localisation:
         self._sure = self._believed = False
         self._since_asked = np.zeros(3)
         self._since_search = math.inf
-        self._search_wait = 0.0
+        self._search_wait = self._search_most = 0.0
         self._kept_before = self._searches = 0
-        self._agreed = self._doubted = self._regained = 0.0
+        self._agreed = self._doubted = self._regained = self._usual = 0.0
         self._hypotheses: list[Array] = []
         self._before: deque[float] = deque(maxlen=10)
         self._estimate: Estimate | None = None
@@ -214,22 +233,31 @@ class Localisation:
         points = points[np.hypot(points[:, 0] - origin[0], points[:, 1] - origin[1]) <= params.max_beam]
         scan = self._odometry.update(step, with_normals(points, origin))
         travelled = _length(scan.motion)
-        # A robot that stands is matched with the same scans again and again: those errors do not add up.
-        covariance = scan.covariance * min(1.0, travelled / params.update_distance + 1e-6)
+        # A scan is matched with the same surfaces as the one before: errors add up only as others come into sight, and
+        # those of a robot that stands do not.
+        renewed = params.renewed_distance if scan.matched else params.update_distance
+        covariance = scan.covariance * min(1.0, travelled / renewed + 1e-6)
         self.particles = move_particles(self.particles, scan.motion, covariance, self._random)
         self._hypotheses = [compose(pose, scan.motion) for pose in self._hypotheses]
         self._since_search += travelled
         self._since_asked = compose(self._since_asked, scan.motion)
         away = self._since_asked
         still = math.hypot(away[0], away[1]) < params.update_distance and abs(away[2]) < params.update_turn
-        if still and self._estimate is not None and not scan.broken:
+        # What is carried away does not turn its wheels; one that drives sees nothing new at once but what stands in its
+        # way.
+        carried = scan.jumped and _length(step) < params.update_distance
+        if still and self._estimate is not None and not (scan.broken or carried):
+            if self._usual and scan.overlap >= _AS_USUAL * self._usual:
+                # Somebody stood before the laser.
+                self._sure, self._usual = True, 0.0
             pose = compose(self._estimate.pose, scan.motion)
-            self._estimate = replace(self._estimate, pose=pose, searched=False)
+            self._estimate = replace(self._estimate, pose=pose, sure=self._sure, searched=False)
             return self._estimate
+        self._usual = scan.usual if carried and self._sure else 0.0
         self._since_asked = np.zeros(3)
         if self._believed:
             # By where it is, not by its way: what trembles does not drive.
-            self._estimate = self._track(points, origin, _length(away), scan.broken)
+            self._estimate = self._track(points, origin, _length(away), scan.broken, carried)
         if not self._believed:
             self._estimate = self._find(points, origin)
         assert self._estimate is not None  # noqa: S101 - one of both was done
@@ -242,7 +270,7 @@ class Localisation:
 
     def _believe(self) -> None:
         self._sure = self._believed = True
-        self._doubted = self._regained = 0.0
+        self._doubted = self._regained = self._usual = 0.0
         self._hypotheses = []
         self._search_wait = self.params.doubt_search
         self._kept_before = self._odometry.kept
@@ -250,6 +278,7 @@ class Localisation:
 
     def _disbelieve(self) -> None:
         self._sure = self._believed = False
+        self._usual = 0.0
         self._since_search = math.inf
         self._search_wait = self.params.search_distance
         self._kept_before = 0
@@ -261,7 +290,7 @@ class Localisation:
 
     # Tracking
 
-    def _track(self, points: Array, origin: Array, travelled: float, broken: bool) -> Estimate:
+    def _track(self, points: Array, origin: Array, travelled: float, broken: bool, carried: bool) -> Estimate:
         params = self.params
         if len(points) > params.beams:
             points = points[np.linspace(0, len(points) - 1, params.beams).astype(np.int64)]
@@ -270,7 +299,8 @@ class Localisation:
         at = cluster.mean
         if _deviation(cluster) > params.gathered:
             # The middle of a wide cloud may explain nothing, though some particle is right.
-            at = self.particles[int(score_poses(self._field, self.particles, points).argmax())]
+            near = self.particles[bulk(self.particles, self.weights, _BULK)]
+            at = near[int(score_poses(self._field, near, points).argmax())]
         beams = compare_beams(self._field, at, starts, points)
         fits = beams == EXPLAINED
         # What stands in the open, on no map, says nothing of where the robot is.
@@ -281,7 +311,7 @@ class Localisation:
         self._weigh(points[fits], alike * min(max(trust, 0.0), 1.0))
         cluster = self._cluster()
         seen = explain(self._field, cluster.mean, starts, points)
-        self._judge(cluster, seen, travelled, broken)
+        self._judge(cluster, seen, travelled, broken, carried)
         searched = self._believed and not self._sure and self._since_search >= self._search_wait
         if searched and self._search_beside(cluster.mean, origin):
             cluster = self._cluster()
@@ -308,7 +338,7 @@ class Localisation:
         count = min(max(count, params.min_particles), params.max_particles)
         self._spread(self.particles[low_variance_sample(self.weights, count, float(self._random.random()))])
 
-    def _judge(self, cluster: Cluster, seen: Explained, travelled: float, broken: bool) -> None:
+    def _judge(self, cluster: Cluster, seen: Explained, travelled: float, broken: bool, carried: bool) -> None:
         """Whether the pose is still believed, and sure."""
         params = self.params
         explained = seen.share * seen.known
@@ -316,6 +346,9 @@ class Localisation:
         if broken and before >= params.carried_from and explained <= params.carried_to:
             self._disbelieve()
             return
+        if broken or carried:
+            # Carried to a place that looks alike, or from or to one that the map lacks; or all around it has changed.
+            self._doubt(params.search_distance, params.doubt_search)
         self._before.append(explained)
         tells = seen.known >= params.doubt_known and seen.telling >= params.doubt_telling
         contradicts = tells and seen.against > params.doubt_share
@@ -327,10 +360,16 @@ class Localisation:
         if self._sure and not contradicts:
             self._kept_before = self._odometry.kept
         if self._sure and (wide or self._doubted >= params.doubt_distance):
-            self._sure = False
-            self._since_search, self._search_wait, self._agreed = 0.0, params.doubt_search, 0.0
+            self._doubt(params.doubt_search, params.doubt_search_most)
         elif not self._sure and not wide and self._regained >= params.sure_distance:
-            self._sure = True
+            # Unless the last search liked another place better.
+            self._sure = not self._hypotheses or self._is_same(self._hypotheses[0], cluster.mean)
+
+    def _doubt(self, wait: float, most: float) -> None:
+        """Be no longer sure of the pose, and search the map beside it: first after so much motion, at last each [m]."""
+        self._sure = False
+        self._since_search, self._search_wait, self._search_most = 0.0, wait, most
+        self._agreed = self._regained = 0.0
 
     # Search
 
@@ -386,14 +425,19 @@ class Localisation:
         self._since_search = 0.0
         first = found[0]
         lead = first.score - found[1].score if len(found) > 1 else math.inf
-        good = first.explained.known >= params.sure_known and lead >= lead_needed(first.explained.share, params)
+        known = first.explained.known >= params.sure_known
+        credit = lead_credit(lead, first.explained.share, params) if known else 0.0
+        good = credit == 1.0
+        if self._believed and not good:
+            # What is believed is given up for nothing less.
+            credit = 0.0
         same = bool(self._hypotheses) and self._is_same(first.pose, self._hypotheses[0])
-        self._agreed = self._agreed + driven if good and same else 0.0
+        self._agreed = self._agreed + credit * driven if same else 0.0
         self._hypotheses = [hypothesis.pose for hypothesis in found]
         if self._agreed < params.sure_distance:
             if self._believed:
                 # What looks good is soon looked at again.
-                wait = min(2 * max(self._search_wait, params.doubt_search / 2), params.doubt_search_most)
+                wait = min(2 * max(self._search_wait, params.doubt_search / 2), self._search_most)
                 self._search_wait = params.search_distance if good else wait
             return found
         self._spread(self._random.multivariate_normal(first.pose, np.diag([0.01, 0.01, 0.001]), params.max_particles))
@@ -431,6 +475,16 @@ def lead_needed(share: float, params: LocalisationParams) -> float:
     if share < params.least_share:
         return math.inf
     return params.sure_lead + max(0.0, params.sure_share - share)
+
+
+def lead_credit(lead: float, share: float, params: LocalisationParams) -> float:
+    """Which part of the motion within one place counts, by the lead with which it is the best, from 0 to 1.
+
+    A place like others leads by less than is needed, but then it leads again and again. Less than half of that is
+    chance.
+    """
+    part = lead / lead_needed(share, params) if share >= params.least_share else 0.0
+    return min(part, 1.0) if part >= 0.5 else 0.0
 
 
 def _length(motion: Array) -> float:

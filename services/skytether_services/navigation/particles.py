@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether_services.navigation.compiled import compiled
+from skytether_services.navigation.poses import wrap
 
 Array = NDArray[np.float64]
 
@@ -119,6 +120,16 @@ def moments(particles: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted mean and covariance of poses; headings as directions."""
     mean, covariance, _ = _moments(particles, weights, np.ones(len(particles), np.bool_))
     return mean, covariance
+
+
+def bulk(particles: Array, weights: Array, deviations: float) -> NDArray[np.bool_]:
+    """Which poses are within so many standard deviations of their weighted mean (Mahalanobis' distance)."""
+    mean, covariance = moments(particles, weights)
+    away = particles - mean
+    away[:, 2] = wrap(away[:, 2])
+    information = np.linalg.inv(covariance + np.diag([1e-6, 1e-6, 1e-6]))
+    inside: NDArray[np.bool_] = np.einsum("ij,jk,ik->i", away, information, away) <= deviations**2
+    return inside
 
 
 @compiled

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 _INDEPENDENT = 0.1
 """Part of a scan's points that err independently of their neighbours."""
+_RECENT = 5
+"""Scans before one that it is compared with, by how well they continued what was seen."""
 _FLOOR = np.diag([0.005**2, 0.005**2, 0.0015**2])
 """Covariance of a perfect match [m², rad²]."""
 
@@ -39,6 +42,7 @@ class ScanOdometryParams:
         near_scans: So many of them, the nearest, are what the next scan is matched with.
         continues: Share of the points on surfaces that have to lie on what was seen before, for a scan to continue it.
         trusted: With this share a match from where the wheels say is good enough; below it, others are looked for.
+        jump: A scan jumped whose share is less than this part of that of the scans just before.
         strange: After so many scans on end that do not continue it, what was seen before is forgotten.
     """
 
@@ -50,6 +54,7 @@ class ScanOdometryParams:
     near_scans: int = 40
     continues: float = 0.3
     trusted: float = 0.3
+    jump: float = 0.5
     strange: int = 4
 
 
@@ -78,12 +83,24 @@ class ScanStep:
         overlap: Share of the scan's points on surfaces that lie on what was seen before; 1 if there is nothing to
             compare with.
         broken: Whether what was seen before was forgotten, because too many scans did not continue it.
+        matched: Whether the motion is by a match of scans; else it is the wheels'.
+        jumped: Whether the scan is the first that continues what was seen before much less than those before it, as
+            when the robot was carried away.
+        usual: Median overlap of those scans; 0 where they are too few.
     """
 
     motion: Array
     covariance: Array
     overlap: float
     broken: bool
+    matched: bool
+    jumped: bool
+    usual: float
+
+
+def usual_overlap(before: Sequence[float]) -> float:
+    """Median overlap of the scans just before; 0 where they are too few."""
+    return sorted(before)[len(before) // 2] if len(before) >= _RECENT else 0.0
 
 
 class ScanOdometry:
@@ -105,6 +122,7 @@ class ScanOdometry:
         self._poses: Array = np.zeros((0, 3))
         self._last: Array = np.zeros(3)
         self._strange = 0
+        self._overlaps: deque[float] = deque(maxlen=_RECENT)
 
     def forget(self) -> None:
         """Begin anew: the next scan continues nothing."""
@@ -112,6 +130,7 @@ class ScanOdometry:
         self._poses = np.zeros((0, 3))
         self._patch = None
         self._strange = 0
+        self._overlaps.clear()
 
     def update(self, step: Array, points: Array) -> ScanStep:
         """Take a step of the wheels and the scan after it.
@@ -124,7 +143,7 @@ class ScanOdometry:
         before = self.pose
         prior = odometry_information(step, params.odometry_m, params.odometry_rad)
         motion, covariance = step, np.asarray(np.linalg.inv(prior), np.float64)
-        overlap, broken = 1.0, False
+        overlap, broken, matched = 1.0, False, False
         if self._patch is not None and len(points) >= FEWEST:
             reach = (0.1 + 0.5 * math.hypot(step[0], step[1]), 0.05 + 0.5 * abs(float(step[2])))
             # Only points on a surface can lie on one.
@@ -133,7 +152,7 @@ class ScanOdometry:
             fit = match_next(self._patch, points, before, step, held, reach, params.trusted * on_surfaces)
             overlap = fit.overlap / on_surfaces
             if overlap >= params.continues:
-                self._strange = 0
+                self._strange, matched = 0, True
                 motion = between(before, fit.pose)
                 information = turned(fit.information, float(before[2])) * _INDEPENDENT
                 covariance = np.asarray(np.linalg.inv(information) + _FLOOR, np.float64)
@@ -145,7 +164,12 @@ class ScanOdometry:
             self.forget()
         if not self._strange and len(points) >= FEWEST:
             self._keep(points)
-        return ScanStep(motion, covariance, overlap, broken)
+        usual = usual_overlap(self._overlaps)
+        least = params.jump * usual
+        jumped = overlap < least <= self._overlaps[-1] if usual else False
+        if len(points) >= FEWEST:
+            self._overlaps.append(overlap)
+        return ScanStep(motion, covariance, overlap, broken, matched, jumped, usual)
 
     def _keep(self, points: Array) -> None:
         params = self.params

@@ -20,10 +20,18 @@ from skytether_services.navigation.likelihood_field import (
     explain,
     likelihood_field,
 )
-from skytether_services.navigation.localisation import LocalisationParams, lead_needed
+from skytether_services.navigation.localisation import LocalisationParams, lead_credit, lead_needed
 from skytether_services.navigation.motion_model import move_particles
-from skytether_services.navigation.particles import bin_keys, heaviest_cluster, kld_count, low_variance_sample, moments
+from skytether_services.navigation.particles import (
+    bin_keys,
+    bulk,
+    heaviest_cluster,
+    kld_count,
+    low_variance_sample,
+    moments,
+)
 from skytether_services.navigation.poses import between, compose, wrap
+from skytether_services.navigation.scan_odometry import usual_overlap
 
 
 def test_a_step_is_what_lies_between_its_ends() -> None:
@@ -118,6 +126,30 @@ def test_the_less_a_place_explains_the_more_it_has_to_lead() -> None:
     params = LocalisationParams(sure_share=0.7, sure_lead=0.25, least_share=0.4)
     needed = [lead_needed(share, params) for share in (0.39, 0.4, 0.6, 0.7, 1.0)]
     np.testing.assert_allclose(needed, [math.inf, 0.55, 0.35, 0.25, 0.25])
+
+
+def test_a_small_lead_counts_in_part_and_less_than_half_of_it_not_at_all() -> None:
+    params = LocalisationParams(sure_share=0.7, sure_lead=0.25, least_share=0.4)
+    # A share of 0.9 needs 0.25, one of 0.5 needs 0.45.
+    counted = [lead_credit(lead, 0.9, params) for lead in (0.5, 0.25, 0.2, 0.125, 0.12)]
+    np.testing.assert_allclose(counted, [1.0, 1.0, 0.8, 0.5, 0.0])
+    assert lead_credit(0.36, 0.5, params) == pytest.approx(0.8)
+    assert lead_credit(math.inf, 0.39, params) == 0.0
+
+
+def test_a_particle_far_out_is_not_in_the_bulk_of_them() -> None:
+    # Deviations of 1 m, 1 m and 0.1 rad about (0, 0, pi), with weights that leave the last one out of the mean.
+    corners = np.array([(x, y, math.pi + t) for x in (-1, 1) for y in (-1, 1) for t in (-0.1, 0.1)])
+    particles = np.vstack((corners, [[3.0, 0.0, math.pi], [0.0, 0.0, -math.pi]]))
+    particles[:, 2] = wrap(particles[:, 2])
+    weights = np.array([0.125] * 8 + [0.0, 0.0])
+    assert bulk(particles, weights, 2.5).tolist() == [True] * 8 + [False, True]
+
+
+def test_what_scans_usually_continue_is_not_changed_by_a_single_bad_one() -> None:
+    before = [0.8, 0.9, 0.1, 0.9, 0.9]
+    assert usual_overlap(before) == 0.9
+    assert usual_overlap(before[:4]) == 0.0
 
 
 def test_noise_is_in_proportion_to_the_motion() -> None:

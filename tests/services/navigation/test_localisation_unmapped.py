@@ -80,3 +80,23 @@ def test_a_pose_from_which_beams_pass_walls_is_doubted_in_such_a_field_too() -> 
     # It believes that it drives towards the near wall, and sees along the hall.
     estimates, _ = driven(np.array([2.0, 3.0, math.pi / 2]), np.array([0.8, 3.0, 0.0]), poles(), 12)
     assert not estimates[-1].sure
+
+
+def test_a_robot_that_was_carried_away_notices_it_and_one_whose_view_was_blocked_goes_on() -> None:
+    standing = poles()[::5]
+    start, elsewhere = np.array([0.8, 3.0, 0.0]), np.array([6.0, 1.5, 2.0])
+    localisation = Localisation(likelihood_field(hall()), np.random.default_rng(1))
+    localisation.place(start, np.diag([0.01, 0.01, 0.001]))
+    truth = start
+    for _ in range(20):
+        truth = compose(truth, STEP)
+        localisation.update(STEP, seen_from(truth, standing))
+    stand = np.zeros(3)
+    assert localisation.update(stand, seen_from(truth, standing)).sure
+    # A wall of people at 0.5 m before it: nothing of what was seen before is left. Then they go away.
+    crowd = 0.5 * np.column_stack((np.cos(ANGLES), np.sin(ANGLES)))
+    assert not localisation.update(stand, crowd).sure
+    assert localisation.update(stand, seen_from(truth, standing)).sure
+    # Carried away with standing wheels, it is not sure, and stays so while it stands.
+    assert not localisation.update(stand, seen_from(elsewhere, standing)).sure
+    assert not localisation.update(stand, seen_from(elsewhere, standing)).sure
