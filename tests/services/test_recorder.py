@@ -146,6 +146,25 @@ def test_rosbags_reads_it(tmp_path: Path) -> None:
     assert found == [("scan", 1_700_000_100_000_000_000 + n * 50_000_000, [float(n)]) for n in range(3)]
 
 
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_a_bag_that_nobody_closed_is_read_up_to_the_last_flush(tmp_path: Path, compression: str) -> None:
+    from rosbags.highlevel import AnyReader
+
+    harness = recorder(tmp_path, format="bag", flush_period=0.01, compression=compression)
+    offer(harness, scan="ros1 sensor_msgs/msg/LaserScan", odd="ros1 acme_msgs/msg/Odd")
+    for number in range(20):
+        harness.send("scan", encode(LaserScan(Header(Time(number)), ranges=[number]), "ros1"))
+        harness.send("odd", bytes(3))
+        harness.step()
+        with AnyReader(list(tmp_path.iterdir())) as reader:
+            scans = [c for c in reader.connections if c.topic == "scan"]
+            found = [reader.deserialize(data, c.msgtype).ranges[0] for c, _, data in reader.messages(scans)]
+        assert found == [float(n) for n in range(number + 1)]
+    harness.stop()
+    with AnyReader(list(tmp_path.iterdir())) as reader:
+        assert reader.message_count == 40
+
+
 def test_a_type_that_nobody_knows_is_recorded_without_its_definition(tmp_path: Path) -> None:
     harness = recorder(tmp_path)
     offer(harness, odd="cdr acme_msgs/msg/Odd")

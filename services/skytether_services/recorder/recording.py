@@ -22,6 +22,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from skytether.messages import definition_of, hash_of
 from skytether.service import RawReceived
 
+from .bag import BagFile
+
 _COMPRESSION = {"zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 _PROFILE = {"cdr": "ros2", "ros1": "ros1"}
 _SCHEMA_ENCODING = {"cdr": "ros2msg", "ros1": "ros1msg"}
@@ -137,12 +139,12 @@ class Recording:
         max_bytes: Checked at each `flush`.
     """
 
-    def __init__(self, open_file: Callable[[float, str], File], epoch: float, max_bytes: int) -> None:
+    def __init__(self, open_file: Callable[[float, str], File | BagFile], epoch: float, max_bytes: int) -> None:
         self.messages = 0
         self._open_file = open_file
         self._epoch = epoch
         self._max_bytes = max_bytes
-        self._files: dict[str, File] = {}
+        self._files: dict[str, File | BagFile] = {}
 
     def write(self, message: RawReceived) -> None:
         """Append a message, to a new file if there is none.
@@ -182,15 +184,15 @@ class Recording:
             self._files.popitem()[1].abandon()
 
 
-def new_path(folder: Path, prefix: str, unix_time: float) -> Path:
+def new_path(folder: Path, prefix: str, unix_time: float, suffix: str = ".mcap") -> Path:
     """Name of a file that does not exist yet: prefix, date and time in UTC, a number if that is taken."""
     moment = datetime.fromtimestamp(unix_time, UTC)
     stem = f"{prefix}-{moment:%Y%m%dT%H%M%S}.{moment.microsecond // 1000:03d}Z"
-    path = folder / f"{stem}.mcap"
+    path = folder / f"{stem}{suffix}"
     number = 1
     while path.exists():
         number += 1
-        path = folder / f"{stem}-{number}.mcap"
+        path = folder / f"{stem}-{number}{suffix}"
     return path
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from skytether.service import AnyInput, Service, ServiceError, param
+from skytether_services.recorder.bag import BagFile
 from skytether_services.recorder.recording import File, Recording, new_path
 
 MEGABYTE = 10**6
@@ -19,6 +20,7 @@ class Params:
     prefix: str = param(
         "recording", max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", doc="begin of each file's name"
     )
+    format: Literal["mcap", "bag"] = param("mcap", doc="of ROS 1 messages; bag: what rosbag and rosbags read")
     compression: Literal["zstd", "none"] = param("zstd", doc="of each chunk; images do not get smaller by it")
     chunk_size: float = param(1.0, unit="MB", gt=0, le=64, doc="messages are compressed and written in such pieces")
     flush_period: float = param(1.0, unit="s", gt=0, le=60, doc="a killed recorder loses at most so much")
@@ -28,7 +30,8 @@ class Params:
 class Recorder(Service[Params]):
     """Writes everything that the robot sends to MCAP files in the instance's data directory.
 
-    Foxglove and the `mcap` tools read them all; rosbags reads those of ROS 2 robots, it knows no ROS 1 in MCAP.
+    Foxglove and the `mcap` tools read them all; rosbags reads those of ROS 2 robots, it knows no ROS 1 in MCAP. With
+    ``format: bag`` messages of ROS 1 go to ROS 1 bags, which rosbag, rosbags and Foxglove read.
 
     When a file cannot be written (disk full), it stops recording, says so once, and stays up: ending would make the
     orchestrator start it again and again, with a useless file each time. What was flushed stays readable.
@@ -70,10 +73,14 @@ class Recorder(Service[Params]):
         if self.everything.dropped:
             self.log.warning("%d messages came faster than they could be written", self.everything.dropped)
 
-    def _open_file(self, unix_time: float, profile: str) -> File:
+    def _open_file(self, unix_time: float, profile: str) -> File | BagFile:
         prefix = "-".join(part for part in (self.params.prefix, self.context.robot) if part)
-        path = new_path(self.context.data_dir, prefix, unix_time)
+        bag = self.params.format == "bag" and profile == "ros1"
+        path = new_path(self.context.data_dir, prefix, unix_time, ".bag" if bag else ".mcap")
         self.log.info("recording to %s", path)
+        if bag:
+            chunk = int(self.params.chunk_size * MEGABYTE)
+            return BagFile(path, chunk, compressed=self.params.compression != "none")
         metadata = {"robot": self.context.robot, "instance": self.context.instance}
         return File(path, profile, self.params.compression, int(self.params.chunk_size * MEGABYTE), metadata)
 

@@ -6,6 +6,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from ros1_graph import wait_for
+from rosbags.highlevel import AnyReader
 
 from skytether.api.manifest import Manifest
 from skytether.api.rest import RobotCreate
@@ -77,6 +78,29 @@ def test_a_late_topic_of_the_user_s_own_type_is_recorded_with_definition_and_has
     }
     assert {channel.metadata["topic_type_hash"] for _, channel, _ in found} == {md5}
     assert [message.data[:4] for _, _, message in found][:3] == [n.to_bytes(4, "little") for n in range(3)]
+
+
+def test_as_a_bag_it_is_what_rosbag_and_rosbags_read(graph, orchestrator, recording):
+    path, folder = recording
+    document = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump(document | {"params": {"format": "bag", "flush_period": 0.1}}))
+    agent = graph.skytether("robot", "run", str(path))
+    wait_for(lambda: "/walker/skytether" in graph.subscribers("/secrets"), "the agent to wait for the topic")
+    talker = graph.python(TALK, stdout=-1)
+    md5 = talker.stdout.readline().decode().strip()
+    (bag,) = wait_for(lambda: [p for p in folder.rglob("*.bag") if p.stat().st_size > 12_000], "the bag")
+    graph.end(talker)
+    graph.end(agent)
+    wait_for(lambda: all(one.state.final for one in orchestrator.client.instances()), "the recorder's end")
+    with AnyReader([bag]) as reader:
+        (connection,) = reader.connections
+        assert (connection.topic, connection.digest) == ("/secrets", md5)
+        found = [reader.deserialize(data, connection.msgtype) for _, _, data in reader.messages()]
+    assert [one.secret for one in found][:10] == list(range(10))
+    assert {one.word for one in found} == {"word"}
+    info = graph.ask("rosbag", "info", str(bag))
+    assert f"acme_msgs/Secret [{md5}]" in info
+    assert f"{len(found)} msgs" in info
 
 
 def test_the_check_says_which_topics_are_missing_now(graph, recording):
