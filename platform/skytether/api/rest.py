@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, FailFast, Field, model_validator
 
 from .manifest import Name, Needs, Strict, Tier, Topics
+from .pull_progress import PullProgress
 
 
 class State(StrEnum):
@@ -175,6 +176,8 @@ class Instance(Strict):
     state: State
     reason: str = ""
     """One sentence a person can act on; empty while all is well."""
+    pull: PullProgress | None = None
+    """While its image is pulled, how far that is."""
     params: dict[str, Any] = {}
     placement: Placement | None = None
     size: Size | None = None
@@ -205,6 +208,8 @@ class InstanceEvent(Strict):
     """Of a report: what the service says, a sentence for people."""
     code: str = ""
     """Of a report: what the service says, for programs; empty: a change."""
+    pull: PullProgress | None = None
+    """Of a change while the image is pulled: how far that is."""
 
 
 def _between(least: float, most: float) -> BeforeValidator:

@@ -78,12 +78,10 @@ class Lines:
 
     def line(self, event: InstanceEvent) -> str:
         """What to print; empty: nothing."""
-        from skytether.api.pull_progress import read_pull
-
         line = f"{event.instance}: {event.state}" + (f": {event.reason}" if event.reason else "")
-        pull = read_pull(event.reason)
-        if pull is not None and pull.total:
-            tenth = 10 * pull.done // pull.total + 11 * pull.unpacking
+        pull = event.pull
+        if pull is not None and pull.total_bytes:
+            tenth = 10 * pull.done_bytes // pull.total_bytes + 11 * pull.unpacking
             if tenth == self._tenth:
                 return ""
             self._tenth = tenth
@@ -114,13 +112,11 @@ class _Bar:
 
     def show(self, event: InstanceEvent) -> None:
         """Overwrite what was shown."""
-        from skytether.api.pull_progress import read_pull
-
-        pull = read_pull(event.reason)
+        pull = event.pull
         text = f"{event.state}: {event.reason}" if event.reason else str(event.state)
         amount, done, total = "", 0, None
-        if pull is not None and pull.total:
-            done, total = pull.done, pull.total
+        if pull is not None and pull.total_bytes:
+            done, total = pull.done_bytes, pull.total_bytes
             amount = f"{done / 1e6:.0f} of {total / 1e6:.0f} MB, {done / total:.0%}"
             text = f"{event.state}: {'unpacking' if pull.unpacking else 'pulling'} {pull.image}"
         self._progress.update(self._task, description=text, completed=done, total=total, amount=amount)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import State
 from skytether.orchestrator.config.settings import Timing
 from skytether.orchestrator.domain.records import MOVES, IllegalMoveError, Record, check_move
@@ -301,9 +302,10 @@ def test_a_start_that_makes_progress_has_time(new_record: NewRecord) -> None:
     record = at_site(new_record, State.STARTING, started_at=NOW, reason="pulling x: 1 of 9 MB")
     record = dataclasses.replace(record, lease_expires_at=NOW + 999)
     late = NOW + T.start_timeout + 1
-    further = seen(Phase.STARTING, detail="pulling x: 2 of 9 MB")
-    assert decide(record, further, late, T) == Progress(record, "pulling x: 2 of 9 MB")
-    same = seen(Phase.STARTING, detail="pulling x: 1 of 9 MB")
+    pull = PullProgress(image="x", done_bytes=2_000_000, total_bytes=9_000_000)
+    further = seen(Phase.STARTING, pull=pull)
+    assert decide(record, further, late, T) == Progress(record, "pulling x: 2 of 9 MB", pull)
+    same = seen(Phase.STARTING, pull=pull.model_copy(update={"done_bytes": 1_000_000}))
     assert decide(record, same, NOW + 1, T) is None
     assert isinstance(decide(record, same, late, T), Crash)
 

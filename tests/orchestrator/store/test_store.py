@@ -12,10 +12,12 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import SiteCreate, State
 from skytether.api.service_report import ServiceReport
 from skytether.orchestrator.domain.records import Change, IllegalMoveError, Record
 from skytether.orchestrator.domain.security import TokenHash
+from skytether.orchestrator.domain.transitions import progressed, running
 from skytether.orchestrator.scheduling.standbys import FOREVER
 from skytether.orchestrator.store.database import RobotRow, TokenRow
 from skytether.orchestrator.store.engine import AddressError, make_engine, migrate
@@ -167,6 +169,18 @@ def test_a_change_of_neither_state_nor_reason_is_no_event(store: Store, new_reco
     assert len(loud.reason) == 1024
     assert [e.reason[:1] for e in store.events("i1", 0)] == ["", "r"]
     assert told == ["i1", "i1"]
+
+
+def test_how_far_a_pull_is_stands_beside_the_reason_and_goes_with_it(store: Store, new_record: NewRecord) -> None:
+    record = store.add(new_record(state=State.STARTING, site="lab"), "operator", None, "")
+    pull = PullProgress(image="x:1", done_bytes=3_000_000, total_bytes=9_000_000)
+    pulling = store.change(progressed(record, NOW, str(pull), pull), NOW)
+    assert pulling is not None
+    assert (pulling.reason, pulling.pull) == ("pulling x:1: 3 of 9 MB", pull.model_dump())
+    ready = store.change(running(pulling, NOW, "127.0.0.1", 7600), NOW)
+    assert ready is not None
+    assert ready.pull is None
+    assert [event.pull for event in store.events("i1", 0)] == [None, pull.model_dump(), None]
 
 
 def test_an_illegal_move_changes_nothing(store: Store, new_record: NewRecord) -> None:

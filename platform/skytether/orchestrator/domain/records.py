@@ -65,6 +65,8 @@ class Record:
     """By site: :class:`skytether.api.rest.Measurement` as JSON."""
     state: State = State.PENDING
     reason: str = ""
+    pull: dict[str, Any] | None = None
+    """:class:`skytether.api.pull_progress.PullProgress` as JSON, where the reason tells that; None: it does not."""
     site: str | None = None
     refused: list[dict[str, Any]] = field(default_factory=list)
     """:class:`skytether.api.rest.Refusal` as JSON."""
@@ -170,12 +172,13 @@ class Change(NamedTuple):
         """
         record, changes = self.record, self.columns
         state, reason = changes.get("state", record.state), changes.get("reason", record.reason)[:_REASON_LENGTH]
-        through = {"state": self.through, "reason": "", "updated_at": now}
+        through = {"state": self.through, "reason": "", "pull": None, "updated_at": now}
         passed = record.after(through) if self.through else record
         check_move(record.state, passed.state)
         check_move(passed.state, state)
         told = state is not record.state or reason != record.reason
         columns = {
+            **({"pull": None} if told else {}),
             **changes,
             "version": record.version + 1,
             "reason": reason,
@@ -185,7 +188,7 @@ class Change(NamedTuple):
         events = [passed] if self.through else []
         events += [new] if told else []
         if self.happened:
-            events.append(new.after({"reason": self.happened[:_REASON_LENGTH], "updated_at": now}))
+            events.append(new.after({"reason": self.happened[:_REASON_LENGTH], "pull": None, "updated_at": now}))
         return new, columns, events
 
 

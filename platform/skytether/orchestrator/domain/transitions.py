@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import Refusal, Score, Size, State
 
 from .records import Change, Record
@@ -41,9 +42,9 @@ def launched(record: Record, now: float) -> Change:
     return Change(record, {"started_at": now, "said": 0})
 
 
-def progressed(record: Record, now: float, detail: str) -> Change:
+def progressed(record: Record, now: float, detail: str, pull: PullProgress | None = None) -> Change:
     """Its start has come further, and has its time anew."""
-    return Change(record, {"reason": detail, "started_at": now})
+    return Change(record, {"reason": detail, "started_at": now, "pull": pull.model_dump() if pull else None})
 
 
 def running(record: Record, now: float, host: str | None, port: int | None) -> Change:

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec, Strict
+from skytether.api.pull_progress import PullProgress
 from skytether.api.service_report import ServiceReport
 
 ENGINE_SOCKET, ENGINE_AWAY = "engine.sock", "engine.away"
@@ -62,9 +63,11 @@ class Observation:
     last_line: str = ""
     """When EXITED: the last line of its log."""
     detail: str = ""
-    """STARTING: what it waits for ("pulling x: 12 of 80 MB"); as long as this changes, the start makes progress.
+    """STARTING: what it waits for ("room on a node"); as long as this or ``pull`` changes, the start makes progress.
     RUNNING: what its own health check finds wrong; empty: it is well. EXITED: how it ended, where the status does not
     tell; continues "the service ..."."""
+    pull: PullProgress | None = None
+    """STARTING: how far the pull is that it waits for, instead of ``detail``."""
     out_of_memory: bool = False
     """EXITED: it was killed for taking more memory than it may."""
     unstarted: bool = False

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.report_metrics import counts_of
 from skytether.api.rest import (
     Instance,
@@ -404,6 +405,7 @@ class Instances:
             service=record.service,
             state=record.state,
             reason=record.reason,
+            pull=PullProgress.model_validate(record.pull) if record.pull else None,
             params=record.params,
             size=record.has,
             resize=record.wants,

@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import State
 
 from ..config.settings import Timing
@@ -45,6 +46,8 @@ class Progress:
 
     record: Record
     detail: str
+    pull: PullProgress | None = None
+    """Where the detail says how far a pull is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,11 +181,12 @@ def _starting(record: Record, seen: Observation | None, now: float, timing: Timi
         ended = seen.exit_status is not None and not for_good  # else something may be left that is to be cleared first
         unstarted = seen.unstarted or ended
         return Crash(record, how_it_ended(seen), for_good, out_of_memory=seen.out_of_memory, unstarted=unstarted)
-    if seen.detail and seen.detail != record.reason:
-        return Progress(record, seen.detail)
+    waits_for = str(seen.pull) if seen.pull else seen.detail
+    if waits_for and waits_for != record.reason:
+        return Progress(record, waits_for, seen.pull)
     if record.started_at is not None and _waited(record.started_at, now, seen_since) > timing.start_timeout:
         why = f"was not ready within {timing.start_timeout:g} s"
-        return Crash(record, f"{why}: {seen.detail}" if seen.detail else why, unstarted=seen.unstarted)
+        return Crash(record, f"{why}: {waits_for}" if waits_for else why, unstarted=seen.unstarted)
     return None
 
 

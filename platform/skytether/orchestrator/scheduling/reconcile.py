@@ -282,8 +282,8 @@ class Reconciler:
         match action:
             case Start(record):
                 self._start(site, record)
-            case Progress(record, detail):
-                self._store.change(progressed(record, self._clock(), detail), self._clock())
+            case Progress(record, detail, pull):
+                self._store.change(progressed(record, self._clock(), detail, pull), self._clock())
             case Ready(record, host, port):
                 return self._ready(site, record, host, port)
             case Crash():
@@ -428,7 +428,7 @@ def _same(one: Observation | None, other: Observation | None) -> bool:
 
 
 def _phase(seen: Observation) -> tuple[object, ...]:
-    return seen.attempt, seen.phase, seen.detail, seen.host, seen.port, seen.exceeds, seen.leaving
+    return seen.attempt, seen.phase, seen.detail, seen.pull, seen.host, seen.port, seen.exceeds, seen.leaving
 
 
 def _ended(

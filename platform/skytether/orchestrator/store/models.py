@@ -194,6 +194,7 @@ instances = Table(
         index=True,
     ),
     Column("reason", String(1024), nullable=False),
+    Column("pull", JSON(none_as_null=True), comment="How far that is; NULL: the reason tells of no pull"),
     Column("site", String(63)),
     Column("refused", JSON, nullable=False),
     Column("scores", JSON, nullable=False, server_default="[]"),
@@ -227,6 +228,7 @@ events = Table(
     Column("state", String(16), nullable=False),
     Column("reason", String(1024), nullable=False),
     Column("code", String(63), nullable=False, server_default="", comment="Of what the service said; empty: our own"),
+    Column("pull", JSON(none_as_null=True), comment="How far that is; NULL: the reason tells of no pull"),
     Index(None, "instance", "id"),
     sqlite_autoincrement=True,  # an id that a watcher has seen must not come again after pruning
 )

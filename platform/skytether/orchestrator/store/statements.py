@@ -148,4 +148,10 @@ def add_event(connection: Connection, record: Record) -> None:
 
 def event(record: Record) -> dict[str, Any]:
     """The row that tells of an instance as it is."""
-    return {"instance": record.id, "at": record.updated_at, "state": record.state.value, "reason": record.reason}
+    return {
+        "instance": record.id,
+        "at": record.updated_at,
+        "state": record.state.value,
+        "reason": record.reason,
+        "pull": record.pull,
+    }

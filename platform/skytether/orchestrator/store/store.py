@@ -58,6 +58,8 @@ class EventRow:
     reason: str
     code: str
     """Of a report; empty: a change."""
+    pull: dict[str, Any] | None
+    """:class:`skytether.api.pull_progress.PullProgress` as JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,7 +420,9 @@ class Store(GroupStore):
         query = select(events).where(events.c.instance == instance, events.c.id > after).order_by(events.c.id)
         with self._reader.connect() as connection:
             rows = connection.execute(query).all()
-        return [EventRow(row.id, row.instance, row.at, State(row.state), row.reason, row.code) for row in rows]
+        return [
+            EventRow(row.id, row.instance, row.at, State(row.state), row.reason, row.code, row.pull) for row in rows
+        ]
 
     def prune(self, now: float, ended_age: float, ended_count: int, events_count: int) -> list[tuple[str, str | None]]:
         """Forget ended instances that are too old or too many, their events, keys and sums, and the oldest events.

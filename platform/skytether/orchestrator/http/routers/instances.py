@@ -12,6 +12,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import (
     Instance,
     InstanceCreate,
@@ -200,7 +201,13 @@ async def events(
             for row in rows:
                 last = row.id
                 event = InstanceEvent(
-                    id=row.id, instance=row.instance, at=utc(row.at), state=row.state, reason=row.reason, code=row.code
+                    id=row.id,
+                    instance=row.instance,
+                    at=utc(row.at),
+                    state=row.state,
+                    reason=row.reason,
+                    code=row.code,
+                    pull=PullProgress.model_validate(row.pull) if row.pull else None,
                 )
                 yield ServerSentEvent(id=str(row.id), event="report" if row.code else "state", data=event)
             if ended:

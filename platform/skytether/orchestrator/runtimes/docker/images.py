@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from docker.auth import AuthConfig, load_config, resolve_authconfig, resolve_repository_name
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
 
-from skytether.api.pull_progress import Pull
+from skytether.api.pull_progress import PullProgress
 
 from ..base import RuntimeFailure
 from ..containers import is_pulled
@@ -31,14 +31,14 @@ class _Layer(NamedTuple):
     unpacked: int = 0
 
 
-class Progress:
+class PullMeter:
     """How far a pull is, from the engine's messages. Pure."""
 
     def __init__(self, image: str) -> None:
         self._image = image
         self._layers: dict[str, _Layer] = {}
 
-    def after(self, message: Mapping[str, Any]) -> Pull:
+    def after(self, message: Mapping[str, Any]) -> PullProgress:
         """After one more message."""
         layer, detail = str(message.get("id")), message.get("progressDetail") or {}
         status, current = str(message.get("status", "")), int(detail.get("current") or 0)
@@ -51,7 +51,8 @@ class Progress:
         layers = self._layers.values()
         total, here = sum(one.size for one in layers), sum(one.here for one in layers)
         unpacking = total > 0 and here >= total
-        return Pull(self._image, unpacking, sum(one.unpacked for one in layers) if unpacking else here, total)
+        done = sum(one.unpacked for one in layers) if unpacking else here
+        return PullProgress(image=self._image, unpacking=unpacking, done_bytes=done, total_bytes=total)
 
 
 def check_credentials(path: str) -> None:
@@ -75,7 +76,7 @@ def check_credentials(path: str) -> None:
 
 
 def ensure_image(
-    engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None], *, by_digest: bool = False
+    engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None], *, by_digest: bool = False
 ) -> str:
     """The id of an image that is on the engine, after a pull if need be.
 
@@ -97,7 +98,7 @@ def ensure_image(
 
 
 def _on_the_engine(
-    engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None], *, by_digest: bool
+    engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None], *, by_digest: bool
 ) -> str:
     may_pull = "@sha256:" in image if by_digest else is_pulled(image)
     if options.pull != "always" or not may_pull:
@@ -126,17 +127,17 @@ def _find(engine: Engine, image: str) -> str | None:
             return None
 
 
-def _pull(engine: Engine, options: DockerOptions, image: str, tell: Callable[[str], None]) -> None:
+def _pull(engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None]) -> None:
     trouble = ""
-    progress = Progress(image)
-    tell(str(progress.after({})))
+    meter = PullMeter(image)
+    tell(meter.after({}))
     with engine.asked():
         try:
             api = engine.api(_PULL_SILENCE_S)
             pinned = "@" in image or ":" in image.rpartition("/")[2]
             name = image if pinned else f"{image}:latest"  # or the engine would fetch every tag there is
             for message in api.pull(name, stream=True, decode=True, auth_config=_credentials(options, image)):
-                tell(str(progress.after(message)))
+                tell(meter.after(message))
                 trouble = str(message["error"]) if "error" in message else trouble
         except APIError as error:
             trouble = explain(error)

@@ -13,6 +13,7 @@ from typing import Protocol
 from docker.errors import APIError, NotFound
 
 from skytether.api.manifest import Opening
+from skytether.api.pull_progress import PullProgress
 
 from ..base import Launch, OvertakenError, RuntimeFailure
 from ..egress import resolve
@@ -92,7 +93,8 @@ class Job:
         started again, by who leads."""
         self.unstarted = False
         """It came to nothing, and nothing of earlier runs is left either."""
-        self.detail = ""
+        self.pull: PullProgress | None = None
+        """How far the pull is that it waits for."""
         self.given_up: set[str] = before.given_up if before is not None else set()
         """Containers that this start or one before has ended, or tried to: the engine may do either much later."""
         self._engine = engine
@@ -177,14 +179,14 @@ class Job:
         if self._cancelled.is_set() or self._leaving.is_set():
             raise StoppedError
 
-    def _tell(self, detail: str) -> None:
+    def _note_pull(self, pull: PullProgress) -> None:
         self._go_on()
-        self.detail = detail
+        self.pull = pull
 
     def _launch(self) -> None:
         self._go_on()
-        image = ensure_image(self._engine, self._options, str(self.launch.spec.image), self._tell)
-        self.detail = ""
+        image = ensure_image(self._engine, self._options, str(self.launch.spec.image), self._note_pull)
+        self.pull = None
         self._go_on()
         self._prepare()
         openings = resolve(self.launch.spec.needs.openings)

@@ -305,7 +305,7 @@ class DockerRuntime(Runtime):
             if job.failure:
                 found[instance] = Observation(job.attempt, Phase.EXITED, detail=job.failure, unstarted=job.unstarted)
             else:
-                found[instance] = Observation(job.attempt, Phase.STARTING, detail=job.detail)
+                found[instance] = Observation(job.attempt, Phase.STARTING, pull=job.pull)
         return found
 
     def stop(self, instance: str, *, force: bool) -> None:
