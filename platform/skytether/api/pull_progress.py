@@ -18,8 +18,9 @@ class PullProgress(Strict):
 
     image: str
     unpacking: bool = False
-    """All is here; it is being unpacked, and ``done_bytes`` are unpacked of ``total_bytes``."""
+    """All of it is here and is being unpacked."""
     done_bytes: _Bytes = 0
+    """So much is here, or unpacked."""
     total_bytes: _Bytes = 0
     """0: not known yet."""
 
