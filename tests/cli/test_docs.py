@@ -44,6 +44,15 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_line_of_prose_is_longer_than_120_characters(page: Path) -> None:
+    prose = re.sub(r"^( *)```\w*\n.*?^\1```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    rows = (line for line in prose.splitlines() if not line.lstrip().startswith(("|", "![")))
+    # A name or a link is never broken; only words are counted.
+    words = (re.sub(r"`[^`]*`|\]\([^)]*\)", "", line) for line in rows)
+    assert [line for line in words if len(line) > 120] == []
+
+
 @cache
 def root() -> Any:
     return typer.main.get_command(app)
