@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -158,8 +158,8 @@ def test_a_bag_that_nobody_closed_is_read_up_to_the_last_flush(tmp_path: Path, c
         harness.step()
         with AnyReader(list(tmp_path.iterdir())) as reader:
             scans = [c for c in reader.connections if c.topic == "scan"]
-            found = [reader.deserialize(data, c.msgtype).ranges[0] for c, _, data in reader.messages(scans)]
-        assert found == [float(n) for n in range(number + 1)]
+            read = [cast(Any, reader.deserialize(data, c.msgtype)) for c, _, data in reader.messages(scans)]
+        assert [scan.ranges[0] for scan in read] == [float(n) for n in range(number + 1)]
     harness.stop()
     with AnyReader(list(tmp_path.iterdir())) as reader:
         assert reader.message_count == 40

@@ -22,7 +22,7 @@ from .config.settings import Settings
 from .config.sites_file import read_groups, read_sites
 from .domain.clock_jump import SharedClock
 from .domain.counter_totals import CounterTotals
-from .domain.discovery import advertised, named, targets
+from .domain.discovery import targets
 from .domain.errors import OutdatedError
 from .domain.overload import Overload
 from .domain.rate_limit import RateLimiter
@@ -50,6 +50,7 @@ from .scheduling.sites import Sites
 from .store.engine import GONE
 from .store.leader import Leadership
 from .store.store import Store
+from .telemetry.heartbeat import Heartbeat
 from .telemetry.metrics import GroupGauges, Metrics, Running, SiteGauges
 from .telemetry.reports import PERIOD, Reports
 
@@ -89,7 +90,7 @@ class Orchestrator:
         self._told_why = ""
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
-        self.store = Store(database, named(settings.advertise), settings.quotas.robot_names)
+        self.store = Store(database, settings.quotas.robot_names)
         self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
         clock = self.clock = clock or self._shared_clock or time.time
         self.store.key_id = lambda: secrets.fingerprint
@@ -100,6 +101,7 @@ class Orchestrator:
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.shared_topics = SharedTopics(self.store, clock)
+        self.heartbeat = Heartbeat(self.store, settings.advertise, clock)
         self.broker = Broker()
         self.store.on_change = self.broker.publish
         self.metrics = Metrics(
@@ -288,6 +290,7 @@ class Orchestrator:
         self.reports.write()
         self.gates.write()
         self.shared_topics.sync()
+        self.heartbeat.beat()
 
     def _elect(self) -> float:
         if self.look_outdated():
@@ -347,6 +350,7 @@ class Orchestrator:
         self.keeper.stop(timeout=1.0)
         self.writer.stop(timeout=1.0)
         self._write_last()
+        self.heartbeat.end()
         self.elector.stop(timeout=1.0)
         self.leadership.end()
         self.store.close()
@@ -391,7 +395,7 @@ class Orchestrator:
 
     def scrape_targets(self, asked: str) -> list[ScrapeTargets]:
         """For Prometheus: the orchestrators over this database; ``asked``: the address that the request was sent to."""
-        return targets(advertised(self.store.names()), self.settings.advertise, asked)
+        return targets(self.heartbeat.addresses(), self.settings.advertise, asked)
 
     def _running(self) -> list[Running]:
         self.reports.write()  # what robots told before a scrape is in it

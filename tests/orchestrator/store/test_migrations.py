@@ -68,6 +68,7 @@ INSTANCE: dict[str, Any] = {
     "said": 0,
     "size": None,
     "resize": None,
+    "pull": None,
 }
 """A value for every column that a table had at any time; what a version has not is left out."""
 ROWS: dict[str, dict[str, Any]] = {
@@ -82,6 +83,7 @@ ROWS: dict[str, dict[str, Any]] = {
         "share_group": None,
     },
     "shared": {"robot": "walker", "service": "toy", "share_group": "hall", "at": NOW, "text": "a crate"},
+    "orchestrators": {"address": "http://one:8600", "seen_at": NOW},
     "services": {"name": "toy", "manifest": MANIFEST},
     "stops": {"robot": "walker", "id": "s1", "at": NOW, "reason": "smoke", "by": "operator:x", "acknowledged_at": None},
     "gates": {"robot": "walker", "at": NOW, "report": {"answers": True, "troubles": 1}},
@@ -138,7 +140,7 @@ ROWS: dict[str, dict[str, Any]] = {
         "provided": "vm-1",
         "reason": "",
     },
-    "events": {"instance": "i1", "at": NOW, "state": "running", "reason": "", "code": ""},
+    "events": {"instance": "i1", "at": NOW, "state": "running", "reason": "", "code": "", "pull": None},
     "idempotency": {"owner": "robot:walker", "key": "k", "body_sha256": "0" * 64, "instance": "i1", "created_at": NOW},
     "reports": {"instance": "i1", "at": NOW, "report": {"rtt_s": 0.02}},
     "facts": {"name": "secret.key", "value": "f"},

@@ -16,7 +16,7 @@ from skytether.api.hosts import is_ip, is_name
 from skytether.api.manifest import Strict
 from skytether.api.node import read_url
 
-from ..domain.discovery import MAX_ADDRESS, is_address
+from ..domain.discovery import is_address
 from .defaults import DEFAULT_HOST, DEFAULT_PORT, default_state_dir
 
 Seconds = Annotated[float, Field(gt=0, le=1e9)]
@@ -336,7 +336,7 @@ class Settings(Group):
     @classmethod
     def _reachable(cls, address: str | None) -> str | None:
         if address is not None and not is_address(address):
-            raise ValueError(f"write http://HOST:PORT or https://HOST:PORT, at most {MAX_ADDRESS} characters")
+            raise ValueError("write http://HOST:PORT or https://HOST:PORT")
         return address
 
     @field_validator("state_dir", "secrets_dir", "catalog_dir", "sites_file")

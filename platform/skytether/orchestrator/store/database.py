@@ -13,11 +13,10 @@ from sqlalchemy.exc import IntegrityError
 
 from skytether.api.rest import GateReport, Scope, SiteCreate
 
-from ..domain.discovery import NAME
 from ..domain.security import TokenHash
 from .engine import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
 from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
-from .models import facts, gates, robots, services, shared, sites, stops, tokens
+from .models import facts, gates, orchestrators, robots, services, shared, sites, stops, tokens
 from .node_rows import NodeRows
 
 
@@ -106,6 +105,10 @@ _HEAR_GATE = text(
     " ON CONFLICT (robot) DO UPDATE SET at = excluded.at, report = excluded.report"
 ).bindparams(bindparam("report", type_=gates.c.report.type))
 """Nothing for a robot that was deleted meanwhile."""
+_ANNOUNCE = text(
+    "INSERT INTO orchestrators (address, seen_at) VALUES (:address, :seen_at)"
+    " ON CONFLICT (address) DO UPDATE SET seen_at = excluded.seen_at"
+)
 _HEAR_SHARED = text(
     "INSERT INTO shared (robot, service, share_group, at, text)"
     " SELECT name, :service, :in_group, :at, :text FROM robots WHERE name = :of_robot"
@@ -118,10 +121,9 @@ _HEAR_SHARED = text(
 class Database:
     """The database as such. Safe from any thread."""
 
-    def __init__(self, url: str, name: str = NAME) -> None:
-        """``name`` is what a database server lists its connections under."""
-        self._engine = make_engine(url, name)
-        apart = make_engine(url, name, tried=False, patience_s=LEAD_PATIENCE_S) if self.served else self._engine
+    def __init__(self, url: str) -> None:
+        self._engine = make_engine(url)
+        apart = make_engine(url, tried=False, patience_s=LEAD_PATIENCE_S) if self.served else self._engine
         self._apart = reading(apart)
         """Connections of its own for who leads: a crowd of requests keeps those of the other waiting. Each statement is
         one round trip, for the lead is lost where a few of them take longer than it lasts."""
@@ -180,14 +182,22 @@ class Database:
         with self._apart.connect() as connection:
             return float(connection.scalar(text("SELECT extract(epoch FROM clock_timestamp())")) or 0.0)
 
-    def names(self) -> list[str]:
-        """Of all connections to this database by this user, whoever's; none with SQLite, which has no server."""
-        if not self.served:
-            return []
-        ours = "datname = current_database() AND usename = current_user"
+    def announce(self, address: str, now: float, silent_s: float) -> None:
+        """Note that an orchestrator is there; those that were not for so many seconds are forgotten."""
+        row = {"address": address, "seen_at": now}
+        with self._writing() as connection:
+            connection.execute(_ANNOUNCE, row)
+            connection.execute(delete(orchestrators).where(orchestrators.c.seen_at < now - silent_s))
+
+    def withdraw(self, address: str) -> None:
+        """An orchestrator ends."""
+        with self._writing() as connection:
+            connection.execute(delete(orchestrators).where(orchestrators.c.address == address))
+
+    def announced(self, since: float) -> list[str]:
+        """Addresses of the orchestrators that were there since then."""
         with self._reader.connect() as connection:
-            asked = connection.scalars(text(f"SELECT DISTINCT application_name FROM pg_stat_activity WHERE {ours}"))  # noqa: S608
-            return [name for name in asked if name]
+            return list(connection.scalars(select(orchestrators.c.address).where(orchestrators.c.seen_at >= since)))
 
     def agree(self, name: str, value: str, earlier: Sequence[str] = ()) -> bool:
         """Note a fact at first, or when it was one of the earlier ones; and then say whether it is still the same."""

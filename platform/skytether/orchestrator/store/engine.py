@@ -10,7 +10,6 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, 
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
 
-from ..domain.discovery import NAME
 from ..domain.errors import OutdatedError
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ def _address(url: str) -> URL:
         ) from error
 
 
-def make_engine(url: str, name: str = NAME, *, tried: bool = True, patience_s: float | None = None) -> Engine:
+def make_engine(url: str, *, tried: bool = True, patience_s: float | None = None) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
     SQLite: write-ahead log, so that readers and the one writer do not wait for each other, and a commit that needs no
@@ -83,7 +82,7 @@ def make_engine(url: str, name: str = NAME, *, tried: bool = True, patience_s: f
     with the execution option ``immediate`` take the write lock at their begin: taking it later can fail at once.
 
     PostgreSQL: a connection is tried before it is used, for the server may have been restarted since; the server lists
-    it under ``name``. Not ``tried``, a statement is answered sooner, and fails where the server was restarted. A
+    it as ``skytether``. Not ``tried``, a statement is answered sooner, and fails where the server was restarted. A
     connection without an answer for ``patience_s`` seconds is given up; None: after as long as a statement may take.
 
     Raises:
@@ -91,7 +90,7 @@ def make_engine(url: str, name: str = NAME, *, tried: bool = True, patience_s: f
     """
     address = _address(url)
     if address.get_backend_name() == "postgresql":
-        connect_args = {**_POSTGRES, "application_name": name}
+        connect_args = {**_POSTGRES, "application_name": "skytether"}
         try:
             made = create_engine(address, pool_pre_ping=tried, connect_args=connect_args, **_JSON)
             from .postgres import Server, gone  # its driver is an extra

@@ -261,6 +261,13 @@ accounts = Table(
     comment="Counters of each robot and service, over all programs and runs that counted them",
 )
 
+orchestrators = Table(
+    "orchestrators",
+    metadata,
+    Column("address", String(300), primary_key=True),
+    Column("seen_at", Float, nullable=False),
+)
+
 facts = Table(
     "facts",
     metadata,

@@ -31,7 +31,6 @@ from skytether.api.rest import State
 from skytether.api.service_report import ServiceReport
 
 from ..domain.counter_totals import MOST_NAMES, CounterTotals, merge
-from ..domain.discovery import NAME
 from ..domain.records import Change, Record
 from . import statements as sql
 from .group_store import GroupStore
@@ -82,15 +81,14 @@ class KeyReusedError(Exception):
 class Store(GroupStore):
     """The database with its instances. Safe from any thread."""
 
-    def __init__(self, url: str, name: str = NAME, robot_names: int = MOST_NAMES) -> None:
+    def __init__(self, url: str, robot_names: int = MOST_NAMES) -> None:
         """Open it.
 
         Args:
             url: SQLAlchemy's.
-            name: What a database server lists its connections under.
             robot_names: Names that one robot may make up in all that it reports.
         """
-        super().__init__(url, name)
+        super().__init__(url)
         self._robot_names = robot_names
         self.on_change: Callable[[str], None] = lambda _: None
         """Called with an instance's id after each of its events is stored; must return at once."""
