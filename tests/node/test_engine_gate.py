@@ -19,6 +19,7 @@ import pytest
 
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
+from skytether.node.registries import registry_of
 
 ID, OTHER = "f" * 64, "e" * 64
 CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
@@ -101,11 +102,11 @@ def engine() -> Iterator[Engine]:
         made.server.server_close()
 
 
-def say(engine: Engine, sent: bytes) -> bytes:
+def say(engine: Engine, sent: bytes, registries: tuple[str, ...] = ()) -> bytes:
     """What somebody who sends this, and then no more, gets back."""
 
     async def run() -> bytes:
-        gate, path, over = EngineGate(engine.path, ()), engine.path + ".way", asyncio.Event()
+        gate, path, over = EngineGate(engine.path, (), registries), engine.path + ".way", asyncio.Event()
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             there = await asyncio.open_unix_connection(engine.path)
@@ -181,6 +182,15 @@ def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: s
     assert "content-type" not in {name.lower() for name in headers}
 
 
+@pytest.mark.parametrize("tag", ["1", f"sha256:{ID}"])
+@pytest.mark.parametrize("image", ["127.0.0.1:8080/x", "localhost/x", "127.1:1/x"])
+def test_no_pull_has_the_engine_ask_this_machine(engine: Engine, image: str, tag: str) -> None:
+    """It would tell some of what a program on loopback answers."""
+    asked = request(f"POST /images/create?fromImage={quote(image, safe='')}&tag={quote(tag)}")
+    assert b"is this machine: name it as it joins" in say(engine, asked)
+    assert engine.lines == []
+
+
 @pytest.mark.parametrize(
     ("image", "digests", "good"),
     [
@@ -197,7 +207,8 @@ def test_no_pull_takes_the_name_of_an_image_that_is_from_elsewhere(
 ) -> None:
     """Whoever starts something by that name on this machine, with whatever rights, would start what was pulled."""
     engine.digests = digests
-    got = say(engine, request(f"POST /images/create?fromImage={quote(image, safe='')}&tag=1"))
+    asked = request(f"POST /images/create?fromImage={quote(image, safe='')}&tag=1")
+    got = say(engine, asked, (registry_of(image),))
     assert (b"200 OK" in got) is good
     assert good or b"of this machine was not pulled from there" in got
     assert any(line.startswith("POST") for line in engine.lines) is good
@@ -272,7 +283,7 @@ def test_a_refusal_takes_one_line_of_the_log_and_many_take_few(
     engine: Engine, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def refuse() -> None:
-        gate = EngineGate(engine.path, ())
+        gate = EngineGate(engine.path)
         for number in range(100):
             reader = asyncio.StreamReader()
             reader.feed_data(request(f"GET /a{number}%0A%1b[31mfalse"))
@@ -288,7 +299,7 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
     """Of a few only is a large body read; whoever wants little is served meanwhile."""
 
     async def run() -> int:
-        gate, taken = EngineGate(engine.path, ()), 0
+        gate, taken = EngineGate(engine.path), 0
         readers = [asyncio.StreamReader() for _ in range(100)]
         nobody = AsyncMock(asyncio.StreamWriter, write=Mock())
         head = b"POST /containers/create HTTP/1.1\r\nContent-Length: 1000000\r\n\r\n"

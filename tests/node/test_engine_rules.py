@@ -127,9 +127,9 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
         asked("POST", "/volumes/create", {"Name": name, "Driver": None, "DriverOpts": None, "Labels": labels}) is None
     )
     pulled = {"fromImage": "registry.example:5000/a/b", "tag": "1.2-x"}
-    about = (("images", "registry.example:5000/a/b:1.2-x"),)
+    about = (("pulled", "registry.example:5000/a/b"), ("images", "registry.example:5000/a/b:1.2-x"))
     assert judge(Call("POST", "/images/create", pulled, None)) == (None, about)
-    assert judge(Call("POST", "/images/create", {**pulled, "tag": "sha256:" + ID}, None)) == (None, ())
+    assert judge(Call("POST", "/images/create", {**pulled, "tag": "sha256:" + ID}, None)) == (None, about[:1])
     assert (
         asked("POST", f"/containers/{ID}/update", {"Memory": 1, "MemorySwap": 1, "NanoCpus": 1, "CpuShares": 2}) is None
     )

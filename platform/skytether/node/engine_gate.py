@@ -22,6 +22,7 @@ from skytether.api.splice import PIECE, Stream
 from .archives import Images, moved, ways
 from .engine_rules import NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
 from .machine import ask, ask_json
+from .registries import Registries
 
 log = logging.getLogger(__name__)
 
@@ -63,9 +64,16 @@ class RefusedCall(Exception):  # noqa: N818 (an answer)
 class EngineGate:
     """Judges what is asked of one engine."""
 
-    def __init__(self, engine: str, devices: tuple[str, ...]) -> None:
-        """``engine``: path of its socket; ``devices``: what containers may have."""
+    def __init__(self, engine: str, devices: tuple[str, ...] = (), registries: tuple[str, ...] = ()) -> None:
+        """Judge by what was said as the machine joined.
+
+        Args:
+            engine: Path of its socket.
+            devices: Files of devices that containers may have.
+            registries: See `Registries`.
+        """
         self._engine = engine
+        self._registries = Registries(registries)
         self._devices = devices
         self._ours: set[str] = set()
         self._opened: set[str] = set()
@@ -153,7 +161,10 @@ class EngineGate:
         if refused:
             raise RefusedCall(refused)
         for subject in subjects:
-            if subject[0] == "images":
+            if subject[0] == "pulled":
+                if odd := await self._registries.refusal(subject[1]):
+                    raise RefusedCall(odd)
+            elif subject[0] == "images":
                 await self._may_be_pulled(subject[1])
             elif not await self._is_ours(subject):
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")

@@ -107,7 +107,7 @@ class Call:
 Subject = tuple[str, str]
 """Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all. What is one of
 ``seen networks`` may be open to us, too, and so may ``joined networks``, which must be there. ``images`` must not be
-there, or be from where they are pulled."""
+there, or be from where they are pulled; ``pulled`` must be from a registry that may be asked."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -169,9 +169,9 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
         case "pull":
             image, tag = call.query.get("fromImage", ""), call.query.get("tag", "")
             if re.fullmatch(_IMAGE, image) and re.fullmatch(_DIGEST, tag):
-                return None, ()  # by that nothing gets another name
+                return None, (("pulled", image),)  # by that nothing gets another name
             odd = None if re.fullmatch(_IMAGE, image) and re.fullmatch(_TAG, tag) else "a pull names one image"
-            return odd, (("images", f"{image}:{tag}"),)
+            return odd, (("pulled", image), ("images", f"{image}:{tag}"))
         case "listed":
             filters = _json(call.query.get("filters", ""))
             labels = filters.get("label") if isinstance(filters, dict) else None

@@ -52,6 +52,8 @@ class JoinOptions:
     echo: int | None = 8600
     devices: tuple[str, ...] = ()
     """That containers may have."""
+    registries: tuple[str, ...] = ()
+    """From which alone images are pulled; none: from any that is not this machine itself."""
     unfiltered: bool = False
     """Let an orchestrator ask the engine for anything."""
     folder: Path = Path("/etc/skytether/node")
@@ -129,6 +131,7 @@ def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: Non
         follow=options.advertise is None,
         echo=options.echo,
         devices=options.devices,
+        registries=options.registries,
         unfiltered=options.unfiltered,
         unit=options.unit,
     )

@@ -86,7 +86,7 @@ class NodeProgram:
         self._config = store.config()
         self._trust: ssl.SSLContext = trusting(store.authority(), store.identity)
         config = self._config
-        self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices)
+        self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices, config.registries)
         self._on_linked = on_linked
         self._links: dict[str, asyncio.Task[None]] = {}
         self._told: dict[str, str] = {}

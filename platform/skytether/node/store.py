@@ -41,6 +41,8 @@ class NodeConfig(Strict):
     """UDP port of the echo; None: it has none."""
     devices: tuple[Device, ...] = ()
     """Files of devices that containers may have."""
+    registries: tuple[str, ...] = ()
+    """From which alone images are pulled; none: from any that is not this machine itself."""
     unfiltered: bool = False
     """Whether an orchestrator may ask the engine for anything, and so has all of this machine."""
     unit: bool = True

@@ -111,6 +111,7 @@ def test_two_orchestrators_with_different_keys_of_nodes_do_not_both_start(
         (["site", "join", "https://cloud", "--token-file", "/none"], "cannot read the token file /none"),
         (["site", "join", "https://cloud", "--token", "x", "--ports", "5-1"], "write FIRST-LAST"),
         (["site", "join", "https://cloud", "--token", "x", "--device", "/etc"], "write the path of a device"),
+        (["site", "join", "https://cloud", "--token", "x", "--registry", "a/b"], "write HOST or HOST:PORT"),
     ],
 )
 def test_wrong_usage_is_told(words: list[str], says: str) -> None:

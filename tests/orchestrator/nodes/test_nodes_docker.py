@@ -128,6 +128,9 @@ def gets_nothing_by_a_way_around(client: Engine, good: dict[str, Any], docker_si
     )
     name, _, tag = image.rpartition(":")
     assert refused("POST", f"/v1.41/images/create?fromImage={name}&tag={tag}")  # it was made on this machine
+    assert refused(
+        "POST", "/v1.41/images/create?fromImage=127.0.0.1:8600/x&tag=1"
+    )  # nor is a program on loopback asked
     assert refused("GET", "/v1.41/containers/json?all=1")
     assert refused("GET", "/v1.41/networks/bridge")
     made = client.create_container_from_config(good)["Id"]

@@ -129,6 +129,13 @@ def join_node(
         list[str] | None,
         typer.Option(help="File of a device that services here may have, such as /dev/video0; may be given again."),
     ] = None,
+    registry: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="HOST[:PORT] from which images are pulled, and from no other; may be given again. Without it: from "
+            "any that is not this machine itself."
+        ),
+    ] = None,
     unfiltered: Annotated[
         bool,
         typer.Option(
@@ -158,6 +165,7 @@ def join_node(
         ports=_ports(ports),
         echo=echo_port or None,
         devices=_devices(device),
+        registries=_registries(registry),
         unfiltered=unfiltered,
         folder=folder.expanduser().absolute(),
         unit=unit,
@@ -192,6 +200,13 @@ def _devices(given: list[str] | None) -> tuple[str, ...]:
     for path in given or ():
         if not path.startswith("/dev/") or not re.fullmatch(r"[A-Za-z0-9._/-]+", path):
             fail(f"--device {path}: write the path of a device, such as /dev/video0", 2)
+    return tuple(given or ())
+
+
+def _registries(given: list[str] | None) -> tuple[str, ...]:
+    for name in given or ():
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.-]*(:\d{1,5})?", name):
+            fail(f"--registry {name}: write HOST or HOST:PORT, such as docker.io or registry.example:5000", 2)
     return tuple(given or ())
 
 
