@@ -99,6 +99,15 @@ def test_looking_again_reads_only_what_changed(store: Store, new_record: NewReco
     assert [old is new for old, new in zip(now, listed, strict=True)] == [True, True, False]
 
 
+def test_all_that_changed_is_read_by_who_saw_it_before(tmp_path: Path, store: Store, new_record: NewRecord) -> None:
+    standby = store.add(new_record("warm", robot="", standby=True, state=State.RUNNING), "", None, "")
+    with closing(Store(f"sqlite:///{tmp_path}/state.db")) as other:
+        assert other.live() == [standby]
+        claimed = store.claim(Change(standby, {"robot": "walker", "standby": False}), NOW, "", None, "")
+        assert claimed is not None
+        assert other.live() == [claimed]
+
+
 def test_standbys_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:
     store.add(new_record("warm", standby=True, state=State.RUNNING), "", None, "")
     store.add(new_record("cold", standby=True, state=State.STARTING), "", None, "")

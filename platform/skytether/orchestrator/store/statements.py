@@ -136,6 +136,12 @@ def record(row: RowMapping) -> Record:
     return Record(**{name: row[name] for name in COLUMNS})
 
 
+def newer(seen: Record, row: RowMapping) -> Record:
+    """The record that was seen, as a row of `CHANGEABLE` has it now."""
+    # By the fields' names: a column may have an older one.
+    return seen.after({name: row[name] for name in COLUMNS if name != "manifest"})
+
+
 def as_seen(record: Record) -> dict[str, Any]:
     """That it is changed only if it is still so."""
     return {"seen_id": record.id, "seen_version": record.version}

@@ -455,8 +455,8 @@ class Store(GroupStore):
                 these = changed[start : start + _FETCHED]
                 known = {id_: seen for id_ in these if (seen := found[id_]) is not None}
                 if known:
-                    newer = connection.execute(sql.CHANGEABLE, {"ids": list(known)}).mappings()
-                    found |= {row["id"]: known[row["id"]].after(dict(row)) for row in newer}
+                    rows_now = connection.execute(sql.CHANGEABLE, {"ids": list(known)}).mappings()
+                    found |= {row["id"]: sql.newer(known[row["id"]], row) for row in rows_now}
                 if new := [id_ for id_ in these if id_ not in known]:
                     found |= {
                         row["id"]: sql.record(row) for row in connection.execute(sql.WHOLE, {"ids": new}).mappings()

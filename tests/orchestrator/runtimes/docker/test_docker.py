@@ -614,7 +614,7 @@ def test_a_private_registry_with_digests(docker_site: DockerSite, tmp_path: Path
 
             def ended() -> bool:
                 seen = runtime.observe()["i1"]
-                told.add(seen.detail)
+                told.add(str(seen.pull or ""))
                 return seen.phase is Phase.EXITED
 
             until(ended)
