@@ -135,7 +135,13 @@ TOGETHER = (
 )
 """Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
 
-FIRST_ROW = ("e2e/test_navigation_guide.py", "ros/ros1/test_gate.py", "ros/ros1/test_own_gate.py")
+FIRST_ROW = (
+    "e2e/test_navigation_guide.py",
+    "ros/ros1/test_gate.py",
+    "ros/ros1/test_own_gate.py",
+    "ros/ros2/native/",
+    "jepsen/",
+)
 """Of these, what runs beside the others with what needs the Docker engine: so both rows take as long."""
 
 ALONE = (
