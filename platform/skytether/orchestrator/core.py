@@ -281,6 +281,7 @@ class Orchestrator:
     def _write_reports(self) -> float:
         with contextlib.suppress(*GONE):  # they are kept until it answers
             self._write()
+            self.heartbeat.beat()
             # Another one leads, and cannot know whom this one refused.
             if not self.leadership.leads and (self.overload.felt() or self.overload.owed()):
                 self.store.extend_leases(self.clock(), at_least=True)
@@ -290,7 +291,6 @@ class Orchestrator:
         self.reports.write()
         self.gates.write()
         self.shared_topics.sync()
-        self.heartbeat.beat()
 
     def _elect(self) -> float:
         if self.look_outdated():

@@ -208,9 +208,9 @@ class RobotConfig(Strict):
     """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
     fallback: FallbackConfig = FallbackConfig()
     limits: dict[str, float] = {}
+    """What the wheels may do: fields of ``skytether.robot.control.supervisor.Limits``."""
     beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
     """Limits that are meant to be beyond what is plausible: ``limits.NAME`` to reason."""
-    """What the wheels may do: fields of ``skytether.robot.control.supervisor.Limits``."""
     needs: LinkNeeds = LinkNeeds()
     """What the link must be like at least."""
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
