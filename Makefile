@@ -100,7 +100,7 @@ ros2: .venv-ros2/.ready ## ROS 2 itself, for tests and benches, in an environmen
 	@command -v $(ROS2_PYTHON) >/dev/null || { echo "ROS 2's wheels are for Python 3.11; name it with ROS2_PYTHON=..."; exit 1; }
 	@echo "Setting up .venv-ros2 ..."
 	@test -x .venv-ros2/bin/pip || $(ROS2_PYTHON) -m venv .venv-ros2
-	@.venv-ros2/bin/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-ros2.lock
+	@.venv-ros2/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-ros2.lock
 	@.venv-ros2/bin/python -c 'import rclpy'
 	@touch $@
 
@@ -118,7 +118,7 @@ $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python's venv is missing: apt-get install python3-venv"; exit 1; }
 	@echo "Setting up .venv (once; about 500 MB) ..."
 	@test -x $(BIN)/pip || $(PYTHON) -m venv .venv
-	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
