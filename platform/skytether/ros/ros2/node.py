@@ -6,35 +6,30 @@ comes back is found again by Zenoh, which declares everything anew.
 
 from __future__ import annotations
 
-import concurrent.futures
 import json
 import logging
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import zenoh
 
-from .dialect import Dialect, Endpoint, Kind, NodeName
+from .dialect import Dialect, Endpoint, NodeName
 from .endpoints import Client, Handle, Publication, Server, Subscription
 from .graph import Graph, learned_hash, mismatches
-from .seam import Ros2Error, Troubles
+from .node_base import NodeBase
+from .seam import Ros2Error
 
 _log = logging.getLogger(__name__)
 
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 MAX_OUTBOX = 1000
 """Messages of reliable topics that wait for Zenoh."""
-MAX_WORKING = 64
-"""Calls from the graph that are worked on or wait for it."""
-WORKERS = 16
-"""Of these at the same time: an action's result is a call that waits as long as the action."""
 MAX_CHANGES = 100_000
 """Changes of the graph that wait for the node's thread."""
 _POLL_S = 0.5
@@ -43,7 +38,7 @@ _RETRY_S = (0.25, 0.5, 1.0, 2.0)
 _H = TypeVar("_H", bound=Handle)
 
 
-class Ros2Node:
+class Ros2Node(NodeBase):
     """One node of a ROS 2 graph; every method may be called from any thread.
 
     Args:
@@ -67,47 +62,21 @@ class Ros2Node:
         name: NodeName | None = None,
         say: Callable[[str], object] | None = None,
     ) -> None:
+        super().__init__(name, say)
         self.dialect = dialect
-        self._name = name or NodeName()
-        self._troubles = Troubles(say)
         self._router = router or ("the one that its configuration names" if config_file else DEFAULT_ROUTER)
         self._config = _config(router or (None if config_file else DEFAULT_ROUTER), config_file)
         self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._closing = threading.Event()
-        self._joined = threading.Event()
         self._handles: list[Handle] = []
         self._changes: deque[tuple[str, bool]] = deque(maxlen=MAX_CHANGES)
-        self._known: dict[str, Endpoint] = {}
         self._outbox: queue.Queue[Callable[[], object] | None] = queue.Queue(MAX_OUTBOX)
-        self._working = threading.Semaphore(MAX_WORKING)
-        self._workers: concurrent.futures.ThreadPoolExecutor | None = None
-        self._threads: list[threading.Thread] = []
 
-    def start(self) -> None:
-        """Begin to join the graph; returns at once."""
-        self._workers = concurrent.futures.ThreadPoolExecutor(WORKERS, thread_name_prefix="ros2-call")
-        for job in (self._run, self._post):
-            self._threads.append(threading.Thread(target=job, name=f"ros2{job.__name__}", daemon=True))
-            self._threads[-1].start()
+    def _jobs(self) -> Sequence[Callable[[], None]]:
+        return (self._run, self._post)
 
-    def close(self) -> None:
-        """Leave the graph, and wait until that is done."""
-        self._closing.set()
+    def _interrupt(self) -> None:
         self._wake.set()
-        for thread in self._threads:
-            thread.join()
-        if self._workers is not None:
-            self._workers.shutdown(wait=False, cancel_futures=True)
-
-    def __enter__(self) -> Ros2Node:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
         """Be a publisher; a farewell is not said, because a router has no way to do it for us."""
@@ -128,23 +97,6 @@ class Ros2Node:
         """Be a client of a service."""
         return self._add(Client(self, endpoint))
 
-    def wait_until_joined(self, timeout: float) -> bool:
-        """Whether the router was reached, the graph known and everything declared within so many seconds."""
-        return self._joined.wait(timeout)
-
-    def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
-        """What others have on the graph now."""
-        return [e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind)]
-
-    def lives(self, name: str, kind: Kind) -> set[str]:
-        """Something for each endpoint of a name and kind that is another after it was away."""
-        return {token for token, e in self._known.items() if (e.name, e.kind) == (name, kind)}
-
-    @property
-    def troubles(self) -> tuple[str, ...]:
-        """What is wrong now, a sentence each."""
-        return self._troubles.texts
-
     # --- Host --------------------------------------------------------------------------------------------------------
 
     def changed(self) -> None:
@@ -161,25 +113,6 @@ class Ros2Node:
             )
             return False
         return True
-
-    def work(self, job: Callable[[], object]) -> bool:
-        """Host: have something done in a worker's thread."""
-        if self._workers is None or not self._working.acquire(blocking=False):
-            return False
-        try:
-            self._workers.submit(job).add_done_callback(lambda _: self._working.release())
-        except RuntimeError:  # closing
-            self._working.release()
-            return False
-        return True
-
-    def report(self, key: str, text: str) -> None:
-        """Tell a trouble once: again only after `settle`."""
-        self._troubles.report(key, text)
-
-    def settle(self, key: str) -> None:
-        """A trouble is over; nothing is said."""
-        self._troubles.settle(key)
 
     # --- threads -----------------------------------------------------------------------------------------------------
 

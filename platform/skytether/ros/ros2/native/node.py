@@ -6,7 +6,6 @@ away is told nothing, and says so.
 
 from __future__ import annotations
 
-import concurrent.futures
 import itertools
 import json
 import os
@@ -16,23 +15,18 @@ import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 from ..dialect import Endpoint, Kind, NodeName
 from ..graph import mismatches
+from ..node_base import NodeBase
 from ..qos import Qos, clash
-from ..seam import Troubles
 from .handles import Client, Handle, Publication, Server, Subscription
 from .interpreter import find_python
 from .side.frames import Frame, control, pull_frame
 from .side.frames import Kind as FrameKind
 from .side.outbox import Sender
 
-MAX_WORKING = 64
-"""Calls from the graph that are worked on or wait for it."""
-WORKERS = 16
-"""Of these at the same time: an action's result is a call that waits as long as the action."""
 LEAVE_S = 3.0
 """For the program to end by itself."""
 _SIDE = Path(__file__).parent / "side" / "__main__.py"
@@ -41,7 +35,7 @@ _RETRY_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _H = TypeVar("_H", bound=Handle)
 
 
-class RclpyNode:
+class RclpyNode(NodeBase):
     """One node of a ROS 2 graph; every method may be called from any thread.
 
     Args:
@@ -64,23 +58,16 @@ class RclpyNode:
         arguments: Sequence[str] = (),
         say: Callable[[str], object] | None = None,
     ) -> None:
-        self._name = name or NodeName()
+        super().__init__(name, say)
         self._python = find_python(python)
         self._environment = dict(os.environ) if domain is None else {**os.environ, "ROS_DOMAIN_ID": str(domain)}
         self._arguments = list(arguments)
-        self._troubles = Troubles(say)
         self._lock = threading.RLock()
-        self._closing = threading.Event()
-        self._joined = threading.Event()
         self._handles: dict[int, Handle] = {}
         self._channels = itertools.count(1)
         self._sender: Sender | None = None
         self._link: socket.socket | None = None
-        self._known: dict[str, Endpoint] = {}
         self._lost: dict[int, int] = {}
-        self._working = threading.Semaphore(MAX_WORKING)
-        self._workers: concurrent.futures.ThreadPoolExecutor | None = None
-        self._thread: threading.Thread | None = None
         self.nodes = 0
         """Other nodes of the graph."""
         self.middleware = ""
@@ -90,31 +77,13 @@ class RclpyNode:
         self.pid = 0
         """Of the program; 0: there is none now."""
 
-    def start(self) -> None:
-        """Begin to join the graph; returns at once."""
-        self._workers = concurrent.futures.ThreadPoolExecutor(WORKERS, thread_name_prefix="ros2-call")
-        self._thread = threading.Thread(target=self._run, name="ros2-node", daemon=True)
-        self._thread.start()
+    def _jobs(self) -> Sequence[Callable[[], None]]:
+        return (self._run,)
 
-    def close(self) -> None:
-        """Leave the graph, and wait until that is done."""
-        self._closing.set()
+    def _interrupt(self) -> None:
         with self._lock:
             if self._link is not None:
                 self._link.shutdown(socket.SHUT_RDWR)
-        if self._thread is not None:
-            self._thread.join()
-        if self._workers is not None:
-            self._workers.shutdown(wait=False, cancel_futures=True)
-
-    def __enter__(self) -> RclpyNode:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
         """Be a publisher; see `skytether.ros.ros2.seam.GraphNode`."""
@@ -132,31 +101,6 @@ class RclpyNode:
         """Be a client of a service."""
         return self._add(Client(self, next(self._channels), endpoint))
 
-    def wait_until_joined(self, timeout: float) -> bool:
-        """Whether the node was in the graph within so many seconds; who else is there may take longer to see."""
-        return self._joined.wait(timeout)
-
-    def endpoints(self, name: str | None = None, kind: Kind | None = None) -> list[Endpoint]:
-        """What others have on the graph now."""
-        return [e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind)]
-
-    def lives(self, name: str, kind: Kind) -> set[str]:
-        """Something for each endpoint of a name and kind that is another after it was away."""
-        return {key for key, e in self._known.items() if (e.name, e.kind) == (name, kind)}
-
-    @property
-    def troubles(self) -> tuple[str, ...]:
-        """What is wrong now, a sentence each."""
-        return self._troubles.texts
-
-    def report(self, key: str, text: str) -> None:
-        """Tell a trouble once: again only after `settle`."""
-        self._troubles.report(key, text)
-
-    def settle(self, key: str) -> None:
-        """A trouble is over; nothing is said."""
-        self._troubles.settle(key)
-
     # --- Host --------------------------------------------------------------------------------------------------------
 
     def remove(self, handle: Handle) -> None:
@@ -168,17 +112,6 @@ class RclpyNode:
             if self._sender is not None:
                 self._sender.put(control(do="close", channel=handle.channel))
                 self._sender.remove(handle.channel)
-
-    def work(self, job: Callable[[], object]) -> bool:
-        """Host: have something done in a worker's thread."""
-        if self._workers is None or not self._working.acquire(blocking=False):
-            return False
-        try:
-            self._workers.submit(job).add_done_callback(lambda _: self._working.release())
-        except RuntimeError:  # closing
-            self._working.release()
-            return False
-        return True
 
     # --- the program -------------------------------------------------------------------------------------------------
 
