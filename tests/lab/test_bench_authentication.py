@@ -8,7 +8,7 @@ from itertools import count
 import pytest
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app as cli
+from skytether.cli.commands.lab.app import app as cli
 from skytether.lab.bench import authentication
 from skytether.lab.bench.authentication import bench_authentication
 from skytether.lab.bench.pair import BenchError

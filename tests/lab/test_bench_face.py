@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app
+from skytether.cli.commands.lab.app import app
 from skytether.lab.bench import face as bench
 from skytether_services.follow_in_front.bench_face import look
 

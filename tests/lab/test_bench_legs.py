@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app
+from skytether.cli.commands.lab.app import app
 from skytether.lab.leg_bag import read_leg_bag
 from skytether.messages import (
     Header,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app
+from skytether.cli.commands.lab.app import app
 from skytether.lab.bench.mapping import noisy
 from skytether.lab.relations import relative
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app as cli
+from skytether.cli.commands.lab.app import app as cli
 from skytether.lab.bench.ros import BRIDGED, MESSAGES, PLAIN, bench_ros
 from skytether.lab.bench.ros2_node import PYTHON
 

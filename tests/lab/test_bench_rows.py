@@ -8,7 +8,7 @@ import time
 import pytest
 from typer.testing import CliRunner
 
-from skytether.cli.commands.lab.lab import app as cli
+from skytether.cli.commands.lab.app import app as cli
 from skytether.lab.bench import conditions, traffic
 from skytether.lab.bench.bridge import BenchError, make_plan
 from skytether.lab.bench.report import cells, markdown_table

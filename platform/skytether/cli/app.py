@@ -46,12 +46,12 @@ class _Commands(LazyGroup):
         ),
         "orchestrator": Lazy("orchestrator", "app", "Run the orchestrator."),
         "service": Lazy("service", "app", "What robots can ask for."),
-        "site": Lazy("site_nodes", "app", "Where instances run."),
+        "site": Lazy("site.app", "app", "Where instances run."),
         "group": Lazy("group", "app", "Groups of sites, whose machines come and go as they are needed."),
         "instance": Lazy("instance", "app", "What runs, for whom."),
         "robot": Lazy("robot.app", "app", "Who may ask; and what runs on a robot: its agent and its gate."),
         "token": Lazy("token", "app", "Tokens of robots and operators."),
-        "lab": Lazy("lab.lab", "app", "Experiments and benchmarks on this machine."),
+        "lab": Lazy("lab.app", "app", "Experiments and benchmarks on this machine."),
     }
 
 

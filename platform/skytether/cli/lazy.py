@@ -2,6 +2,9 @@
 
 A group's help names each command with one sentence. That stands in the table of the group, and a test compares it with
 the command's own.
+
+A command's file imports at its top. In functions are imports that need an extra (help is there without it), and, where
+one file has several verbs, those of the client: help and completion are not to wait for it.
 """
 
 from __future__ import annotations

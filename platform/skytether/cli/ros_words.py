@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skytether.ros.ros1.arguments import ArgumentError, parse
+
 from .output import fail
 
 if TYPE_CHECKING:
@@ -24,8 +26,6 @@ RosWords = Annotated[
 
 def given(words: list[str] | None) -> RosArguments:
     """What they say, and the environment; a word that ROS does not know ends the command."""
-    from skytether.ros.ros1.arguments import ArgumentError, parse
-
     try:
         return parse(words or (), os.environ)
     except ArgumentError as error:

@@ -6,12 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from skytether.api.client import ApiError, Unreachable
+from skytether.lab.embedded import EmbeddedError
+from skytether.robot.agent.snapshot import AgentStatus
+from skytether.robot.control import control_loop as robot_driver
 
 from ..output import console, fail, print_json, silenced
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from skytether.lab.demo import Demo, DemoResult
     from skytether.robot.control.control_loop import Transition
 
@@ -30,9 +35,7 @@ def demo(
     Starts an orchestrator, then a walker that asks it for virtual-trail. Ends with exit status 0 only if the walker
     completed the trail.
     """
-    from skytether.api.client import ApiError, Unreachable
     from skytether.lab.demo import Demo, DemoError, DemoSettings
-    from skytether.lab.embedded import EmbeddedError
 
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -59,11 +62,6 @@ def demo(
 
 def _walk(running: Demo) -> DemoResult:
     """Show how it goes while it goes."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from skytether.robot.agent.snapshot import AgentStatus
-    from skytether.robot.control import control_loop as robot_driver
-
     handed_over = 0.0
     columns = (
         TextColumn("{task.description}"),
@@ -112,7 +110,6 @@ def _print_tables(result: DemoResult) -> None:
 
 
 def _facts(result: DemoResult) -> Table:
-    from rich.table import Table
 
     walk = result.measures
     table = Table(title="The walk", show_header=False)
@@ -130,7 +127,6 @@ def _facts(result: DemoResult) -> Table:
 
 
 def _topics(result: DemoResult) -> Table:
-    from rich.table import Table
 
     table = Table(title="Topics: one-way delay and jitter in ms")
     for heading in ("topic", "sent", "delivered", "lost", "delay p50", "delay p99", "jitter"):

@@ -10,12 +10,22 @@ from urllib.parse import urlsplit
 
 import typer
 
+from skytether.api.client import addresses
+from skytether.api.config_file import ConfigError
+from skytether.robot.config.robot_config import load_config, load_token
+from skytether.robot.diagnosis import examine
+from skytether.robot.diagnosis.doctor import Finding
+from skytether.ros.ros1.master import MasterError, call
+from skytether.ros.ros1.node import Node, NodeError
+
 from ..connection import Json, transport
 from ..output import console, fail, print_json
+from .robot.check import look
+from .robot.ros2 import look_ros2
+from .robot.run import ros1_config
 
 if TYPE_CHECKING:
     from skytether.robot.config.robot_config import RobotConfig
-    from skytether.robot.diagnosis.doctor import Finding
 
 _COLOURS = {"ok": "green", "trouble": "red", "skipped": "yellow"}
 
@@ -41,8 +51,6 @@ def doctor(
     Looks at orchestrator, certificate, clock, token, UDP, packet size, NAT, ROS graph, message types, fallback and
     optional parts. Ends with exit status 1 if there is trouble.
     """
-    from skytether.api.config_file import ConfigError
-
     if config is None and url is None and echo is None:
         fail("give a robot.yaml, the address of an orchestrator with --url, or an echo with --echo", 2)
     try:
@@ -63,10 +71,6 @@ def doctor(
 
 
 def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str | None) -> Iterator[Finding]:
-    from skytether.api.client import addresses
-    from skytether.api.config_file import ConfigError
-    from skytether.robot.config.robot_config import load_config, load_token
-    from skytether.robot.diagnosis import examine
 
     settings = load_config(config) if config is not None else None
     if settings is not None:
@@ -104,13 +108,6 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
 
 def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
     """The ROS 1 graph: its master, and the types of what the service takes and gives."""
-    from skytether.robot.diagnosis.doctor import Finding
-    from skytether.ros.ros1.master import MasterError, call
-    from skytether.ros.ros1.node import Node, NodeError
-
-    from .robot.check import look
-    from .robot.run import ros1_config
-
     ros1 = settings.ros1
     if ros1 is None:
         return
@@ -143,11 +140,6 @@ def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
 
 def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
     """The ROS 2 graph: its router, and the types of what the service takes and gives."""
-    from skytether.api.config_file import ConfigError
-    from skytether.robot.diagnosis.doctor import Finding
-
-    from .robot.ros2 import look_ros2
-
     if settings.ros2 is None:
         return
     try:
@@ -169,14 +161,11 @@ def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
 
 
 def _trouble(check: str, says: str, todo: str) -> Finding:
-    from skytether.robot.diagnosis.doctor import Finding
 
     return Finding(check, "trouble", says, todo)
 
 
 def _token(settings: RobotConfig, config: Path) -> str:
-    from skytether.api.config_file import ConfigError
-    from skytether.robot.config.robot_config import load_token
 
     try:
         return load_token(settings, config.parent)

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from skytether.bridge.echo import EchoServer
+
 from ..output import console, fail
 
 
@@ -19,8 +21,6 @@ def echo(
 
     Robots name it in robot.yaml under task.echoes, by site; `skytether doctor` uses it to look at the network.
     """
-    from skytether.bridge.echo import EchoServer
-
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())

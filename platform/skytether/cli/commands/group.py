@@ -8,8 +8,8 @@ import typer
 
 from .. import names
 from ..connection import Json, TokenFile, Url, connected
+from ..options import value_of
 from ..output import console, fail, or_dash, plain, print_json, print_table, show
-from .site import value_of
 
 if TYPE_CHECKING:
     from skytether.api.groups import Group

@@ -11,6 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skytether.orchestrator.backup import BackupError, backup, restore
+from skytether.orchestrator.config.defaults import default_state_dir
+from skytether.orchestrator.domain.errors import ConflictError, InvalidError, OutdatedError
+from skytether.orchestrator.domain.security import SecretFileError
+from skytether.orchestrator.runtimes.base import RuntimeFailure
+from skytether.orchestrator.telemetry.audit import AuditError, verify
+
 from ..output import console, fail
 
 if TYPE_CHECKING:
@@ -74,7 +81,6 @@ def run(
     both. TLS, logs, limits and the reconciler's patience are set there: see `skytether orchestrator config`.
     """
     from skytether.orchestrator.config.sources import load, seen_by_others
-    from skytether.orchestrator.domain.errors import InvalidError
     from skytether.orchestrator.http.server import StartError
     from skytether.orchestrator.http.server import run as serve
 
@@ -130,8 +136,6 @@ def verify_audit(
 
     That its end was cut off shows only by a hash that was noted elsewhere: give it with --last.
     """
-    from skytether.orchestrator.telemetry.audit import AuditError, verify
-
     try:
         checked = verify(file, last)
     except AuditError as error:
@@ -169,8 +173,6 @@ def rotate(
     has ended. The old operator's token is worth nothing from then on.
     """
     from skytether.orchestrator.access.rotation import rotate_key, rotate_operator
-    from skytether.orchestrator.config.defaults import default_state_dir
-    from skytether.orchestrator.domain.security import SecretFileError
 
     folder = (secrets_dir or state_dir or default_state_dir()).expanduser()
     try:
@@ -203,11 +205,8 @@ def dismantle_sites(
 
     For when their orchestrators are gone for good: whatever runs there ends.
     """
-    from skytether.orchestrator.config.defaults import default_state_dir
     from skytether.orchestrator.config.sites_file import read_groups, read_sites
-    from skytether.orchestrator.domain.errors import ConflictError, InvalidError
     from skytether.orchestrator.groups.group_end import end_groups
-    from skytether.orchestrator.runtimes.base import RuntimeFailure
     from skytether.orchestrator.scheduling.sites import dismantle
 
     folder = (state_dir or default_state_dir()).expanduser()
@@ -235,7 +234,6 @@ def _store(address: str) -> Iterator[Store]:
     """The database; one that cannot be used ends the command with one sentence."""
     from sqlalchemy.exc import SQLAlchemyError
 
-    from skytether.orchestrator.domain.errors import OutdatedError
     from skytether.orchestrator.store.engine import AddressError
     from skytether.orchestrator.store.store import Store
 
@@ -256,9 +254,6 @@ def back_up(
     to: Annotated[Path, typer.Argument(help="A folder that is not there yet.")], state_dir: StateDir = None
 ) -> None:
     """Copy database, secret key and operator's token, while the orchestrator runs. Keep the copy as secret as these."""
-    from skytether.orchestrator.backup import BackupError, backup
-    from skytether.orchestrator.config.defaults import default_state_dir
-
     try:
         copied = backup((state_dir or default_state_dir()).expanduser(), to)
     except BackupError as error:
@@ -271,9 +266,6 @@ def restore_copy(
     source: Annotated[Path, typer.Argument(help="What `backup` made.")], state_dir: StateDir = None
 ) -> None:
     """Put a copy into a state folder that holds none, before an orchestrator is started over it."""
-    from skytether.orchestrator.backup import BackupError, restore
-    from skytether.orchestrator.config.defaults import default_state_dir
-
     try:
         put = restore(source, (state_dir or default_state_dir()).expanduser())
     except BackupError as error:

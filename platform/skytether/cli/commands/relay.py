@@ -11,11 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skytether.api.config_file import ConfigError, check_config, read_config
+from skytether.bridge.endpoint import BridgeError
+from skytether.bridge.relay import Relay, show_address
+from skytether.bridge.relay_config import RelayConfig, parse_endpoint
+from skytether.orchestrator.runtimes.base import RuntimeFailure
+
 from ..output import console, fail, print_json
 
 if TYPE_CHECKING:
-    from skytether.bridge.relay import Relay, RelayStats
-    from skytether.bridge.relay_config import PodsConfig, RelayConfig
+    from skytether.bridge.relay import RelayStats
+    from skytether.bridge.relay_config import PodsConfig
     from skytether.orchestrator.runtimes.kubernetes.relayed import PodRoutes
 
 
@@ -40,9 +46,6 @@ def relay(
 
     Robots name the relay as their peer. It can neither read nor alter what it forwards.
     """
-    from skytether.api.config_file import ConfigError, read_config
-    from skytether.bridge.relay_config import RelayConfig
-
     try:
         if config is None:
             settings = _from_options(listen, route or [], upstream, kubernetes)
@@ -56,8 +59,6 @@ def relay(
 
 
 def _from_options(listen: str | None, routes: list[str], upstream: str | None, kubernetes: str | None) -> RelayConfig:
-    from skytether.api.config_file import check_config
-    from skytether.bridge.relay_config import RelayConfig, parse_endpoint
 
     document: dict[str, Any] = {"routes": []}
     if listen is not None:
@@ -77,8 +78,6 @@ def _endpoint(address: tuple[str, int]) -> dict[str, Any]:
 
 
 def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None:
-    from skytether.bridge.endpoint import BridgeError
-    from skytether.bridge.relay import Relay, show_address
 
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -112,9 +111,6 @@ def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None
 
 def _pods(config: PodsConfig, relay: Relay) -> PodRoutes:
     """Have the relay's routes follow a cluster's pods."""
-    from skytether.api.config_file import ConfigError, check_config
-    from skytether.orchestrator.runtimes.base import RuntimeFailure
-
     try:
         import kubernetes  # noqa: F401 - told apart from an ImportError of our own
     except ImportError:

@@ -8,13 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from skytether.api.client import ApiError, Client, Unreachable
+from skytether.lab.embedded import EmbeddedError, EmbeddedOrchestrator
+from skytether.robot.replay import replay as stream
+from skytether.robot.replay.bag import Bag, BagError
+from skytether.robot.replay.replay import ReplayConfig, ReplayError
 
 from ..connection import TokenFile, connected
 from ..output import SafeConsole, cell, console, fail, print_json, print_whole
 
 if TYPE_CHECKING:
-    from skytether.api.client import Client
-    from skytether.robot.replay.replay import ReplayConfig, ReplayResult
+    from skytether.robot.replay.replay import ReplayResult
 
 
 def replay(
@@ -40,11 +47,6 @@ def replay(
 
     Ends with exit status 0 only if every message arrived.
     """
-    from skytether.api.client import ApiError, Unreachable
-    from skytether.lab.embedded import EmbeddedError
-    from skytether.robot.replay.bag import BagError
-    from skytether.robot.replay.replay import ReplayConfig, ReplayError
-
     topics = tuple(topic) if topic else None
     config = ReplayConfig(bag, robot, service, topics=topics, remap=_remappings(remap or []), speed=speed)
     try:
@@ -69,10 +71,6 @@ def replay(
 
 def _with_own_orchestrator(config: ReplayConfig, output: Path) -> tuple[ReplayResult, list[Path]]:
     """Start an orchestrator, replay, and keep what the service wrote."""
-    from skytether.api.client import Client
-    from skytether.lab.embedded import EmbeddedOrchestrator
-    from skytether.robot.replay.bag import Bag
-
     Bag(config.bag).close()  # what is wrong with the recording is told before anything is started
     output.mkdir(parents=True, exist_ok=True)
     with EmbeddedOrchestrator() as orchestrator:
@@ -107,21 +105,17 @@ def _free(path: Path) -> Path:
 
 def _stream(config: ReplayConfig, client: Client) -> ReplayResult:
     """Replay with a bar on standard error."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from skytether.robot.replay import replay
-
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"starting {config.service}", total=None)
 
-        def show(progress: replay.Progress) -> None:
+        def show(progress: stream.Progress) -> None:
             if progress.total:
                 bar.update(task, completed=progress.sent, total=progress.total, description=progress.stage)
             else:
                 bar.update(task, description=f"{progress.stage} {config.service}")
 
-        return replay.replay(config, client, show)
+        return stream.replay(config, client, show)
 
 
 def _document(config: ReplayConfig, result: ReplayResult, files: list[Path]) -> dict[str, Any]:
@@ -156,7 +150,6 @@ def _ms(seconds: float) -> float | None:
 
 
 def _print_table(config: ReplayConfig, result: ReplayResult, files: list[Path]) -> None:
-    from rich.table import Table
 
     table = Table(title=cell(f"{config.bag.name} to {config.service}, {result.seconds:.1f} s"))
     table.add_column("topic")

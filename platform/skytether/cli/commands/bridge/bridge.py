@@ -12,12 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
+from rich.live import Live
+from rich.table import Table
+
+from skytether.api.config_file import ConfigError
+from skytether.bridge.endpoint import BridgeError
 
 from ...output import console, fail, print_json
+from .config import load_config, load_key, write_new_key
+from .ends import start_ends
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from skytether.wire.stats import SessionStats
 
     from .config import BridgeConfig
@@ -38,10 +45,6 @@ def bridge(
     With ros2: in the configuration this end is a ROS 2 graph. Sources publish made-up messages instead, so that a
     network can be measured before a robot depends on it.
     """
-    from skytether.api.config_file import ConfigError
-
-    from .config import load_config, load_key, write_new_key
-
     try:
         if new_key is not None:
             write_new_key(new_key)
@@ -57,13 +60,6 @@ def bridge(
 
 
 def _run(settings: BridgeConfig, key: bytes, folder: Path, seconds: float | None, *, as_json: bool) -> None:
-    from rich.console import Group
-    from rich.live import Live
-
-    from skytether.api.config_file import ConfigError
-    from skytether.bridge.endpoint import BridgeError
-
-    from .ends import start_ends
 
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -120,9 +116,6 @@ def _plain(value: Any) -> Any:
 
 def _table(role: str, stats: SessionStats) -> Table:
     """Statistics of one end for people."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     state = "connected" if stats.connected else "waiting for the peer"
     for path in stats.paths:
         rtt, loss = _number(path.rtt, 1000, " ms"), _number(path.loss_out, 100, " %")

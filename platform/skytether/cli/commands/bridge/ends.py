@@ -19,6 +19,8 @@ from skytether.bridge.spec import SessionSpec, parse_id, topics_from_api
 from skytether.emulator.udp_link import LinkConditions, LinkEmulator
 from skytether.ros.names import Names
 from skytether.ros.ros2.config import join_graph
+from skytether.ros.ros2.port import Ros2Port
+from skytether.ros.translate import Translated
 from skytether.wire import Config
 from skytether.wire.events import Connected, Event, Refused
 from skytether.wire.topic import Role, Topic
@@ -119,9 +121,6 @@ def _ros2_port(
     Raises:
         ValueError: A topic cannot be in it.
     """
-    from skytether.ros.ros2.port import Ros2Port
-    from skytether.ros.translate import Translated
-
     assert settings.ros2 is not None  # noqa: S101 - the caller has a node of it
     home = settings.ros2.namespace
     names = Names(settings.topics, home, home, settings.ros2.remap, ros=2)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.authentication import bench_authentication
+from skytether.lab.bench.pair import BenchError
 
 from ...output import console, fail, print_json
 
@@ -20,11 +24,6 @@ def authentication(
     ] = False,
 ) -> None:
     """Processor time of a message at both ends of the bridge, without sockets, and how much of it the tags take."""
-    from rich.table import Table
-
-    from skytether.lab.bench.authentication import bench_authentication
-    from skytether.lab.bench.pair import BenchError
-
     try:
         rows = bench_authentication(n)
     except BenchError as error:

@@ -8,6 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
+from skytether.api.client import ApiError, Unreachable
+from skytether.lab.embedded import EmbeddedError
+from skytether.lab.trial.rig import TrialError
+from skytether.lab.world.model import WorldError
+
 from ...output import console, fail, print_json
 
 
@@ -24,11 +29,7 @@ def building(
     the folder. Ends when all goals were reached or given up, when the guide is through, or when the time is over; with
     exit status 0 unless goals were given up, something was touched, or the robot did not move, or stood at the end.
     """
-    from skytether.api.client import ApiError, Unreachable
     from skytether.lab.building_run import ParamsError, drive, read_params
-    from skytether.lab.embedded import EmbeddedError
-    from skytether.lab.trial.rig import TrialError
-    from skytether.lab.world.model import WorldError
 
     def tell(now: float, status: Mapping[str, Any]) -> None:
         if not json:

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from skytether.lab.bench.navigation import NavigationBenchError
+from skytether.lab.world.model import WorldError
+
 from ...output import console, fail, print_json
 
 
@@ -26,8 +29,6 @@ def face(
     photographs.
     """
     from skytether.lab.bench.face import bench_face
-    from skytether.lab.bench.navigation import NavigationBenchError
-    from skytether.lab.world.model import WorldError
 
     try:
         with console.status("drawing and looking ..."):

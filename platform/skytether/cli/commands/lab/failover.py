@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.alarms import bench_alarms
+from skytether.lab.bench.failover import RATES_HZ, bench_failover
+from skytether.lab.bench.pair import BenchError
+from skytether.robot.control import control_loop
 
 from ...output import console, fail, print_json, silenced
 
@@ -27,12 +34,6 @@ def failover(
     and 20 ms for two turns of the control loop.
     Ends with exit status 1 if it was missed.
     """
-    from rich.table import Table
-
-    from skytether.lab.bench.failover import RATES_HZ, bench_failover
-    from skytether.lab.bench.pair import BenchError
-    from skytether.robot.control import control_loop
-
     try:
         with silenced(control_loop.__name__), console.status("starting ...") as line:
             rows = bench_failover(rate or RATES_HZ, n, seed, lambda r, i: line.update(f"{r:g} Hz: cut {i} of {n}"))
@@ -74,15 +75,6 @@ def alarms(
 
     Ends with exit status 1 if there was a hand-over.
     """
-    import os
-
-    from rich.table import Table
-
-    from skytether.lab.bench.alarms import bench_alarms
-    from skytether.lab.bench.failover import RATES_HZ
-    from skytether.lab.bench.pair import BenchError
-    from skytether.robot.control import control_loop
-
     programs = os.cpu_count() or 1 if busy is None else busy
     try:
         with silenced(control_loop.__name__), console.status("starting ...") as line:

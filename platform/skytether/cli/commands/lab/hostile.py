@@ -5,6 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.hostile import bench_hostile
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.embedded import EmbeddedError
 
 from ...output import console, fail, print_json
 
@@ -18,12 +23,6 @@ def hostile(
 
     Ends with exit status 1 if an instance of the others ended, or a renewal of theirs got no good answer.
     """
-    from rich.table import Table
-
-    from skytether.lab.bench.hostile import bench_hostile
-    from skytether.lab.bench.pair import BenchError
-    from skytether.lab.embedded import EmbeddedError
-
     try:
         with console.status("starting ...") as line:
             row = bench_hostile(robots, minutes, line.update)

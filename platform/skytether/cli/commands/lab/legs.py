@@ -7,6 +7,10 @@ from typing import Annotated
 
 import typer
 
+from skytether.lab.bench.legs import bench_legs
+from skytether.lab.bench.navigation import NavigationBenchError
+from skytether.robot.replay.bag import BagError
+
 from ...output import console, fail, print_json
 
 
@@ -27,10 +31,6 @@ def legs(
     (/ground_truth_people_tracks), also CLEAR MOT; else a track that begins where one has just ended counts as a switch,
     and a scan that shows nothing of somebody as a miss (judged_by).
     """
-    from skytether.lab.bench.legs import bench_legs
-    from skytether.lab.bench.navigation import NavigationBenchError
-    from skytether.robot.replay.bag import BagError
-
     try:
         with console.status("reading ..."):
             document = bench_legs(bag, topic, angles)

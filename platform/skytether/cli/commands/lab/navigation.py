@@ -7,6 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.mapping import ODOMETRY, bench_mapping
+from skytether.lab.bench.navigation import NavigationBenchError, bench_driving, bench_localisation
+from skytether.lab.carmen import CarmenError, read_log
 
 from ...output import console, fail, print_json
 
@@ -50,10 +55,6 @@ def mapping(
     Prints one JSON object: mean and standard deviation of the relations' errors (means over the seeds), of all, and of
     neighbours (within 10 s) and loops apart; wall_s with reading the log, peak_mb of the whole process.
     """
-    from skytether.lab.bench.mapping import ODOMETRY, bench_mapping
-    from skytether.lab.bench.navigation import NavigationBenchError
-    from skytether.lab.carmen import CarmenError
-
     mode = next((known for known in ODOMETRY if known == odometry), None)
     if mode is None:
         fail(f"--odometry is one of {', '.join(ODOMETRY)}, not '{odometry}'", 2)
@@ -89,9 +90,6 @@ def localisation(
 
     Prints one JSON object; its mean and 95th percentile of the position's error are over all seeds.
     """
-    from skytether.lab.bench.navigation import NavigationBenchError, bench_localisation
-    from skytether.lab.carmen import CarmenError, read_log
-
     try:
         with console.status("reading ...") as line:
             recorded = read_log(log, fov=None if fov is None else math.radians(fov))
@@ -126,8 +124,6 @@ def navigation(
     A step is all that the service does in one: localisation, costmaps, planner, controller, messages. Time is made up,
     so nothing waits; compilation comes before, and is told apart. By the clock, and of the processor.
     """
-    from skytether.lab.bench.navigation import NavigationBenchError, bench_driving
-
     if delays and cluttered is not None:
         fail("--delays and --cluttered are two benchmarks; give one of them", 2)
     try:
@@ -155,7 +151,6 @@ def navigation(
 
 
 def _print_steps(found: dict[str, Any]) -> None:
-    from rich.table import Table
 
     table = Table("ms per step", "p50", "p99", "max")
     for name, text in (("wall", "by the clock"), ("cpu", "of the processor")):
@@ -172,7 +167,6 @@ def _print_steps(found: dict[str, Any]) -> None:
 
 
 def _print_delays(found: dict[str, Any]) -> None:
-    from rich.table import Table
 
     table = Table(
         "round trip",

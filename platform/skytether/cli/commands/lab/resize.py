@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.embedded import EmbeddedError
 
 from ...output import console, fail, print_json
 
@@ -19,11 +23,7 @@ def resize(
 
     Beside it, the same over as long a time without a change. With docker, the images must be there (`make images`).
     """
-    from rich.table import Table
-
-    from skytether.lab.bench.pair import BenchError
     from skytether.lab.bench.resize import SIZES, bench_resize
-    from skytether.lab.embedded import EmbeddedError
 
     try:
         with console.status("starting ...") as line:

@@ -5,6 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.ros import BRIDGED, PLAIN, bench_ros
 
 from ...output import console, fail, print_json
 
@@ -34,12 +39,6 @@ def ros(
     ROS 2 is that of `make ros2`, or of the Python that
     SKYTETHER_ROS2_PYTHON names.
     """
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from skytether.lab.bench.pair import BenchError
-    from skytether.lab.bench.ros import BRIDGED, PLAIN, bench_ros
-
     ways = (PLAIN, BRIDGED)
     unknown = [name for name in way or () if name not in ways]
     if unknown:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skytether.lab.follow_in_front_report import DEVICES, THESIS, THESIS_TRIALS, summary, topics
+from skytether.lab.follow_in_front_result import FollowResult
+
 from ...output import console, print_json
 from .trials import (
     Keep,
@@ -31,7 +34,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from skytether.lab.follow_in_front import FollowSettings
-    from skytether.lab.follow_in_front_result import FollowResult
     from skytether.lab.trial.scenario import Scenario
 
 
@@ -61,7 +63,6 @@ def follow_in_front(
     trials the robot came round ahead of the person, and touched nothing.
     """
     from skytether.lab.follow_in_front import SCENARIOS
-    from skytether.lab.follow_in_front_result import FollowResult
 
     wanted = named_scenarios(scenario, SCENARIOS, robot_cpu)
     prefix = prefix if docker else ""
@@ -98,7 +99,6 @@ def _told(result: FollowResult) -> str:
 
 
 def _report(results: Sequence[FollowResult], *, json: bool) -> None:
-    from skytether.lab.follow_in_front_report import DEVICES, summary, topics
 
     rows, quality = summary(results), topics(results)
     if json:
@@ -117,7 +117,6 @@ def _draw(results: Sequence[FollowResult], folder: Path, *, json: bool) -> None:
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
-    from skytether.lab.follow_in_front_report import THESIS, THESIS_TRIALS
 
     shown = {
         "time_s": "time [s]",
@@ -132,7 +131,6 @@ def _table(rows: list[dict[str, Any]]) -> Table:
 
 
 def _network_table(rows: list[dict[str, Any]]) -> Table:
-    from skytether.lab.follow_in_front_report import THESIS
 
     shown = {
         "rtt_ms": "round trip [ms]",

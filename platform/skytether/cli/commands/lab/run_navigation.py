@@ -9,6 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skytether.lab.nine_goals import SCENARIOS, SERVICE, NineGoalsSettings, NineGoalsTrial
+from skytether.lab.nine_goals_report import DEVICES, THESIS, THESIS_TRIALS, compare_times, summary, topics
+from skytether.lab.nine_goals_result import NineGoalsResult
+from skytether.lab.trial.scenario import Scenario
+from skytether.lab.world.plan import building
+
 from ...output import console, fail, print_json
 from .trials import (
     Keep,
@@ -29,10 +35,6 @@ from .trials import (
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from skytether.lab.nine_goals import NineGoalsSettings
-    from skytether.lab.nine_goals_result import NineGoalsResult
-    from skytether.lab.trial.scenario import Scenario
 
 
 def navigation(
@@ -67,9 +69,6 @@ def navigation(
     With --keep a run that was stopped goes on where it was. Ends with exit status 0 only if all trials reached all
     goals and touched nothing.
     """
-    from skytether.lab.nine_goals import SCENARIOS
-    from skytether.lab.nine_goals_result import NineGoalsResult
-
     if compensation not in ("measured", "off", "fixed"):
         fail(f"--compensation must be measured, off or fixed, not '{compensation}'", 2)
     wanted = _delays(rtt_ms, jitter_ms / 1000, loss) if rtt_ms else named_scenarios(scenario, SCENARIOS, robot_cpu)
@@ -90,7 +89,6 @@ def _told(result: NineGoalsResult) -> str:
 
 
 def _report(results: Sequence[NineGoalsResult], baseline: str, *, json: bool) -> None:
-    from skytether.lab.nine_goals_report import DEVICES, compare_times, summary, topics
 
     rows, times, quality = summary(results), compare_times(results, baseline), topics(results)
     if json:
@@ -113,15 +111,12 @@ def _report(results: Sequence[NineGoalsResult], baseline: str, *, json: bool) ->
 
 def _draw(results: Sequence[NineGoalsResult], folder: Path, *, json: bool) -> None:
     from skytether.lab.nine_goals_figures import draw_figures
-    from skytether.lab.world.plan import building
 
     write_figures(lambda: draw_figures(results, building(), folder), folder, json=json)
 
 
 def _drive(settings: NineGoalsSettings, text: str) -> NineGoalsResult:
     """One trial, told of while it lasts."""
-    from skytether.lab.nine_goals import NineGoalsTrial
-
     with console.status(f"{text} ...") as line, NineGoalsTrial(settings) as trial:
         return trial.drive(
             lambda status: line.update(f"{text}, goal {status.get('goal', 0)}: {status.get('message', '')}")
@@ -129,13 +124,11 @@ def _drive(settings: NineGoalsSettings, text: str) -> NineGoalsResult:
 
 
 def _delays(rtts_ms: list[float], jitter_s: float, loss: float) -> list[Scenario]:
-    from skytether.lab.trial.scenario import Scenario
 
     return [Scenario(f"{rtt:g} ms", rtt / 1000, jitter_s, loss) for rtt in rtts_ms]
 
 
 def _settings(scenario: Scenario, compensation: str, seed: int, goals: int, prefix: str) -> NineGoalsSettings:
-    from skytether.lab.nine_goals import SERVICE, NineGoalsSettings
 
     delay = {"compensation": compensation, **({"fixed_delay": scenario.rtt_s} if compensation == "fixed" else {})}
     scenario = replace(scenario, params={**scenario.params, "delay": delay})
@@ -144,7 +137,6 @@ def _settings(scenario: Scenario, compensation: str, seed: int, goals: int, pref
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
-    from skytether.lab.nine_goals_report import THESIS, THESIS_TRIALS
 
     shown = {
         "time_s": "time [s]",

@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.safety import HEADING, bench_safety, estimate, select
+from skytether.lab.safety.ros1_hardware import available
 
 from ...output import console, fail, print_json
 
@@ -31,9 +35,6 @@ def safety(
     Only 'suspend' is rehearsed without processes, with a made-up clock.
     Ends with exit status 1 if a promise was broken.
     """
-    from skytether.lab.bench.safety import HEADING, bench_safety, estimate, select
-    from skytether.lab.safety.ros1_hardware import available
-
     if ros1 and not available():
         fail("there is no program 'rosmaster': install ros-core, or leave out --ros1", 2)
     try:
@@ -62,7 +63,6 @@ def safety(
 
 
 def _show(rows: list[SafetyRow]) -> None:
-    from rich.table import Table
 
     table = Table(title="Attacks on the gate")
     table.add_column("attack", no_wrap=True)

@@ -6,6 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.table import Table
+
+from skytether.lab.bench.pair import BenchError
+from skytether.lab.bench.scale import bench_scale
+from skytether.lab.embedded import EmbeddedError
 
 from ...output import console, fail, print_json
 
@@ -29,12 +34,6 @@ def scale(
 
     10,000 robots take half an hour. The orchestrator is real, and so are its calls; what is made up is the cluster.
     """
-    from rich.table import Table
-
-    from skytether.lab.bench.pair import BenchError
-    from skytether.lab.bench.scale import bench_scale
-    from skytether.lab.embedded import EmbeddedError
-
     if replicas > 1 and database is None:
         raise typer.BadParameter("several orchestrators need one database: give --database postgresql://USER@HOST/NAME")
     if plot is not None and not plot.parent.is_dir():

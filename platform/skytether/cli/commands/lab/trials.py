@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from rich.table import Table
+
+from skytether.api.client import ApiError, Unreachable
+from skytether.lab.embedded import EmbeddedError
+from skytether.lab.trial.report import devices
+from skytether.lab.trial.results import KeptTrials
+from skytether.lab.trial.rig import TrialError
+from skytether.lab.world.model import WorldError
 
 from ...output import console, fail
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from skytether.lab.trial.report import Pair
-    from skytether.lab.trial.results import KeptTrials, TrialResult
+    from skytether.lab.trial.results import TrialResult
     from skytether.lab.trial.scenario import Scenario, TrialSettings
 
 R = TypeVar("R", bound="TrialResult")
@@ -38,8 +44,6 @@ Keep = Annotated[
 
 def kept_trials(file: Path | None, kind: type[R]) -> KeptTrials[R] | None:
     """What the option ``--keep`` names."""
-    from skytether.lab.trial.results import KeptTrials
-
     try:
         return KeptTrials(file, kind) if file is not None else None
     except (OSError, ValueError) as error:
@@ -76,11 +80,6 @@ def run_trials(
         run: Does one; given with what it is called while it lasts.
         told: What came of one, in some words.
     """
-    from skytether.api.client import ApiError, Unreachable
-    from skytether.lab.embedded import EmbeddedError
-    from skytether.lab.trial.rig import TrialError
-    from skytether.lab.world.model import WorldError
-
     results: list[R] = []
     try:
         for settings in asked:
@@ -137,8 +136,6 @@ def beside_thesis(
         title: Above.
         thesis_trials: It did so many of each, all completed: shown with ours, and our contacts; 0: neither is shown.
     """
-    from rich.table import Table
-
     made = Table("", *(("completed", "contacts") if thesis_trials else ()), *shown.values(), title=title)
     for row in rows:
         counted = (f"{row['completed']} of {row['trials']}", str(row["contacts"])) if thesis_trials else ()
@@ -164,10 +161,6 @@ def devices_table(
         thesis: By scenario of each device its name, processors [%], memory [MB].
         table: Name of the table.
     """
-    from rich.table import Table
-
-    from skytether.lab.trial.report import devices
-
     on_robot = {result.scenario for result in results if result.on_robot}
     made = Table("", "", "processors [%]", "memory [MB]", title=f"Resources, beside {table}")
     for row in rows:
@@ -190,8 +183,6 @@ def topics_table(rows: Sequence[Mapping[str, Any]], figures: str, caption: str) 
         figures: Those of the thesis that show the same.
         caption: Below the table.
     """
-    from rich.table import Table
-
     made = Table(
         "", "topic", "lost [%]", "delay [ms]", "its change [ms]", "period [ms]", "99 % within [ms]", "as sent [ms]",
         title=f"Loss and jitter of each topic, as in {figures}",

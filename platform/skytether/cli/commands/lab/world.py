@@ -8,6 +8,11 @@ from typing import Annotated
 
 import typer
 
+from skytether.lab.world.cluttered import NoFieldError
+from skytether.lab.world.model import WorldError
+from skytether.lab.world.plan import PlanError, building, read_plan
+from skytether.lab.world.simulation import Simulation
+
 from ...output import console, fail, print_json
 
 
@@ -34,12 +39,8 @@ def world(
     where the robot is drives, and stands before what the laser sees. Ends with exit status 0 only if all goals were
     reached without a contact.
     """
-    from skytether.lab.world.cluttered import NoFieldError
     from skytether.lab.world.live import serve
-    from skytether.lab.world.model import WorldError
-    from skytether.lab.world.plan import PlanError, building, read_plan
     from skytether.lab.world.show import show, show_field
-    from skytether.lab.world.simulation import Simulation
 
     try:
         if field is not None:

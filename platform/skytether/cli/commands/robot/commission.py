@@ -10,6 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
+from skytether.api.config_file import ConfigError
+from skytether.guard.velocity import Velocity
+from skytether.robot.config.gate_config import load_safety
+from skytether.robot.control.supervisor import Limits
+from skytether.robot.safety.commission import Commission, CommissionError, Plan, Step
+from skytether.robot.safety.rig import HardwareRig
+
 from ...output import fail
 
 
@@ -24,12 +31,6 @@ def commission(
     numbers to configure, and the enable signal. End the gate before: no sensor looks where the robot goes meanwhile.
     Questions are on standard error, answers are lines of standard input, the JSON record goes to standard output.
     """
-    from skytether.api.config_file import ConfigError
-    from skytether.robot.config.gate_config import load_safety
-    from skytether.robot.control.supervisor import Limits
-    from skytether.robot.safety.commission import Commission, CommissionError, Plan, Step
-    from skytether.robot.safety.rig import HardwareRig
-
     try:
         settings = load_safety(config)
     except ConfigError as error:
@@ -41,7 +42,6 @@ def commission(
     odometry = settings.odometry
     if odometry is None:  # the rig has said so
         return
-    from skytether.guard.velocity import Velocity
 
     plan = Plan(
         limits=settings.limits or Limits(),

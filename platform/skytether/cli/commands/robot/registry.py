@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import ValidationError
+
+from skytether.api.manifest import NAME
+from skytether.api.rest import RobotCreate
 
 from ... import names
 from ...connection import Json, TokenFile, Url, connected
@@ -16,12 +20,9 @@ if TYPE_CHECKING:
 
     from skytether.api.rest import GateReport, StopOrder
 
-app = typer.Typer(help="Who may ask; and what runs on a robot: its agent and its gate.", no_args_is_help=True)
-
 _LONGEST_REASON = 200
 
 
-@app.command("list")
 def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
     """List the registered robots."""
     with connected(url, token_file) as client:
@@ -63,7 +64,6 @@ def list_robots(url: Url = None, token_file: TokenFile = None, json: Json = Fals
     print_table(head, rows)
 
 
-@app.command("stop-afar")
 def stop_afar(
     name: Annotated[str | None, typer.Argument(help="Its name.", autocompletion=names.robots)] = None,
     everyone: Annotated[bool, typer.Option("--all", help="All registered robots.")] = False,
@@ -106,7 +106,6 @@ def _gate(gate: GateReport | None, heard_at: datetime | None) -> str:
     return f"stopped: {gate.stopped}" if gate.stopped else f"{gate.hand or 'nobody'} drives, ahead {gate.zone}"
 
 
-@app.command("add")
 def add_robot(
     name: str,
     service: Annotated[
@@ -121,10 +120,6 @@ def add_robot(
     json: Json = False,
 ) -> None:
     """Register a robot. Its token is printed on standard output, this once."""
-    from pydantic import ValidationError
-
-    from skytether.api.rest import RobotCreate
-
     try:
         request = RobotCreate(name=name, services=tuple(service or ("*",)), group=group)
     except ValidationError as error:
@@ -139,7 +134,6 @@ def add_robot(
     typer.echo(made.token)
 
 
-@app.command("group")
 def group_robot(
     name: Annotated[str, typer.Argument(help="Its name.", autocompletion=names.robots)],
     group: Annotated[str | None, typer.Argument(help="The group's name; nothing: out of its group.")] = None,
@@ -147,8 +141,6 @@ def group_robot(
     token_file: TokenFile = None,
 ) -> None:
     """Say with whose robots its services share what they see: with the same services of all robots of the group."""
-    from skytether.api.manifest import NAME
-
     if group is not None and not NAME.fullmatch(group):
         fail(f"'{group}' is no name: lower-case letters, digits and '-', at most 63", 2)
     with connected(url, token_file) as client:
@@ -157,7 +149,6 @@ def group_robot(
     console.print(f"robot {name} is in no group" if group is None else f"robot {name} is in group {group}")
 
 
-@app.command("delete")
 def delete_robot(
     name: Annotated[str, typer.Argument(help="Its name.", autocompletion=names.robots)],
     url: Url = None,

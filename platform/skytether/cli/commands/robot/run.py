@@ -14,18 +14,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skytether.api.config_file import ConfigError
+from skytether.bridge.interfaces import LocalPath, Wanted
+from skytether.robot.agent.agent import Agent
+from skytether.robot.agent.config import AgentConfig
+from skytether.robot.agent.diagnostics import Ros1Diagnostics
+from skytether.robot.agent.gated_hardware import GatedHardware
+from skytether.robot.config.robot_config import load_config, load_token
+from skytether.robot.control.fallback import FallbackError
+from skytether.robot.control.supervisor import Limits
+from skytether.robot.graphs.ros1 import Ros1Robot, Ros1RobotConfig
+from skytether.robot.offload.site_prober import TaskConfig
+from skytether.robot.safety.client import GateLink
+from skytether.ros.ros1.arguments import PRIVATE
+from skytether.ros.ros1.console import Console
+from skytether.ros.ros1.master import Master, MasterError
+from skytether.ros.ros1.node import Node, NodeError
+
 from ...output import console, fail
 from ...ros_words import RosWords, given
+from .check import check_robot
+from .gate_process import gate
 from .never_wait import never_wait
+from .ros2 import check_ros2, join_ros2
 
 if TYPE_CHECKING:
-    from skytether.robot.agent.config import AgentConfig
     from skytether.robot.agent.snapshot import AgentStatus
     from skytether.robot.config.robot_config import RobotConfig, Ros1Config, Ros2Config
     from skytether.robot.control.control_loop import RobotHardware
-    from skytether.robot.graphs.ros1 import Ros1RobotConfig
     from skytether.ros.ros1.arguments import RosArguments
-    from skytether.ros.ros1.node import Node
 
     from .gate_process import FoundGate, OwnGate
 
@@ -50,9 +67,6 @@ def run(
     The robot's own nodes stay as they are: what the service takes in is subscribed, what it gives out is published,
     and velocities pass the supervisor before they reach the wheels' topic.
     """
-    from skytether.api.config_file import ConfigError
-    from skytether.robot.config.robot_config import load_config, load_token
-
     if not check:
         never_wait()  # a log that nobody reads must cost no robot anything
     ros1 = given(ros)
@@ -73,8 +87,6 @@ def run(
     if settings.ros1 is None:
         fail(f"{config}: ros1: is missing", 2)
     if check:
-        from .check import check_robot
-
         # With the agent's own name the master would end the agent that runs.
         with _node(settings, settings.ros1, settings.node("check"), threading.Event()) as node:
             raise typer.Exit(0 if check_robot(settings, ros1_config(settings, settings.ros1), node, token) else 1)
@@ -84,14 +96,6 @@ def run(
 def _run(
     settings: RobotConfig, ros1: Ros1Config, path: Path, token: str, seconds: float | None, ros: RosArguments
 ) -> None:
-    from skytether.robot.agent.agent import Agent
-    from skytether.robot.agent.diagnostics import Ros1Diagnostics
-    from skytether.robot.control.fallback import FallbackError
-    from skytether.robot.graphs.ros1 import Ros1Robot
-    from skytether.ros.ros1.arguments import PRIVATE
-    from skytether.ros.ros1.console import Console
-
-    from .gate_process import gate
 
     ended = threading.Event()
     config = agent_config(settings, path.parent, token)
@@ -129,12 +133,6 @@ def _run_ros2(
     Raises:
         ConfigError: The graph cannot be joined as it is configured.
     """
-    from skytether.robot.agent.agent import Agent
-    from skytether.robot.control.fallback import FallbackError
-
-    from .gate_process import gate
-    from .ros2 import check_ros2, join_ros2
-
     folder = path.parent
     if check:
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
@@ -153,8 +151,6 @@ def _base(settings: RobotConfig, graph: RobotHardware) -> RobotHardware:
     """The wheels: behind the gate if there is one, else a topic of the graph."""
     if settings.safety is None:
         return graph
-    from skytether.robot.agent.gated_hardware import GatedHardware
-    from skytether.robot.safety.client import GateLink
 
     return GatedHardware(graph, GateLink(settings.safety.place()))
 
@@ -162,7 +158,6 @@ def _base(settings: RobotConfig, graph: RobotHardware) -> RobotHardware:
 @contextmanager
 def _node(settings: RobotConfig, ros1: Ros1Config, name: str, ended: threading.Event) -> Iterator[Node]:
     """The node; what goes wrong with it ends the command."""
-    from skytether.ros.ros1.node import Node, NodeError
 
     def end(reason: str) -> None:
         says = f"robot {settings.robot} ends: {reason or 'asked to by rosnode kill'}"
@@ -183,8 +178,6 @@ def _node(settings: RobotConfig, ros1: Ros1Config, name: str, ended: threading.E
 
 def private_parameters(ros: RosArguments, master: str, node: str) -> RosArguments:
     """With those that roslaunch has set: below the node's name, or below the one that roslaunch takes for it."""
-    from skytether.ros.ros1.master import Master, MasterError
-
     found: dict[str, Any] = {}
     for name in (f"/{ros.name.lstrip('/')}", node):
         try:
@@ -246,12 +239,6 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         folder: That its paths are relative to.
         token: The robot's, as it is now.
     """
-    from skytether.bridge.interfaces import LocalPath, Wanted
-    from skytether.robot.agent.config import AgentConfig
-    from skytether.robot.config.robot_config import load_token
-    from skytether.robot.control.supervisor import Limits
-    from skytether.robot.offload.site_prober import TaskConfig
-
     task = settings.task
     paths: Wanted = (
         "auto"
@@ -284,9 +271,6 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
 
 def ros1_config(settings: RobotConfig, ros1: Ros1Config) -> Ros1RobotConfig:
     """What the graph needs of the configuration."""
-    from skytether.robot.control.supervisor import Limits
-    from skytether.robot.graphs.ros1 import Ros1RobotConfig
-
     return Ros1RobotConfig(
         robot=settings.robot,
         service=settings.service,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import httpx
 import typer
+from rich.table import Table
+
+from skytether.robot.agent.status import ports
 
 from ...connection import Json
 from ...output import cell, fail, print_json, print_whole
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 _TIMEOUT_S = 5.0
 _NO_AGENT = "what answers on port {} of this machine is no agent; give its status_port with --port"
@@ -45,8 +46,6 @@ def status(
 
 def _of(robot: str, port: int) -> dict[str, Any] | None:
     """What the agent of a robot says."""
-    from skytether.robot.agent.status import ports
-
     for one in ports(port):
         try:
             found = _ask(one)
@@ -59,8 +58,6 @@ def _of(robot: str, port: int) -> dict[str, Any] | None:
 
 def _ask(port: int) -> dict[str, Any] | None:
     """What the agent at a port says; None: nobody answers."""
-    import httpx
-
     try:
         answer = httpx.get(f"http://127.0.0.1:{port}/status", timeout=_TIMEOUT_S, trust_env=False)
         answer.raise_for_status()
@@ -75,7 +72,6 @@ def _ask(port: int) -> dict[str, Any] | None:
 
 
 def _tables(found: dict[str, Any]) -> list[Table]:
-    from rich.table import Table
 
     link, task, instance = found["link"], found["task"], found["instance"]
     about = Table(title=cell(f"{found['robot']}: {found['service']}"), show_header=False, title_justify="left")

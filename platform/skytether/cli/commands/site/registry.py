@@ -1,22 +1,23 @@
-"""``skytether site list, show, add, delete``: where instances run. Machines that join: `site_nodes`."""
+"""``skytether site list, show, add, delete, invite``: sites as the orchestrator knows them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..connection import Json, TokenFile, Url, connected
-from ..names import SiteName
-from ..output import console, fail, or_dash, plain, print_json, print_table, show
+from ...connection import Json, TokenFile, Url, connected
+from ...names import SiteName
+from ...options import options_of
+from ...output import console, fail, or_dash, plain, print_json, print_table, show
 
 if TYPE_CHECKING:
     from skytether.api.rest import Site
 
-app = typer.Typer(help="Where instances run.", no_args_is_help=True)
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+_LONGEST_S = 86_400.0
 
 
-@app.command("list")
 def list_sites(url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
     """List the sites."""
     with connected(url, token_file) as client:
@@ -37,7 +38,6 @@ def _why(site: Site) -> str:
     return "; ".join(filter(None, (state, site.reason, *unfit)))
 
 
-@app.command("show")
 def show_site(name: SiteName, url: Url = None, token_file: TokenFile = None, json: Json = False) -> None:
     """Show one site."""
     with connected(url, token_file) as client:
@@ -45,7 +45,6 @@ def show_site(name: SiteName, url: Url = None, token_file: TokenFile = None, jso
     show(found, json)
 
 
-@app.command("add")
 def add_site(
     name: str,
     runtime: Annotated[str, typer.Option(help="What starts instances there: process, docker.")],
@@ -85,28 +84,6 @@ def add_site(
     show(made, json)
 
 
-def options_of(entries: list[str] | None) -> dict[str, Any]:
-    """What ``--option KEY=VALUE`` says."""
-    options = {}
-    for entry in entries or ():
-        key, is_, value = entry.partition("=")
-        if not is_:
-            fail(f"--option {entry}: write KEY=VALUE", 2)
-        options[key] = value_of(value)
-    return options
-
-
-def value_of(text: str) -> Any:
-    """A value of an option, as YAML reads it; what is none is text."""
-    import yaml
-
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
-
-
-@app.command("delete")
 def delete_site(
     name: SiteName,
     drain: Annotated[
@@ -119,3 +96,64 @@ def delete_site(
     with connected(url, token_file) as client:
         if not client.delete_site(name, drain=drain):
             console.print(f"site {name} takes no more instances, and is deleted when those that are there have ended")
+
+
+def invite_node(
+    name: Annotated[str, typer.Argument(help="Of the site that the machine will be.")],
+    tier: Annotated[str, typer.Option(help="edge or cloud.")] = "edge",
+    valid: Annotated[
+        str, typer.Option(help="How long the token is good for, such as 30m or 1h; a day at most.")
+    ] = "1h",
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="KEY=VALUE of the Docker runtime's options; may be given again. It goes before the machine's."
+        ),
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")] = 1.0,
+    cost: Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")] = 0.0,
+    image: Annotated[
+        list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
+    ] = None,
+    url: Url = None,
+    token_file: TokenFile = None,
+    json: Json = False,
+) -> None:
+    """Make a token with which one machine may join, once. It is printed on standard output, this once.
+
+    With it goes the fingerprint of the key by which the machine knows the orchestrator. A token for the same name that
+    was not used is worth nothing any more.
+    """
+    from pydantic import ValidationError
+
+    from skytether.api.rest import Invite
+
+    asked = {"name": name, "tier": tier, "options": options_of(option), "speed": speed, "cost": cost}
+    try:
+        request = Invite.model_validate({**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
+    except ValidationError as error:
+        first = error.errors()[0]
+        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
+    with connected(url, token_file) as client:
+        made = client.invite(request)
+    if json:
+        print_json(plain(made))
+        return
+    where = ",".join(made.urls) or f"https://ORCHESTRATOR:{made.port}"
+    console.print(
+        f"on the machine that is to be site {made.name}, before {made.expires_at:%Y-%m-%d %H:%M:%S} UTC:", markup=False
+    )
+    console.print(f"  skytether site join {where} --token-file -", markup=False, soft_wrap=True)
+    console.print("with this token, which cannot be shown again:", markup=False)
+    typer.echo(made.token)
+
+
+def _seconds(text: str) -> float:
+    unit = _UNITS.get(text[-1:].lower())
+    try:
+        seconds = float(text[:-1] if unit else text) * (unit or 1.0)
+    except ValueError:
+        seconds = 0.0
+    if not 1 <= seconds <= _LONGEST_S:
+        fail(f"--valid {text}: write 90s, 30m or 1h; 24h at most", 2)
+    return seconds

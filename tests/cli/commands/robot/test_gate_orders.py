@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skytether.cli.app import app
-from skytether.cli.commands.robot import gate
+from skytether.cli.commands.robot import gate_orders
 
 STATUS = {
     "stopped": "",
@@ -33,7 +33,7 @@ STATUS["guard"]["notes"] = ["the event record /run/x is on a tmpfs"]
     ],
 )
 def test_what_is_not_seen_is_called_unknown(monkeypatch, changes, ahead):
-    monkeypatch.setattr("skytether.robot.safety.client.ask", lambda *_: STATUS | changes)
+    monkeypatch.setattr("skytether.cli.commands.robot.gate_orders.ask", lambda *_: STATUS | changes)
     assert ahead in CliRunner().invoke(app, ["robot", "gate-status"]).stdout.splitlines()
     shown = CliRunner().invoke(app, ["robot", "gate-status", "--json"]).stdout
     assert json.loads(shown)["zone"] == (STATUS | changes)["zone"]
@@ -54,14 +54,14 @@ def test_what_is_not_seen_is_called_unknown(monkeypatch, changes, ahead):
     ],
 )
 def test_the_guards_part_is_shown(monkeypatch, changes, says):
-    monkeypatch.setattr("skytether.robot.safety.client.ask", lambda *_: STATUS | changes)
+    monkeypatch.setattr("skytether.cli.commands.robot.gate_orders.ask", lambda *_: STATUS | changes)
     shown = CliRunner().invoke(app, ["robot", "gate-status"])
     assert shown.exit_code == 0
     assert says in shown.stdout.splitlines()
 
 
 def test_a_terminal_gets_no_codes_of_who_gave_the_reason_of_a_stop(monkeypatch, capsys):
-    monkeypatch.setattr(gate, "_ask", lambda *_: {**STATUS, "stopped": "from afar: \x1b[2J"})
+    monkeypatch.setattr(gate_orders, "ask", lambda *_: {**STATUS, "stopped": "from afar: \x1b[2J"})
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    gate.gate_status()
+    gate_orders.gate_status()
     assert "stopped   from afar: \\x1b[2J\n" in capsys.readouterr().out

@@ -1,97 +1,33 @@
-"""``skytether site invite, join, run, leave, drain, resume, remove``: machines that join by themselves, and go."""
+"""``skytether site join, run, leave``: this machine as a site."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 import re
 import sys
-import time
-from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..connection import Json, TokenFile, Url, connected
-from ..names import SiteName
-from ..output import console, fail, fail_all, plain, print_json
-from .site import app, options_of
+from skytether.api.printable import printable
+from skytether.bridge.echo import EchoServer
+from skytether.node.join import ChecksError, JoinOptions, join, leave
+from skytether.node.run import NodeProgram
+from skytether.node.store import NodeError, NodeStore
+
+from ...connection import Json
+from ...output import console, fail, fail_all, plain, print_json
+from .drain import Patience
 
 if TYPE_CHECKING:
-    from skytether.api.client import Client
-    from skytether.api.rest import Site
     from skytether.node.checks import Finding
     from skytether.node.join import Joined
-    from skytether.node.store import NodeStore
 
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _FOLDER = Path("/etc/skytether/node")
-_LONGEST_S = 86_400.0
-_POLL_S = 0.5
 Folder = Annotated[Path, typer.Option(help="Where the node's key and certificate are.")]
-Patience = Annotated[
-    float, typer.Option("--timeout-s", min=0, help="How long to wait for what runs there to be moved, or to end.")
-]
-
-
-def invite_node(
-    name: Annotated[str, typer.Argument(help="Of the site that the machine will be.")],
-    tier: Annotated[str, typer.Option(help="edge or cloud.")] = "edge",
-    valid: Annotated[
-        str, typer.Option(help="How long the token is good for, such as 30m or 1h; a day at most.")
-    ] = "1h",
-    option: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="KEY=VALUE of the Docker runtime's options; may be given again. It goes before the machine's."
-        ),
-    ] = None,
-    speed: Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")] = 1.0,
-    cost: Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")] = 0.0,
-    image: Annotated[
-        list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
-    ] = None,
-    url: Url = None,
-    token_file: TokenFile = None,
-    json: Json = False,
-) -> None:
-    """Make a token with which one machine may join, once. It is printed on standard output, this once.
-
-    With it goes the fingerprint of the key by which the machine knows the orchestrator. A token for the same name that
-    was not used is worth nothing any more.
-    """
-    from pydantic import ValidationError
-
-    from skytether.api.rest import Invite
-
-    asked = {"name": name, "tier": tier, "options": options_of(option), "speed": speed, "cost": cost}
-    try:
-        request = Invite.model_validate({**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
-    with connected(url, token_file) as client:
-        made = client.invite(request)
-    if json:
-        print_json(plain(made))
-        return
-    where = ",".join(made.urls) or f"https://ORCHESTRATOR:{made.port}"
-    console.print(
-        f"on the machine that is to be site {made.name}, before {made.expires_at:%Y-%m-%d %H:%M:%S} UTC:", markup=False
-    )
-    console.print(f"  skytether site join {where} --token-file -", markup=False, soft_wrap=True)
-    console.print("with this token, which cannot be shown again:", markup=False)
-    typer.echo(made.token)
-
-
-def _seconds(text: str) -> float:
-    unit = _UNITS.get(text[-1:].lower())
-    try:
-        seconds = float(text[:-1] if unit else text) * (unit or 1.0)
-    except ValueError:
-        seconds = 0.0
-    if not 1 <= seconds <= _LONGEST_S:
-        fail(f"--valid {text}: write 90s, 30m or 1h; 24h at most", 2)
-    return seconds
 
 
 def join_node(
@@ -154,9 +90,6 @@ def join_node(
     Looks first at engine, memory, disk, clock, ports, address and orchestrator, and changes nothing if one of them is
     not good. Its key never leaves it. What was begun is taken back if anything fails.
     """
-    from skytether.node.join import ChecksError, JoinOptions, join
-    from skytether.node.store import NodeError
-
     options = JoinOptions(
         urls=tuple(part.strip().rstrip("/") for part in orchestrator.split(",") if part.strip()),
         token=_token(token_file, token),
@@ -257,13 +190,6 @@ def run_node(folder: Folder = _FOLDER) -> None:
     Keeps the orchestrators' ways to its engine, and renews its certificate. The unit that `skytether site join` writes
     runs this. What runs in containers goes on when this ends.
     """
-    import asyncio
-    import contextlib
-
-    from skytether.bridge.echo import EchoServer
-    from skytether.node.run import NodeProgram
-    from skytether.node.store import NodeError, NodeStore
-
     _log_everything()
     store = NodeStore(folder.expanduser().absolute())
     try:
@@ -281,9 +207,6 @@ def run_node(folder: Folder = _FOLDER) -> None:
 
 
 def _log_everything() -> None:
-    import logging
-
-    from skytether.api.printable import printable
 
     class OneLine(logging.Formatter):
         def format(self, record: logging.LogRecord) -> str:
@@ -303,9 +226,6 @@ def leave_node(
     folder: Folder = _FOLDER,
 ) -> None:
     """Undo the join of this machine: what runs here is moved elsewhere first, then nothing of it is left."""
-    from skytether.node.join import leave
-    from skytether.node.store import NodeError
-
     store = _store(folder)
     if not force and not store.exists():
         fail(f"this machine has not joined, as far as {store.folder} says")
@@ -322,135 +242,5 @@ def leave_node(
 
 
 def _store(folder: Path) -> NodeStore:
-    from skytether.node.store import NodeStore
 
     return NodeStore(folder.expanduser().absolute())
-
-
-def drain_site(
-    name: SiteName,
-    wait: Annotated[bool, typer.Option(help="Wait until nothing runs there any more.")] = True,
-    timeout_s: Patience = 600.0,
-    url: Url = None,
-    token_file: TokenFile = None,
-    json: Json = False,
-) -> None:
-    """Have a site take no more instances, and move those that are there: before it is updated, say.
-
-    Each robot is handed over before the old instance ends. `skytether site resume` has the site take instances again.
-    """
-    with connected(url, token_file) as client:
-        site = client.drain_site(name)
-        deadline, told = time.monotonic() + timeout_s, ""
-        while wait and site.instances:
-            told = _tell(_left(site), told)
-            if time.monotonic() >= deadline:
-                fail(f"{_left(site)}; `skytether instance list` says why")
-            time.sleep(_POLL_S)
-            site = _look(client, name) or site
-    if json:
-        print_json(plain(site))
-    else:
-        console.print(f"site {name} takes no more instances; {site.instances} are there", markup=False)
-
-
-def resume_site(
-    name: SiteName,
-    wait: Annotated[bool, typer.Option(help="Wait until instances can be started there.")] = True,
-    timeout_s: Annotated[float, typer.Option("--timeout-s", min=0, help="How long to wait for that.")] = 300.0,
-    url: Url = None,
-    token_file: TokenFile = None,
-    json: Json = False,
-) -> None:
-    """Have a site that was drained take instances again, and wait until it can: before the next one is drained.
-
-    One that does not come back is told of, with status 1; it takes instances as soon as it does.
-    """
-    with connected(url, token_file) as client:
-        site = client.resume_site(name)
-        deadline, told = time.monotonic() + timeout_s, ""
-        while wait and site.state != "ready":
-            told = _tell(text := f"site {name} is {site.state}: {site.reason}", told)
-            if time.monotonic() >= deadline:
-                fail(text)
-            time.sleep(_POLL_S)
-            site = _look(client, name) or site
-    if json:
-        print_json(plain(site))
-    else:
-        console.print(f"site {name} takes instances again", markup=False)
-
-
-def remove_site(
-    name: SiteName,
-    force: Annotated[
-        bool,
-        typer.Option("--force", help="At once, with all that is there: for a machine that is gone for good."),
-    ] = False,
-    wait: Annotated[bool, typer.Option(help="Wait until it is gone.")] = True,
-    timeout_s: Patience = 600.0,
-    url: Url = None,
-    token_file: TokenFile = None,
-) -> None:
-    """Drain a site, and forget it with its last instance. The certificate of a machine that joined is no good then."""
-    from skytether.api.client import ApiError
-
-    with connected(url, token_file) as client:
-        if force:
-            client.delete_site(name, force=True)
-        else:
-            client.drain_site(name)
-            gone = client.delete_site(name, drain=True)
-            deadline, told = time.monotonic() + timeout_s, ""
-            while wait and not gone:
-                try:
-                    left = _left(site) if (site := _look(client, name)) else "no orchestrator answers"
-                except ApiError as error:
-                    if error.problem.status != HTTPStatus.NOT_FOUND:
-                        raise
-                    break
-                told = _tell(left, told)
-                if time.monotonic() >= deadline:
-                    fail(f"{left}: site {name} goes with its last instance; with --force it goes now")
-                time.sleep(_POLL_S)
-            if not wait and not gone:
-                console.print(f"site {name} goes when what runs there was moved, or has ended", markup=False)
-                return
-    console.print(f"site {name} is gone", markup=False)
-
-
-def _left(site: Site) -> str:
-    return f"{site.instances} instances are at site {site.name} still"
-
-
-def _look(client: Client, name: str) -> Site | None:
-    """A site as it is now; None: no orchestrator answers, as while it is updated.
-
-    Raises:
-        ApiError: There is no such site, or we may not see it.
-    """
-    from skytether.api.client import ApiError, Unreachable
-
-    try:
-        return client.get_site(name)
-    except Unreachable:
-        return None
-    except ApiError as error:
-        if error.problem.status != HTTPStatus.SERVICE_UNAVAILABLE:
-            raise
-        return None
-
-
-def _tell(text: str, told: str) -> str:
-    if text != told:
-        console.print(text, markup=False)
-    return text
-
-
-app.command("invite")(invite_node)
-app.command("join")(join_node)
-app.command("run")(run_node)
-app.command("leave")(leave_node)
-app.command("drain")(drain_site)
-app.command("resume")(resume_site)
-app.command("remove")(remove_site)

@@ -1,0 +1,1 @@
+"""``skytether site``: sites as the orchestrator knows them, and this machine as one."""
