@@ -6,7 +6,7 @@ from math import nan
 import pytest
 
 from skytether.api.client import ApiError
-from skytether.api.rest import Instance, InstanceCreate, Problem, Renew, Session, State
+from skytether.api.rest import Instance, InstanceCreate, Placement, Problem, Renew, Session, State
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
@@ -121,6 +121,7 @@ class ObedientOrchestrator:
         self.reason = ""
         self.session: Session | None = None
         self.successor: str | None = None
+        self.placement: Placement | None = None
         self.key_taken = False
         self._number = 0
 
@@ -158,6 +159,7 @@ class ObedientOrchestrator:
             reason=self.reason,
             session=self.session,
             successor=self.successor,
+            placement=self.placement,
             created_at=epoch,
             updated_at=epoch,
             lease_expires_at=epoch,

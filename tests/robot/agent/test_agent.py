@@ -57,7 +57,7 @@ class Rig:
 
     def ask(self):
         """One exchange, and what the control loop and the watch do of it."""
-        self.agent._lease_client.step()
+        self.agent.ask()
         self.agent._control_loop._change_over()
         self.agent._settle()
 
@@ -203,7 +203,7 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(base, orch
     drive()
     orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
     rig.ask()
-    rig.agent._stayed(kept, "the other one never commanded")
+    rig.agent._stay(kept, "the other one never commanded")
     assert [endpoint.running for endpoint in rig.bridges] == [False, False]
     rig.tick()
     assert rig.agent.source is Source.FALLBACK

@@ -19,15 +19,15 @@ def make(base, orchestrator, **changes):
 def test_the_preferred_site_is_asked_for(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig())
     agent._site_prober._decision = replace(agent._site_prober.decision, site="edge")
-    request = agent._wanted()
+    request = agent._wanted().request
     assert request.measurements["edge"].preferred
-    agent._lease_client.step()
+    agent.ask()
     assert agent.status().decision.site == "edge"
 
 
 def test_mode_local_asks_for_nothing(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig(Policy(mode=Mode.LOCAL)))
-    assert agent._lease_client.step() > 0
+    assert agent.ask() > 0
     assert orchestrator.calls == []
     agent.tick(50.01)
     assert agent.status().driver.source == "fallback"
@@ -35,20 +35,22 @@ def test_mode_local_asks_for_nothing(base, orchestrator):
 
 def test_a_decision_for_local_lets_the_instance_and_its_session_go(base, orchestrator):
     agent = make(base, orchestrator, task=TaskConfig())
-    agent._lease_client.step()
+    agent.ask()
     agent._site_prober._decision = replace(agent._site_prober.decision, offload=False)
-    agent._lease_client.step()
+    agent.ask()
     assert orchestrator.calls[-1] == ("delete", "i1")
     assert agent.status().instance is None
 
 
 def test_an_instance_elsewhere_is_wanted_when_it_was_so_decided(base, orchestrator):
+    orchestrator.placement = Placement(site="cloud")
     agent = make(base, orchestrator, task=TaskConfig())
-    agent._lease_client.step()
-    instance = agent._instance.model_copy(update={"placement": Placement(site="cloud")})
-    assert not agent._elsewhere(instance)
+    agent.ask()
+    agent.ask()
+    assert [name for name, _ in orchestrator.calls] == ["create", "renew"]
     agent._site_prober._decision = replace(agent._site_prober.decision, site="edge")
-    assert agent._elsewhere(instance)
+    agent.ask()
+    assert [name for name, _ in orchestrator.calls] == ["create", "renew", "renew", "create"]
 
 
 def test_a_refused_token_is_read_again_from_where_it_came(base, monkeypatch):
@@ -61,9 +63,9 @@ def test_a_refused_token_is_read_again_from_where_it_came(base, monkeypatch):
         raise ApiError(Problem(title="no", status=401, detail="the token has expired"))
 
     monkeypatch.setattr(agent._own_client._http, "send", refuse)
-    assert agent._lease_client.step() == 10.0, "the file holds the same"
-    assert agent._lease_client.step() < 1.0
+    assert agent.ask() == 10.0, "the file holds the same"
+    assert agent.ask() < 1.0
     monkeypatch.setattr(agent, "_config", replace(CONFIG, fresh_token=lambda: "new"))
-    assert agent._lease_client.step() == 10.0
+    assert agent.ask() == 10.0
     assert sent == ["Bearer old", "Bearer old", "Bearer new"]
     agent.close()

@@ -33,7 +33,7 @@ def agent(base, orchestrator):
 @pytest.fixture
 def busy(agent):
     """After a while: an instance, a session, a decision."""
-    agent._lease_client.step()
+    agent.ask()
     agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
     topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
     agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))

@@ -15,7 +15,7 @@ from skytether.bridge.spec import SessionSpec
 from skytether.emulator.link_model import LinkConditions
 from skytether.emulator.lossy_link import LossyLink
 from skytether.robot.agent.snapshot import report
-from skytether.robot.offload.lease_client import LeaseClient
+from skytether.robot.offload.lease_client import InstanceReported, LeaseClient, Wanted
 from skytether.robot.session.counter_totals import COUNTERS, CounterTotals
 from skytether.wire import Direction, Role, Session
 
@@ -73,15 +73,11 @@ class SimulatedRobot:
 
     def _begin(self) -> None:
         self._links: dict[str, LossyLink] = {}
+        self._instances: dict[str, str] = {}
+        """Whose session each is."""
         self._instance: Instance | None = None
         self._totals = CounterTotals(uuid.uuid4().hex)
-        self._lease_client = LeaseClient(
-            self._client,
-            self._request,
-            on_instance=self._follow,
-            taken_over=self._taken_over,
-            report=self._report,
-        )
+        self._lease_client = LeaseClient(self._client, report=self._report)
 
     @property
     def instance(self) -> Instance:
@@ -116,8 +112,11 @@ class SimulatedRobot:
         self._now += seconds
 
     def exchange(self) -> None:
-        """One exchange with the orchestrator."""
-        self._lease_client.step()
+        """One exchange with the orchestrator, and what follows from it."""
+        self._lease_client.step(Wanted(self._request, serving=self._serving()))
+        while (event := self._lease_client.next_event()) is not None:
+            if isinstance(event, InstanceReported):
+                self._follow(event.instance)
 
     def begin_anew(self) -> None:
         """Its program is killed just after a report, and started."""
@@ -173,25 +172,28 @@ class SimulatedRobot:
 
     def _follow(self, instance: Instance) -> None:
         self._instance = instance
-        if instance.state is not State.RUNNING or _session(instance).id in self._links:
+        session = instance.session
+        if instance.state is not State.RUNNING or session is None or session.id in self._links:
             return
         seed = zlib.crc32(f"{self.name} {len(self._links)} {self._now}".encode())
         bad = LinkConditions(delay=0.05, jitter=0.01, loss=0.03, seed=seed)
         ends = (self._end(Role.ROBOT, instance), self._end(Role.SERVICE, instance))
-        self._links[_session(instance).id] = LossyLink(*ends, up=bad, down=bad, seed=seed, start=self._now)
+        self._links[session.id] = LossyLink(*ends, up=bad, down=bad, seed=seed, start=self._now)
+        self._instances[session.id] = instance.id
 
-    def _taken_over(self, instance: Instance) -> bool:
-        session = _session(instance).id
-        link = self._links.get(session)
-        if link is None or not link.sessions[Role.ROBOT].stats(self._now).connected:
-            return False
-        for other in [known for known in self._links if known != session]:
+    def _serving(self) -> str | None:
+        """Id of the instance of the newest session, once that is up; those before it are closed then."""
+        newest = next(reversed(self._links), None)
+        if newest is None or not self._links[newest].sessions[Role.ROBOT].stats(self._now).connected:
+            return None
+        for other in [known for known in self._links if known != newest]:
             self._close(other)
-        return True
+        return self._instances[newest]
 
     def _close(self, session: str) -> None:
         """Hear what was under way, and let the session go."""
         link = self._links.pop(session)
+        del self._instances[session]
         self._run(link, self._now + _DRAIN_S, traffic=False)
         self._totals.take(link, link.sessions[Role.ROBOT].stats(link.now), last=True)
 

@@ -31,7 +31,7 @@ from ..control.service_manager import ServiceManager, terms
 from ..graphs.graph_base import Graph
 from ..graphs.wheels_watch import NOBODY, WatchesWheels
 from ..log_throttle import LogThrottle
-from ..offload.lease_client import LeaseClient, Orchestrator
+from ..offload.lease_client import InstanceReported, LeaseClient, MoveFailed, Orchestrator, Wanted
 from ..offload.resolver import Resolver
 from ..offload.shared_topics import Serving, SharedTopics, SharedTopicsExchange
 from ..offload.site_prober import SiteProber
@@ -121,16 +121,9 @@ class Agent:
         )
         self._lease_client = LeaseClient(
             speaks,
-            self._request({}),
-            wanted=self._wanted,
-            elsewhere=self._elsewhere,
-            taken_over=self._taken_over,
-            on_stayed=self._stayed,
-            on_refused=self._another_token,
-            clock=clock,
-            on_instance=self._follow,
             report=self.report,
-            healthy=lambda: self._control_loop.source is Source.CLOUD,
+            another_token=self._another_token,
+            clock=clock,
             renew_s=config.renew_s,
             random=random,
         )
@@ -177,7 +170,7 @@ class Agent:
         self._serve()
         targets: dict[str, Callable[[], object]] = {
             "control": self._control,
-            "ask": self._ask,
+            "ask": partial(self._lease_client.run, self._stop, self.ask),
             "watch": self._watch,
             "share": partial(self._sharing.run, self._stop),
             **({"decide": partial(self._site_prober.run, self._stop)} if self._site_prober else {}),
@@ -298,8 +291,24 @@ class Agent:
         finally:
             self._control_loop.halt()
 
-    def _ask(self) -> None:
-        self._lease_client.run(self._stop)
+    def ask(self) -> float:
+        """One exchange with the orchestrator and what follows from it; called by its thread, or by a test.
+
+        Returns:
+            Seconds until the next is due.
+        """
+        wanted = self._wanted()
+        if wanted.request is None:
+            self._drop_sessions()
+            self._instance = None
+        delay = self._lease_client.step(wanted)
+        while (event := self._lease_client.next_event()) is not None:
+            match event:
+                case InstanceReported(instance):
+                    self._follow(instance)
+                case MoveFailed(kept, reason):
+                    self._stay(kept, reason)
+        return delay
 
     def _request(self, measured: Mapping[str, rest.Measurement]) -> rest.InstanceCreate:
         config = self._config
@@ -311,15 +320,17 @@ class Agent:
             lease_s=config.lease_s,
         )
 
-    def _wanted(self) -> rest.InstanceCreate | None:
-        """What is asked for now; None: nothing, the robot's own controller drives."""
+    def _wanted(self) -> Wanted:
+        """What is asked for now; no request: nothing, the robot's own controller drives."""
+        session = self._control_loop.session
+        opened = self._open_sessions.get(session.id) if session is not None else None
+        serving = opened.instance.id if opened is not None else None
+        healthy = self._control_loop.source is Source.CLOUD
         if self._site_prober is None:
-            return self._request({})
-        if self._site_prober.decision.offload:
-            return self._request(self._site_prober.measurements())
-        self._drop_sessions()
-        self._instance = None
-        return None
+            return Wanted(self._request({}), None, serving, healthy)
+        decision = self._site_prober.decision
+        request = self._request(self._site_prober.measurements()) if decision.offload else None
+        return Wanted(request, decision.site, serving, healthy)
 
     def _drop_sessions(self) -> None:
         self._control_loop.let_go()
@@ -332,11 +343,7 @@ class Agent:
         if session.bridge is not None:
             self._totals.take(session, session.bridge.stats(), last=True)
 
-    def _taken_over(self, instance: rest.Instance) -> bool:
-        session = self._control_loop.session
-        return session is not None and instance.session is not None and session.id == instance.session.id
-
-    def _stayed(self, instance: rest.Instance, reason: str) -> None:
+    def _stay(self, instance: rest.Instance, reason: str) -> None:
         """What was to take over does not."""
         serving = self._control_loop.session
         if self._graph is not None and len(self._open_sessions) > 1:
@@ -351,10 +358,6 @@ class Agent:
             self._end(self._open_sessions.pop(session_id).session)
         if self._site_prober is not None:
             self._site_prober.stayed(instance, reason)
-
-    def _elsewhere(self, instance: rest.Instance) -> bool:
-        wanted = self._site_prober.decision.site if self._site_prober else None
-        return wanted is not None and instance.placement is not None and instance.placement.site != wanted
 
     def _another_token(self) -> bool:
         """Look for a newer token where this one came from; True if there is one."""

@@ -12,7 +12,9 @@ import math
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from random import Random
 from typing import Protocol
 
@@ -74,22 +76,58 @@ class _KeyTakenError(Exception):
         super().__init__(text)
 
 
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the robot wants at the moment of one exchange.
+
+    Attributes:
+        request: As it would be made now; None while the service is not wanted: an instance that is held is let go.
+        site: Where the instance should run; None: where it is. One that runs at another site is kept until one there
+            serves the robot.
+        serving: Id of the instance that serves the robot now; the one before it can be let go.
+        healthy: Whether the link is good; while it is not, the address is looked at more often.
+    """
+
+    request: InstanceCreate | None
+    site: str | None = None
+    serving: str | None = None
+    healthy: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class InstanceReported:
+    """An answer about an instance that is coming up or running.
+
+    Attributes:
+        instance: As the orchestrator told of it, with its session's key.
+    """
+
+    instance: Instance
+
+
+@dataclass(frozen=True, slots=True)
+class MoveFailed:
+    """There is no instance elsewhere.
+
+    Attributes:
+        kept: The instance that is kept instead.
+        reason: Why, in one sentence.
+    """
+
+    kept: Instance
+    reason: str
+
+
+LeaseEvent = InstanceReported | MoveFailed
+
+
 class LeaseClient:
     """Wants one instance of a service to run, for as long as it is asked to.
 
     Args:
         client: The orchestrator.
-        request: What is wanted.
-        wanted: Looked at before each request: the request as it would be now, or None while the service is not wanted;
-            an instance that is held is then let go. Without it: ``request``, always.
-        elsewhere: Whether an instance at another site is wanted instead of this one. It is asked for, and this one let
-            go once that runs.
-        taken_over: Whether an instance that runs serves the robot now, so that the one before can be let go.
-        on_stayed: Told the instance that is kept, and why there is none elsewhere.
-        on_refused: Called when the token was refused; True if there is another one to try.
-        on_instance: Told every answer about an instance that is coming up or running.
         report: What to say with each renewal.
-        healthy: Whether the link is good; while it is not, the address is looked at more often.
+        another_token: Looks for a newer token when one was refused; True if there is another one to try.
         renew_s: Time between renewals [s].
         clock: Monotonic seconds.
         random: For the jitter of the back-off.
@@ -98,33 +136,20 @@ class LeaseClient:
     def __init__(
         self,
         client: Orchestrator,
-        request: InstanceCreate,
         *,
-        on_instance: Callable[[Instance], None],
-        wanted: Callable[[], InstanceCreate | None] | None = None,
-        elsewhere: Callable[[Instance], bool] = lambda _: False,
-        taken_over: Callable[[Instance], bool] = lambda _: True,
-        on_stayed: Callable[[Instance, str], None] = lambda *_: None,
-        on_refused: Callable[[], bool] = lambda: False,
-        clock: Callable[[], float] = time.monotonic,
         report: Callable[[], Report | None] = lambda: None,
-        healthy: Callable[[], bool] = lambda: True,
+        another_token: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic,
         renew_s: float = 2.0,
         random: Random | None = None,
     ) -> None:
         self._client = client
-        self._service = request.service
-        self._wanted = wanted or (lambda: request)
-        self._elsewhere = elsewhere
-        self._taken_over = taken_over
-        self._on_stayed = on_stayed
-        self._on_refused = on_refused
+        self._report = report
+        self._another_token = another_token
         self._clock = clock
+        self._events: deque[LeaseEvent] = deque()
         self._next: tuple[Instance, float] | None = None
         """An instance elsewhere that is coming up, and when it was asked for."""
-        self._on_instance = on_instance
-        self._report = report
-        self._healthy = healthy
         self._renew_s = renew_s
         random = random or Random()
         self._backoff = Backoff(0.2, 5.0, random)
@@ -142,17 +167,25 @@ class LeaseClient:
         """What stands in the way now, in one sentence; empty while all is well."""
         return self._trouble
 
-    def step(self) -> float:
-        """One exchange with the orchestrator.
+    def next_event(self) -> LeaseEvent | None:
+        """The oldest event not yet taken."""
+        return self._events.popleft() if self._events else None
+
+    def step(self, wanted: Wanted) -> float:
+        """One exchange with the orchestrator; `next_event` has what came of it.
+
+        Args:
+            wanted: What the robot wants now, the events before considered.
 
         Returns:
             Seconds until the next is due.
         """
-        self._change()
-        request = self._wanted()
+        self._take_over(wanted.serving)
+        request = wanted.request
         if request is None:
             self.release()
             return self._say("", _IDLE_S)
+        held = self._instance
         try:
             instance = self._with_key(self._exchange(request))
         except _KeyTakenError as error:
@@ -161,37 +194,37 @@ class LeaseClient:
         except Unreachable as error:
             return self._say(str(error), self._backoff.next())
         except ApiError as error:
-            if error.problem.status == 404 and self._instance is not None:
-                return self._lost(f"instance {self._instance.id} is gone; asking for {self._service} again")
-            if error.problem.status in (401, 403):
-                fresh = error.problem.status == 401 and self._on_refused()
-                return self._say(str(error), self._backoff.next() if fresh else _REFUSED_S)
-            return self._say(str(error), self._backoff.next())
+            return self._refused(error, request.service)
         if instance.state.final or instance.state is State.STOPPING:
             reason = f": {instance.reason}" if instance.reason else ""
             return self._lost(f"instance {instance.id} is {instance.state}{reason}")
         self._instance = instance
-        self._on_instance(instance)
+        self._events.append(InstanceReported(instance))
         running = instance.state is State.RUNNING
         if running:
             self._backoff.reset()
             self._trouble = ""
-        if self._next is not None or instance.successor or (running and self._elsewhere(instance)):
+        if self._next is not None or instance.successor or (running and _elsewhere(held, instance, wanted.site)):
             return self._move(instance, request)
         if not running:
             return _poll(_POLL_S, self._clock() - self._asked_at)
-        if not self._healthy():
+        if not wanted.healthy:
             return self._looks.next()
         self._looks.reset()
         return self._renew_s
 
-    def run(self, stop: threading.Event) -> None:
-        """Exchange until told to stop; trouble is logged, each once."""
+    def run(self, stop: threading.Event, turn: Callable[[], float]) -> None:
+        """Take turns until told to stop; trouble is logged, each once.
+
+        Args:
+            stop: Ends it.
+            turn: One `step` and what follows from its events; returns the seconds until the next is due.
+        """
         delay = 0.0
         told = ""
         while not stop.wait(delay):
             try:
-                delay = self.step()
+                delay = turn()
             except Exception as error:  # a robot must not stop asking because of one strange answer
                 _log.debug("asking failed", exc_info=error)
                 delay = self._say(f"asking failed unexpectedly: {error!r}", self._backoff.next())
@@ -245,13 +278,12 @@ class LeaseClient:
         if found.state.final or found.state is State.STOPPING or self._clock() - began > _MOVE_S:
             return self._stay(held, found.reason or f"it is {found.state}, and does not serve")
         if found.state is State.RUNNING:
-            self._on_instance(found)
-            self._change()
+            self._events.append(InstanceReported(found))
         return _poll(_MOVING_S, self._clock() - began)
 
-    def _change(self) -> None:
+    def _take_over(self, serving: str | None) -> None:
         """Let the one before go, once another one serves."""
-        if self._next is not None and self._next[0].state is State.RUNNING and self._taken_over(self._next[0]):
+        if self._next is not None and self._next[0].state is State.RUNNING and self._next[0].id == serving:
             held, self._instance = self._instance, self._next[0]
             self._next = None
             self._let_go(held)
@@ -261,7 +293,7 @@ class LeaseClient:
             self._let_go(self._next[0])
             self._next = None
         _log.warning("instance %s is kept, there is none elsewhere: %s", held.id, reason)
-        self._on_stayed(held, reason)
+        self._events.append(MoveFailed(held, reason))
         return self._renew_s
 
     def _exchange(self, request: InstanceCreate) -> Instance:
@@ -299,6 +331,15 @@ class LeaseClient:
             self._keys = {one: known for one, known in self._keys.items() if one in held} | {instance.id: key}
         return instance.model_copy(update={"session": session.model_copy(update={"key": key})})
 
+    def _refused(self, error: ApiError, service: str) -> float:
+        """The orchestrator answered, but not with an instance."""
+        status = error.problem.status
+        if status == 404 and self._instance is not None:
+            return self._lost(f"instance {self._instance.id} is gone; asking for {service} again")
+        if status == 403 or (status == 401 and not self._another_token()):
+            return self._say(str(error), _REFUSED_S)
+        return self._say(str(error), self._backoff.next())
+
     def _lost(self, sentence: str) -> float:
         """The instance has ended; one that is coming is followed, otherwise another is asked for."""
         self._instance, self._next = (self._next[0] if self._next else None), None
@@ -308,6 +349,13 @@ class LeaseClient:
     def _say(self, sentence: str, delay: float) -> float:
         self._trouble = sentence[:_LONGEST]
         return delay
+
+
+def _elsewhere(before: Instance | None, now: Instance, wanted: str | None) -> bool:
+    """Whether an instance runs where it is not wanted; where it was moved just now, the robot has not seen that yet."""
+    if wanted is None or before is None or before.placement is None or now.placement is None:
+        return False
+    return before.placement.site == now.placement.site != wanted
 
 
 def _poll(first_s: float, since_s: float) -> float:

@@ -30,7 +30,7 @@ from skytether.wire.topic import Direction, Role, Topic
 
 from ..agent.config import Address
 from ..agent.snapshot import report
-from ..offload.lease_client import LeaseClient, Orchestrator
+from ..offload.lease_client import InstanceReported, LeaseClient, Orchestrator, Wanted
 from ..session.counter_totals import CounterTotals
 from ..session.topic_table import robot_table
 from .bag import Bag
@@ -208,7 +208,9 @@ class _Replay:
         self._refused_messages: Counter[str] = Counter()
         self._stop = threading.Event()
         self._keeper: threading.Thread | None = None
-        self._lease_client = LeaseClient(client, _request(config), on_instance=self._follow, report=self._report)
+        self._lease_client = LeaseClient(client, report=self._report)
+        self._newest: rest.Instance | None = None
+        """Told of last; whoever replays leaves the one before at once."""
 
     def start(self) -> None:
         """Ask for the service and wait for the session."""
@@ -223,7 +225,7 @@ class _Replay:
         except BridgeError as error:
             raise ReplayError(str(error)) from error
         self._keeper = threading.Thread(
-            target=self._lease_client.run, args=(self._stop,), name="replay-ask", daemon=True
+            target=self._lease_client.run, args=(self._stop, self._ask), name="replay-ask", daemon=True
         )
         self._keeper.start()
         if not self._settled.wait(_CONNECT_S):
@@ -293,6 +295,16 @@ class _Replay:
         if isinstance(event, Refused | Connected):
             self._settled.set()
 
+    def _ask(self) -> float:
+        """One exchange with the orchestrator; returns the seconds until the next is due."""
+        serving = self._newest.id if self._newest is not None else None
+        delay = self._lease_client.step(Wanted(_request(self._config), serving=serving))
+        while (event := self._lease_client.next_event()) is not None:
+            if isinstance(event, InstanceReported):
+                self._newest = event.instance
+                self._follow(event.instance)
+        return delay
+
     def _follow(self, instance: rest.Instance) -> None:
         if self._instance is not None and instance.id != self._instance.id:
             self._ended = self._ended or f"instance {self._instance.id} ended before the replay did"
@@ -315,7 +327,7 @@ class _Replay:
     def _wait_until_running(self) -> rest.Session:
         deadline = time.monotonic() + _START_S
         while True:
-            delay = self._lease_client.step()
+            delay = self._ask()
             if self._lease_client.trouble:
                 raise ReplayError(self._lease_client.trouble)
             instance = self._instance
