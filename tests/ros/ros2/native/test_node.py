@@ -234,11 +234,24 @@ node.create_timer(0.05, lambda: out.publish(Twist()))
     assert not ours.troubles
 
 
-def test_when_the_agent_is_killed_the_wheels_are_told_to_stand(ros2_nodes):
+@pytest.mark.parametrize("unread", [False, True])
+def test_when_the_agent_is_killed_the_wheels_are_told_to_stand(ros2_nodes, unread):
+    """Also where it was killed before it had read all that came."""
     peer = ros2_nodes.start(
         """
 from geometry_msgs.msg import Twist
 node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+odom = node.create_publisher(Twist, "/odom", 10)
+def work():
+    while not odom.get_subscription_count():
+        time.sleep(0.05)
+    say("joined")
+    for line in sys.stdin:
+        for _ in range(50):
+            odom.publish(Twist())
+            time.sleep(0.01)
+        say("published")
+threading.Thread(target=work, daemon=True).start()
 """
     )
     agent = f"""
@@ -248,17 +261,23 @@ from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.native.node import RclpyNode
 from skytether.ros.ros2.qos import Qos
 with RclpyNode() as node:
-    endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", "{TWIST}", hash_of("{TWIST}", "cdr"), Qos(depth=1))
+    hashed = hash_of("{TWIST}", "cdr")
+    node.subscribe(Endpoint(Kind.SUBSCRIPTION, "/odom", "{TWIST}", hashed, Qos(depth=10)), lambda _: None)
+    endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", "{TWIST}", hashed, Qos(depth=1))
     wheels = node.publish(endpoint, farewell=encode(Twist()))
     while True:
         wheels.put(encode(Twist(linear=Vector3(x=1.5))))
         time.sleep(0.02)
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    with subprocess.Popen([sys.executable, "-c", agent], env=environment) as process:
-        assert peer.next() == 1.5
-        process.kill()
     heard = []
+    with subprocess.Popen([sys.executable, "-c", agent], env=environment) as process:
+        until(lambda: heard.extend(peer.all()) or {"joined", 1.5} <= {*heard}, "the agent")
+        if unread:
+            process.send_signal(signal.SIGSTOP)
+            peer.tell("publish")
+            until(lambda: heard.extend(peer.all()) or "published" in heard, "messages")
+        process.kill()
     until(lambda: heard.extend(peer.all()) or 0.0 in heard, "a standstill")
     assert heard[-1] == 0.0
 

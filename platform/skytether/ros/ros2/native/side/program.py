@@ -91,7 +91,8 @@ class Program:
         self._node = rclpy.create_node(start["node"], namespace=start["namespace"], start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self._sender = Sender(link, self._ended.set)
+        # The reader sees the end too, behind what was told before it: no velocity may follow the farewell.
+        self._sender = Sender(link, lambda: None)
         self._sender.set(GRAPH, FIRST, 1)
         self._lock = threading.Lock()
         self._names: dict[int, str] = {}
@@ -143,7 +144,9 @@ class Program:
 
     def _read(self, stream: Any) -> None:
         while True:
-            frame = pull_frame(stream)
+            frame = None
+            with contextlib.suppress(OSError):  # of an agent that was killed before it had read all of ours
+                frame = pull_frame(stream)
             if frame is None:
                 self._ended.set()
                 self._executor.create_task(lambda: None)  # wakes it
