@@ -134,15 +134,18 @@ def test_two_robots_in_one_domain_have_nothing_to_do_with_each_other(scene, ros2
         agent.start()
     for name in speeds:
         until(lambda name=name: drives(name), f"{name} to be driven")
-    began = len(agents["ben"].status["transitions"])
+    of_ben = agents["ben"].status["instance"]["id"]
     agents["anna"].kill()
     until(lambda: bases["anna"].next() == 0.0, "the standstill of the robot whose agent was killed")
     agents["anna"].start()
     until(lambda: drives("anna"), "it to be driven again")
     bases["anna"].close()
     until(lambda: not agents["anna"].drives, "the loss of its base to be seen")
-    assert drives("ben")
-    assert len(agents["ben"].status["transitions"]) == began
+    until(lambda: drives("ben"), "the other one to be driven all the same")
+    assert agents["ben"].status["instance"]["id"] == of_ben
+    assert agents["ben"].log.rindex("no session") < agents["ben"].log.index("session up"), (
+        "it has one session, all along"
+    )
     assert max(told["anna"]) <= 0.2 + 1e-9
     assert max(told["ben"]) <= 0.1 + 1e-9
     said = agents["anna"].log + agents["ben"].log
