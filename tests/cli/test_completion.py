@@ -60,7 +60,7 @@ def test_no_word_that_others_wrote_reaches_a_shell_that_evaluates_it(
 ) -> None:
     monkeypatch.setenv("SKYTETHER_URL", "http://127.0.0.1:1")
     monkeypatch.setenv("SKYTETHER_TOKEN", "token")
-    complete = names._complete(lambda _: [("toy", f"version {word}"), (word, "version 1"), ("tool", "version 1.2+3")])
+    complete = names.completion(lambda _: [("toy", f"version {word}"), (word, "version 1"), ("tool", "version 1.2+3")])
     asked: Any = SimpleNamespace(params={})
     assert complete(asked, "") == [("tool", "version 1.2+3")]
 

@@ -313,9 +313,9 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
         written = b"".join(call.args[0] for call in nobody.write.call_args_list)
         assert written.startswith(b"GET /info")
         for reader in readers:
-            before = len(reader._buffer)  # type: ignore[attr-defined]
+            before = len(reader._buffer)  # type: ignore[attr-defined]  # noqa: SLF001 asyncio's own
             reader.feed_data(b" " * 10)
-            taken += before < 60_000 or reader._waiter is not None  # type: ignore[attr-defined]
+            taken += before < 60_000 or reader._waiter is not None  # type: ignore[attr-defined]  # noqa: SLF001
         for way in ways:
             way.cancel()
         await asyncio.gather(*ways, return_exceptions=True)

@@ -293,7 +293,7 @@ def nodes(tmp_path: Path, server: Server, later: Later) -> Iterator[NodeScene]:
     server.share_routes()
     with Client(server.url, (state / "operator.token").read_text().strip()) as operator:
         operator.put_service("toy", document(needs={"cpu": 0.1, "memory_mb": 1}))
-        scene = NodeScene(core, operator, tmp_path)
+        scene = NodeScene(core, operator, tmp_path, server.url)
         yield scene
         scene.close()
     core.stop()

@@ -162,9 +162,9 @@ def find_runtime(name: str) -> type[Runtime]:
 class NodeScene:
     """One orchestrator, and the machines that join it."""
 
-    def __init__(self, core: Orchestrator, operator: Any, folder: Path) -> None:
+    def __init__(self, core: Orchestrator, operator: Any, folder: Path, api: str = "") -> None:
         self.core = core
-        self.operator = operator
+        self.operator, self.api = operator, api
         self.folder = folder
         self.sockets = Path(tempfile.mkdtemp(prefix="sky-"))
         """Short paths."""

@@ -23,7 +23,7 @@ _PLAIN = re.compile(r"[\w.,+() -]*", re.ASCII)
 Names = Callable[[Context, str], list[tuple[str, str]]]
 
 
-def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
+def completion(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
     """Of what ``ask`` gives, names with a word on each, those that begin so."""
 
     def complete(ctx: Context, incomplete: str) -> list[tuple[str, str]]:
@@ -44,12 +44,12 @@ def _complete(ask: Callable[[Client], Iterable[tuple[str, str]]]) -> Names:
     return complete
 
 
-services = _complete(lambda client: [(m.metadata.name, f"version {m.metadata.version}") for m in client.services()])
-sites = _complete(lambda client: [(s.name, f"{s.tier}, {s.state}") for s in client.sites()])
-groups = _complete(lambda client: [(g.name, f"{g.provider}, {len(g.machines)} of {g.max}") for g in client.groups()])
-robots = _complete(lambda client: [(r.name, ", ".join(r.services)) for r in client.robots()])
-tokens = _complete(lambda client: [(t.id, t.name) for t in client.tokens()])
-instances = _complete(
+services = completion(lambda client: [(m.metadata.name, f"version {m.metadata.version}") for m in client.services()])
+sites = completion(lambda client: [(s.name, f"{s.tier}, {s.state}") for s in client.sites()])
+groups = completion(lambda client: [(g.name, f"{g.provider}, {len(g.machines)} of {g.max}") for g in client.groups()])
+robots = completion(lambda client: [(r.name, ", ".join(r.services)) for r in client.robots()])
+tokens = completion(lambda client: [(t.id, t.name) for t in client.tokens()])
+instances = completion(
     lambda client: [(i.id, f"{i.service} for {i.robot or 'nobody'}, {i.state}") for i in client.instances()]
 )
 

@@ -119,10 +119,10 @@ def test_what_did_not_arrive_fails_and_is_shown_in_the_table(bag, token, streame
 
 
 def test_recordings_are_never_overwritten(tmp_path):
-    assert command._free(tmp_path / "a.mcap") == tmp_path / "a.mcap"
+    assert command.free_name(tmp_path / "a.mcap") == tmp_path / "a.mcap"
     (tmp_path / "a.mcap").touch()
     (tmp_path / "a-2.mcap").touch()
-    assert command._free(tmp_path / "a.mcap") == tmp_path / "a-3.mcap"
+    assert command.free_name(tmp_path / "a.mcap") == tmp_path / "a-3.mcap"
 
 
 def test_the_speed_must_be_positive(bag):
@@ -132,7 +132,7 @@ def test_the_speed_must_be_positive(bag):
 
 def test_remappings_are_read_and_mistakes_in_them_told(bag, token):
     to = ("--url", "http://127.0.0.1:9", "--token-file", token)
-    assert command._remappings(["/scan:=scan", "/a:=/b"]) == {"/scan": "scan", "/a": "/b"}
+    assert command.remappings(["/scan:=scan", "/a:=/b"]) == {"/scan": "scan", "/a": "/b"}
     assert "must be OLD:=NEW" in refused(run(bag, "--remap", "/talk=talk", *to))
     assert "/talk is renamed twice" in refused(run(bag, "--remap", "/talk:=a", "--remap", "/talk:=b", *to))
     assert "has no topic /tale" in refused(run(bag, "--remap", "/tale:=talk", *to))

@@ -132,7 +132,7 @@ def test_a_full_site_gets_no_more(served_with: Any, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_process_site_weighs_robots_of_which_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skytether.orchestrator.runtimes.process._WEIGH", 0.0)
+    monkeypatch.setattr("skytether.orchestrator.runtimes.process.WEIGH_S", 0.0)
     for robot, size in (("walker", 100_000), ("runner", 300_000)):
         folder = tmp_path / "data" / robot / "recorder" / "i1"
         folder.mkdir(parents=True)

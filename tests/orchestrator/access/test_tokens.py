@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from deep_size import deep_size
 
 from skytether.api.client import ApiError, Client
 from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, SiteCreate, TokenCreate, TokenRotate
@@ -156,12 +157,15 @@ def test_tokens_that_a_robot_makes_and_uses_again_and_again_cost_no_memory(
     """Fifteen a second were 250 MB a day: when each was used last was never forgotten."""
     now = [1000.0]
     monkeypatch.setattr(accesses, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(accesses, "_MOST_RECENT", 5)
     access = Access(store, Secrets(tmp_path), lambda: now[0], RateLimiter(100, 100, lambda: 0.0))
     _, token = access.register("walker", ("*",), ttl_s=None)
+    sizes = []
     for _ in range(60):
         now[0] += 1.0
         token = access.rotate(access.authenticate(token), "self", 0.5)[1]
-    assert len(access._noted) <= 10
+        sizes.append(deep_size(access, without=(store,)))
+    assert max(sizes[20:]) <= max(sizes[:20])
     access.authenticate(token)
     now[0] += 5.0
     access.authenticate(token)

@@ -13,7 +13,6 @@ import pytest
 
 from skytether.api.client import ApiError, NotRunning
 from skytether.api.rest import (
-    Instance,
     InstanceCreate,
     Measurement,
     Renew,
@@ -191,7 +190,9 @@ def test_of_sites_that_are_not_there_nothing_is_kept(served: Any) -> None:
     robot.renew_instance(made.id, Renew(measurements={**names, "lab": Measurement(rtt_ms=8)}))
     assert served.core.store.get(made.id).measurements == {"lab": {"rtt_ms": 8, "preferred": False}}
     many = {f"s{n}": {"rtt_ms": 1} for n in range(257)}
-    assert refused(robot._one, Instance, "POST", f"/instances/{made.id}/renew", {"measurements": many})[0] == 422
+    renewal = f"{served.url}/api/v1/instances/{made.id}/renew"
+    asked_for = {"Authorization": f"Bearer {served.token}"}
+    assert httpx.post(renewal, json={"measurements": many}, headers=asked_for).status_code == 422
 
 
 def test_an_instance_that_is_not_renewed_ends(served: Any) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from certificates import certificate
+from deep_size import deep_size
 from uvicorn import Config
 from uvicorn.server import ServerState
 
@@ -81,12 +82,16 @@ def test_of_a_robots_connections_the_one_that_was_quiet_for_longest_gives_way() 
 
 def test_those_who_left_are_forgotten() -> None:
     at = table()
-    connections = [came(at, "a"), came(at, "b", "robot:b"), came(at, "b", "robot:c")]
-    at.know(connections[2], "robot:b")
-    for connection in [*connections, *connections]:
-        at.leave(connection)
-    at.know(connections[0], "robot:a")
-    assert (at.connections, at._at, at._of, at._strangers, at._strange) == (set(), {}, {}, {}, 0)
+    sizes = []
+    for number in range(50):
+        connections = [came(at, f"a{number}"), came(at, "b", f"robot:{number}"), came(at, "b", "robot:c")]
+        at.know(connections[2], "robot:b")
+        for connection in [*connections, *connections]:
+            at.leave(connection)
+        at.know(connections[0], "robot:a")
+        assert at.connections == set()
+        sizes.append(deep_size(at))
+    assert max(sizes[25:]) <= max(sizes[:25])
 
 
 def test_of_strangers_the_oldest_of_the_largest_crowd_gives_way() -> None:

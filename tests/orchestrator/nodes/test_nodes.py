@@ -69,11 +69,11 @@ def test_no_token_is_in_the_database_and_whoever_may_change_sites_may_make_one(n
     assert token.partition(".")[0].encode() not in stored
     made = nodes.operator.create_token(TokenCreate(name="terraform", scopes=("sites", "read")))
     reader = nodes.operator.create_token(TokenCreate(name="reader", scopes=("read",)))
-    with Client(nodes.operator._urls[0], made.token) as client:
+    with Client(nodes.api, made.token) as client:
         assert client.invite(Invite(name="other")).name == "other"
         with pytest.raises(ApiError, match="network"):  # opens the network: the state folder's operator alone
             client.invite(Invite(name="other", options={"network": "mine"}))
-    with Client(nodes.operator._urls[0], reader.token) as client, pytest.raises(ApiError, match="scope 'sites'"):
+    with Client(nodes.api, reader.token) as client, pytest.raises(ApiError, match="scope 'sites'"):
         client.invite(Invite(name="other"))
 
 
@@ -138,7 +138,7 @@ def test_an_operators_token_is_no_join_token(nodes: NodeScene) -> None:
 def test_a_join_token_is_no_operators_token(nodes: NodeScene) -> None:
     token = nodes.invite()
     for given in (token, token.partition(".")[0]):
-        with Client(nodes.operator._urls[0], given) as client, pytest.raises(ApiError, match="is not known here"):
+        with Client(nodes.api, given) as client, pytest.raises(ApiError, match="is not known here"):
             client.sites()
 
 
@@ -202,7 +202,7 @@ def test_a_port_that_is_closed_is_named_with_the_check_that_shows_it(nodes: Node
 
 def test_the_apis_port_is_not_where_nodes_connect(nodes: NodeScene) -> None:
     nodes.engine()
-    api = nodes.operator._urls[0].replace("http://", "https://")
+    api = nodes.api.replace("http://", "https://")
     why = said(lambda: join.join(nodes.options(nodes.invite(), urls=(api,))))
     assert "is the port the orchestrator's nodes.port (8603)?" in why
     assert "write https://HOST or https://HOST:PORT" in said(

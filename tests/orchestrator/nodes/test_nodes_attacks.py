@@ -202,7 +202,7 @@ def test_connections_that_say_nothing_keep_no_node_out(nodes: NodeScene, monkeyp
     """As many as may be, and twice that: the oldest of them give way."""
     nodes.join()
     with contextlib.ExitStack() as stack:
-        for _ in range(2 * door._STRANGERS):
+        for _ in range(2 * door.STRANGERS):
             stack.enter_context(socket.create_connection(("127.0.0.1", nodes.port), timeout=10))
         with nodes.running() as linked:
             until(lambda: linked and nodes.state() == "ready")
@@ -237,7 +237,7 @@ def test_a_node_has_ways_to_no_engine_but_its_own_and_only_when_it_is_asked(node
         with connection(nodes, hostile) as link, contextlib.ExitStack() as stack:
             secret, opened = linked_by(link), []
             link.sendall(line_of(Said(engine="")))
-            for _ in range(ways._SPARE + 3):  # some may be wanted just now
+            for _ in range(ways.SPARE + 3):  # some may be wanted just now
                 way = stack.enter_context(connection(nodes, hostile))
                 way.sendall(line_of(Way(link=secret)))
                 way.settimeout(0.05)
@@ -270,7 +270,7 @@ def test_a_node_that_links_again_and_again_is_told_to_wait(nodes: NodeScene) -> 
     """With another address each time: its site would be opened anew with each."""
     nodes.join(advertise=None)
     trust, said = context_of(nodes.store()), []
-    for number in range(door._LINKS + 3):
+    for number in range(door.LINKS + 3):
         with connection(nodes, trust) as link:
             link.sendall(line_of(Link(address=f"192.0.2.{number}")))
             said.append(first_line(link))
@@ -354,7 +354,7 @@ def test_ways_that_wait_are_not_forgotten_by_a_nat(nodes: NodeScene) -> None:
     nodes.join()
     with nodes.running() as linked:
         until(lambda: linked and nodes.state() == "ready")
-        until(lambda: len(found := kept()) >= 2 * ways._SPARE and all(found))
+        until(lambda: len(found := kept()) >= 2 * ways.SPARE and all(found))
 
 
 def test_the_socket_of_an_engine_is_nobody_elses(nodes: NodeScene) -> None:

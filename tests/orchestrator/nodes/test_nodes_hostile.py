@@ -91,7 +91,7 @@ def test_a_copy_of_a_nodes_key_gets_none_of_its_ways(nodes: NodeScene) -> None:
     trust = context_of(nodes.store())
     with nodes.running() as linked, contextlib.ExitStack() as stack:
         until(lambda: linked and nodes.state() == "ready")
-        for number in range(ways._SPARE + 2):
+        for number in range(ways.SPARE + 2):
             way = stack.enter_context(connection(nodes, trust))
             way.sendall(line_of(Way()) if number % 2 else line_of(Way(link=32 * "0")))
             assert b"this way is of no link that stands" in first_line(way)
@@ -110,7 +110,7 @@ def test_a_node_that_talks_without_end_is_heard_only_now_and_then(
     """All nodes are served by one loop, and each line takes its time: others were not linked any more."""
     monkeypatch.setattr(ways, rate, 0.01)
     monkeypatch.setattr(ways, most, 5)
-    heard, hear = [], ways.Ways._hear
+    heard, hear = [], ways.Ways._hear  # noqa: SLF001 what is not heard shows nowhere
     monkeypatch.setattr(ways.Ways, "_hear", lambda own, node, said: (heard.append(said), hear(own, node, said)))
     nodes.shut()
     nodes.open()
@@ -225,13 +225,13 @@ def test_a_node_whose_name_takes_for_ever_to_resolve_keeps_nobody_waiting(
     try:
         nodes.join("other", echo=free_port())
         hostile = context_of(nodes.store("other"))
-        for _ in range(door._ECHOES + 4):  # more than there are threads
+        for _ in range(door.ECHOES + 4):  # more than there are threads
             assert calls.call(nodes.url, hostile, Standing(), Stands).echo is None
         assert calls.call(nodes.url, context_of(nodes.store("edge")), Standing(), Stands).state == "unreachable"
         nodes.shut()  # nor whoever ends the orchestrator
     finally:
         ended.set()
-    assert sum(thread.name == "node-echo" for thread in threading.enumerate()) <= door._ECHOES
+    assert sum(thread.name == "node-echo" for thread in threading.enumerate()) <= door.ECHOES
 
 
 def free_port() -> int:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-import math
 import os
 import shutil
 import signal
@@ -513,7 +512,7 @@ def test_no_folder_that_a_service_made_keeps_it_from_being_weighed_started_and_r
     until(runtime, Phase.RUNNING)
     assert not (own / "deep").exists()
     monkeypatch.setattr("skytether.orchestrator.runtimes.disk.MOST_FILES", 2)
-    runtime._weighed_at = -math.inf
+    monkeypatch.setattr("skytether.orchestrator.runtimes.process.WEIGH_S", 0.0)
     (own / "one").touch()
     runtime.tidy()
     assert "files or too deep ones in its own folder" in runtime.observe()["i1"].exceeds

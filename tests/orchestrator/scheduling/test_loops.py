@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
@@ -40,11 +41,12 @@ def test_it_runs_at_once_then_when_woken() -> None:
 
 def test_a_wake_during_a_pass_is_not_lost() -> None:
     passes = threading.Semaphore(0)
+    numbers = itertools.count(1)
     loop: Loop
 
     def step() -> float:
         passes.release()
-        if passes._value < 3:
+        if next(numbers) < 3:
             loop.wake()
         return 1000
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from reconcile_bench import Bench, add
 
@@ -356,7 +357,10 @@ def test_what_cannot_be_is_told_in_a_sentence_and_nothing_is_changed(served: Any
         assert (got, says in text.replace("memory_mb: is", "memory_mb is")) == (status, True), text
     assert refused(served, "nobody", cpu=1)[0] == 404
     for body in ({}, {"cpu": -1}, {"memory_mb": 0.5}, {"cpu": "many"}, {"cores": 2}):
-        assert served.operator._http.patch(f"{served.url}/api/v1/instances/{made.id}", json=body).status_code == 422
+        asked_for = httpx.patch(
+            f"{served.url}/api/v1/instances/{made.id}", json=body, headers={"Authorization": f"Bearer {served.token}"}
+        )
+        assert asked_for.status_code == 422
     assert served.operator.get_instance(made.id).size == made.size
     assert fake.resized == []
     with pytest.raises(ApiError, match="needs an operator's token"):

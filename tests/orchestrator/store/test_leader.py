@@ -274,24 +274,26 @@ def test_postgresql_gives_the_lead_to_one_and_to_the_next_when_it_is_not_renewed
     stores[0].migrate()
     one, two = (store.lock() for store in stores)
     first, second = in_turn(one, two)
-    with stores[0]._writing() as connection:  # the connection of the one that leads is ended, as firewalls do
+    database = make_engine(postgres)
+    with database.begin() as connection:  # the connection of the one that leads is ended, as firewalls do
         ours = "application_name = 'skytether' AND pid <> pg_backend_pid()"
         connection.execute(text(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {ours}"))
     assert (one.hold(), two.hold()) == (0, second)
     began = time.monotonic()
     until(lambda: one.hold() > second)
     assert LEASE - 0.5 <= time.monotonic() - began <= LEASE + 1
-    with stores[0]._writing() as connection:  # the clock of the database's server is set back
+    with database.begin() as connection:  # the clock of the database's server is set back
         connection.execute(text("UPDATE leadership SET until = until + 3600"))
     third = two.hold()
     assert third > second
     assert two.hold() == third
-    with stores[0]._writing() as connection:  # restored from a copy of when the same one led before
+    with database.begin() as connection:  # restored from a copy of when the same one led before
         connection.execute(text(f"UPDATE leadership SET epoch = {first}"))
     assert two.hold() > third, "no epoch that was"
     later = two.hold(third + 5000)
     assert later > third + 5000
     assert (two.hold(third + 5000), two.hold(), one.hold(later)) == (later, later, 0)
+    database.dispose()
     for lock, store in zip((one, two), stores, strict=True):
         lock.release()
         store.close()

@@ -48,7 +48,7 @@ def replay(
     Ends with exit status 0 only if every message arrived.
     """
     topics = tuple(topic) if topic else None
-    config = ReplayConfig(bag, robot, service, topics=topics, remap=_remappings(remap or []), speed=speed)
+    config = ReplayConfig(bag, robot, service, topics=topics, remap=remappings(remap or []), speed=speed)
     try:
         if url is None:
             result, files = _with_own_orchestrator(config, output)
@@ -77,10 +77,10 @@ def _with_own_orchestrator(config: ReplayConfig, output: Path) -> tuple[ReplayRe
         with Client(orchestrator.url, orchestrator.operator_token) as client:
             result = _stream(config, client)
         written = [path for path in orchestrator.state_dir.rglob(f"data/*/*/{result.instance}/*") if path.is_file()]
-        return result, [Path(shutil.move(path, _free(output / path.name))) for path in sorted(written)]
+        return result, [Path(shutil.move(path, free_name(output / path.name))) for path in sorted(written)]
 
 
-def _remappings(texts: list[str]) -> dict[str, str]:
+def remappings(texts: list[str]) -> dict[str, str]:
     """``OLD:=NEW``, as ROS writes it."""
     found: dict[str, str] = {}
     for text in texts:
@@ -93,7 +93,7 @@ def _remappings(texts: list[str]) -> dict[str, str]:
     return found
 
 
-def _free(path: Path) -> Path:
+def free_name(path: Path) -> Path:
     """A name that nothing has yet: what was recorded before is never overwritten."""
     number = 1
     candidate = path

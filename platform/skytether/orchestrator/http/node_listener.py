@@ -60,7 +60,7 @@ log = logging.getLogger(__name__)
 audit = logging.getLogger(AUDIT)
 strangers = logging.getLogger("skytether.strangers")
 
-_MOST, _STRANGERS = 8192, 128
+_MOST, STRANGERS = 8192, 128
 """Connections in all, and those that have shown no certificate."""
 _LOOK_S = 2.0
 """Between two looks which nodes are sites still."""
@@ -70,7 +70,7 @@ _GUESSES_PER_S, _GUESSES = 0.2, 10
 """Join tokens that one address may try, and at once."""
 _REQUESTS_PER_S, _REQUESTS = 10.0, 60
 """Requests of one node, ways not counted, and at once."""
-_LINKS_PER_S, _LINKS = 0.5, 20
+_LINKS_PER_S, LINKS = 0.5, 20
 """Of these, links and renewals, which change the database: one that is cut off again and again comes no more often."""
 _AT_ONCE_S = 0.002
 """Seconds between two connections that are taken: a handshake costs a millisecond, and robots' requests are served by
@@ -78,7 +78,7 @@ the same process."""
 _AT_ONCE = 4
 """Requests of one node under way, its links and ways not counted."""
 _ECHO_S, _ECHO_TRIES = 0.5, 3
-_ECHOES, _ECHO_PATIENCE_S = 8, 3.0
+ECHOES, _ECHO_PATIENCE_S = 8, 3.0
 """Looks for echoes at once, of all nodes, and how long a node waits for one."""
 
 
@@ -123,10 +123,10 @@ class NodeListener:
         """Looks for echoes that are under way."""
         self._leave = leave
         self._clock = clock
-        self._table = ConnectionTable(Limits(strangers=_STRANGERS, connections_per_address=_MOST), _MOST)
+        self._table = ConnectionTable(Limits(strangers=STRANGERS, connections_per_address=_MOST), _MOST)
         self._guesses = RateLimiter(_GUESSES_PER_S, _GUESSES, time.monotonic)
         self._requests = RateLimiter(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
-        self._links = RateLimiter(_LINKS_PER_S, _LINKS, time.monotonic)
+        self._links = RateLimiter(_LINKS_PER_S, LINKS, time.monotonic)
         self._told = RateLimiter(0.2, 20, time.monotonic)
         self._busy: Counter[str] = Counter()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -382,7 +382,7 @@ class NodeListener:
         In a thread that nobody waits for: a node says the name under which it is, and whoever resolves that may hang.
         """
         where = await asyncio.to_thread(self._echo, name)
-        if where is None or self._echoes >= _ECHOES:
+        if where is None or self._echoes >= ECHOES:
             return None
         answered: asyncio.Future[bool] = self._loop.create_future()
 

@@ -26,7 +26,7 @@ from ..runtimes.base import ENGINE_AWAY, ENGINE_SOCKET
 
 log = logging.getLogger(__name__)
 
-_SPARE = 4
+SPARE = 4
 """Ways that wait, so that who asks does not wait for a handshake."""
 _MOST_WAITING = 256
 """Who waits for a way of one node at a time; of more, each is refused."""
@@ -215,7 +215,7 @@ class Ways:
         node.listener = listener
         asyncio.get_running_loop().add_reader(listener.fileno(), self._take, node, listener)
         (folder / ENGINE_AWAY).unlink(missing_ok=True)
-        self._want(node, _SPARE - len(node.spare) - node.wanted)
+        self._want(node, SPARE - len(node.spare) - node.wanted)
 
     def _close_socket(self, node: LinkedNode, why: str) -> None:
         listener, node.listener = node.listener, None

@@ -62,7 +62,7 @@ _PASSED_ON = ("LANG", "LC_ALL", "PATH", "TZ")
 """Of our environment; nothing else, for there may be secrets in it."""
 _OWN_MB = 64
 """MiB that a run may have in its own folder, which is also its home and has its temporary files."""
-_WEIGH = 2.0
+WEIGH_S = 2.0
 """Seconds between two looks at how much robots' services have written."""
 _EMPTY = 0.2
 """Seconds at a time for what runs that have ended left behind."""
@@ -150,7 +150,7 @@ class ProcessRuntime(Runtime):
         self._data = folder / "data"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._measured_at = -math.inf
-        self._weighed_at = -_WEIGH
+        self._weighed_at = -WEIGH_S
         self._stored: dict[str, int] = {}
         """By robot, as weighed last."""
         self._unweighed: list[str] = []
@@ -420,7 +420,7 @@ class ProcessRuntime(Runtime):
 
     def tidy(self) -> None:
         self._fence.must_lead()
-        if time.monotonic() - self._weighed_at >= _WEIGH:
+        if time.monotonic() - self._weighed_at >= WEIGH_S:
             self._weigh()
             self._weigh_one()
             self._weighed_at = time.monotonic()

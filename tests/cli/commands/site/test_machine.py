@@ -29,8 +29,8 @@ def orchestrator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pr
     (tmp_path / "one").mkdir()
     program = Program(tmp_path / "one" / "state")
     program.environment = {"SKYTETHER_NODES_PORT": "0", "SKYTETHER_LOCAL_SITE": "false"}
-    with program.start() as client:
-        monkeypatch.setenv("SKYTETHER_URL", client._urls[0])
+    with program.start():
+        monkeypatch.setenv("SKYTETHER_URL", (program.folder / "address").read_text().strip())
     monkeypatch.setenv("SKYTETHER_TOKEN_FILE", str(program.folder / "operator.token"))
     yield program
     program.clean_up()

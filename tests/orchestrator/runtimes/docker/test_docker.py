@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from docker_runs import KEY, PYTHON, docker, inside, launch, until, until_phase
 from docker_site import DockerSite
@@ -303,15 +304,15 @@ def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room
         until_phase(runtime, Phase.RUNNING)
         (container,) = docker_site.containers()
         inside(container, "open('/run/skytether/data/i1/much', 'wb').write(bytes(3 << 20)); print(1)")
-        runtime._scales.weigh()
+        runtime.scales.weigh()
         assert "has more than 1 MiB in the volume" in runtime.observe()["i1"].exceeds
         with pytest.raises(RuntimeFailure, match="has more than 1 MiB"):
             runtime.start(launch(docker_site, "i2"))
         inside(container, "import os; os.remove('/run/skytether/data/i1/much'); print(1)")
-        runtime._scales.weigh()
+        runtime.scales.weigh()
         assert runtime.observe()["i1"].exceeds == ""
         inside(container, "open('/run/skytether/instance/much', 'wb').write(bytes(65 << 20)); print(1)")
-        runtime._scales.weigh()
+        runtime.scales.weigh()
         assert runtime.observe()["i1"].exceeds == "has more than 64 MiB in a volume that is not for data"
         runtime.remove("i1")
 
@@ -324,7 +325,7 @@ def test_what_hides_from_being_weighed_is_ended(docker_site: DockerSite, tmp_pat
         (container,) = docker_site.containers()
         inside(container, _HIDE)
         for _ in range(2):
-            runtime._scales.weigh()
+            runtime.scales.weigh()
         assert "the engine cannot tell how much is in there" in runtime.observe()["i1"].exceeds
         with pytest.raises(RuntimeFailure, match="the engine cannot tell"):
             runtime.start(launch(docker_site, "i2"))
@@ -465,7 +466,7 @@ def test_who_is_asked_too_slowly_is_not_ill(docker_site: DockerSite, runtime: Do
         until_phase(runtime, Phase.RUNNING)
         (container,) = docker_site.containers()
         until(lambda: docker("inspect", "-f", "{{.State.Health.Status}}", container) == "unhealthy")
-        runtime._follower.look(container)
+        runtime.follower.look(container)
         assert runtime.observe()["i1"].detail == ""
         runtime.remove("i1")
 
@@ -583,12 +584,9 @@ def test_an_engine_behind_ssh(sshd: str, docker_site: DockerSite, tmp_path: Path
             seen = until_phase(runtime, Phase.RUNNING)
             assert seen.host == "127.0.0.1"
             assert "toy service" in runtime.logs("i1", 10)
-            tunnel = runtime._engine._tunnel
-            assert tunnel is not None
-            process = tunnel._process
-            assert process is not None
-            process.kill()  # the network is gone for a moment
-            process.wait()
+            (tunnel,) = (child for child in psutil.Process().children() if child.name() == "ssh")
+            tunnel.kill()  # the network is gone for a moment
+            tunnel.wait()
             until(lambda: is_seen(runtime, Phase.RUNNING))
             until(lambda: stopped(runtime))
             until(lambda: is_seen(runtime, Phase.EXITED))

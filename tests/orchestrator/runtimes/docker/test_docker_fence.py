@@ -87,9 +87,9 @@ def test_an_act_that_finds_the_engine_silent_lets_the_next_look_know(
     options = DockerOptions(engine=f"unix://{tmp_path}/none", prepared=0)
     monkeypatch.setattr(Follower, "start", lambda _: None)
     with closing(DockerRuntime("edge", tmp_path, options)) as runtime:
-        runtime._follower._looked.set()
-        runtime._fence.epoch = 1
-        monkeypatch.setattr(runtime._fence, "lead", silent)
+        runtime.follower.looked.set()
+        runtime.fence.epoch = 1
+        monkeypatch.setattr(runtime.fence, "lead", silent)
         assert runtime.observe() == {}
         with pytest.raises(EngineGoneError):
             runtime.tidy()
@@ -108,7 +108,7 @@ class Frozen:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runtime: DockerRuntime) -> None:
         self.reached, self.go_on = threading.Event(), threading.Event()
-        api = runtime._engine.api()
+        api = runtime.engine.api()
         begin = api.start
 
         def start(container: str) -> None:
@@ -144,8 +144,8 @@ def test_a_leader_that_is_frozen_between_its_look_and_its_call(
         leader.remove("i1")
         until(lambda: leader.tidy() or not docker_site.containers())
     frozen.go_on.set()
-    late._jobs["i1"].join(30)
-    assert late._jobs["i1"].ended
+    late.jobs["i1"].join(30)
+    assert late.jobs["i1"].ended
     assert made not in docker_site.containers()
     assert len(docker_site.containers()) == wanted
     assert len(docker_site.volumes_with("skytether.io/instance")) == wanted
@@ -232,7 +232,7 @@ def counted(self, request, **more):
 requests.Session.send = counted
 for number in range(until):
     runtime.start(launch(site, f"i{number}"))
-for job in list(runtime._jobs.values()):
+for job in list(runtime.jobs.values()):
     while not job.ended and not any(threads.get(job._thread) is one for one in done):
         job.join(0.02)
 print(max(calls for _, calls in threads.values()), flush=True)

@@ -229,13 +229,13 @@ def test_containers_that_an_engine_makes_up_cost_no_thread_each(
     engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It lists thousands: each had two threads, two connections and a megabyte."""
-    monkeypatch.setattr(follow, "_BESIDE", 3)
+    monkeypatch.setattr(follow, "BESIDE", 3)
     follower.expect(0)
     made_up(engine, monkeypatch, 40)
     follower.start()
     assert len(follower.seen(PATIENCE)) == 40
     engine.looks.get(timeout=PATIENCE)
-    assert max(watchers().values()) <= follow._BESIDE
+    assert max(watchers().values()) <= follow.BESIDE
     follower.expect(10)  # these are to be there, and whoever waited is watched now
     end = time.monotonic() + PATIENCE
     while watchers()["docker-ready"] < 2 * 10 + 3:

@@ -16,8 +16,8 @@ from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker import launch as docker_launch
+from skytether.orchestrator.runtimes.docker import runtime as docker_runtime
 from skytether.orchestrator.runtimes.docker.engine import EngineGoneError
-from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.follow import Follower
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.namespaces import Namespaces
@@ -141,12 +141,12 @@ def test_an_orchestrator_that_ends_waits_for_its_starts_and_cancels_none(
 ) -> None:
     monkeypatch.setattr(Follower, "start", lambda _: None)
     runtime = DockerRuntime("edge", tmp_path, DockerOptions(engine=f"unix://{tmp_path}/none", prepared=0))
-    job = runtime._jobs["i1"] = scene.job()
+    job = runtime.jobs["i1"] = scene.job()
     begins, told = threading.Event(), threading.Event()
     leave = job.leave
     was_over: list[bool] = []
     monkeypatch.setattr(job, "leave", lambda: (leave(), told.set()))
-    monkeypatch.setattr(runtime._namespaces, "close", lambda: was_over.append(job.ended))
+    monkeypatch.setattr(runtime.namespaces, "close", lambda: was_over.append(job.ended))
 
     def meanwhile() -> None:
         begins.set()
@@ -211,8 +211,8 @@ def test_a_network_in_which_a_container_is_or_is_just_begun_stays_when_its_orche
 
     scene: Any = Prepared()
     pool = Namespaces(scene, DockerOptions(), "me", scene, lambda: None, scene.must_lead)
-    pool._ready = [Namespace(name, name, 7600) for name in scene.there]
-    pool._mine = set(scene.there)
+    ready = [Namespace(name, name, 7600) for name in scene.there]
+    pool._ready, pool._mine = ready, set(scene.there)  # noqa: SLF001 as if it had made them
     scene.overtaken = overtaken
     with pool.taken() as begun:
         assert begun is not None
@@ -301,9 +301,11 @@ def test_a_leader_begins_with_a_list_of_its_own_time(
     """The first look at a busy engine took 40 s: what had begun since seemed to be gone."""
     engine: Any = busy
     monkeypatch.setattr(Follower, "start", lambda _: None)
-    runtime = DockerRuntime("edge", tmp_path, DockerOptions(engine=f"unix://{tmp_path}/none", prepared=0))
-    runtime._follower._engine, runtime._fence = engine, Fence(engine, "me")
-    first = threading.Thread(target=runtime._follower._follow, name="docker-events")
+    monkeypatch.setattr(docker_runtime, "Engine", lambda *_: engine)
+    monkeypatch.setattr(DockerRuntime, "prepare_early", lambda _: None)
+    options = DockerOptions(engine=f"unix://{tmp_path}/none", owner="me", prepared=0)
+    runtime = DockerRuntime("edge", tmp_path, options)
+    first = threading.Thread(target=runtime.follower.follow, name="docker-events")
     first.start()
     assert busy.looks.wait(PATIENCE)
     busy.there["c1"] = "running"  # the leader before has begun it

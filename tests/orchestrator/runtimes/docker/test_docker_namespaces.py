@@ -17,7 +17,6 @@ from docker_site import DockerSite
 from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker.network import close_off, guard_image
-from skytether.orchestrator.runtimes.docker.objects import Helper
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
 
@@ -35,8 +34,8 @@ def tended(runtime: DockerRuntime, ready: int) -> None:
 
     def done() -> bool:
         runtime.tidy()
-        pool = runtime._namespaces
-        return len(pool._ready) == ready and not (pool._thread and pool._thread.is_alive()) and not pool._left()
+        pool = runtime.namespaces
+        return len(pool.ready) == ready and not pool.busy
 
     until(done)
 
@@ -119,13 +118,14 @@ def test_what_opens_something_gets_a_network_of_its_own(docker_site: DockerSite,
         assert "192.0.2.1" in docker_site.nft(f"container:{container}", "list table inet skytether")
 
 
-def test_one_that_somebody_removed_is_missed_by_no_start(docker_site: DockerSite, runtime: DockerRuntime) -> None:
-    pool = runtime._namespaces
-    with pool.taken() as taken:
-        assert taken is not None
-    pool._ready.append(taken)  # removed in the moment in which a start gets it
-    docker("rm", "-f", taken.id)
-    runtime._follower._helpers[taken.id] = Helper(taken.name, True, "")
+def test_one_that_somebody_removed_is_missed_by_no_start(
+    docker_site: DockerSite, runtime: DockerRuntime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (ready,) = runtime.namespaces.ready
+    there = runtime.follower.helpers()
+    assert there[ready.id].runs
+    monkeypatch.setattr(runtime.follower, "helpers", lambda: there)  # nobody has told of it yet
+    docker("rm", "-f", ready.id)
     runtime.start(launch(docker_site))
     until_phase(runtime, Phase.RUNNING)
     (container,) = docker_site.containers()
@@ -150,12 +150,12 @@ def test_what_a_killed_orchestrator_left_is_removed_and_what_runs_keeps_its_netw
     holder = holder_of(docker_site, container)
     (ready,) = set(docker_site.helpers()) - {holder}
     # As if it had been killed while it made one: its guard is left, and what that closes off.
-    image = guard_image(runtime._engine, runtime._options)
+    image = guard_image(runtime.engine, runtime.options)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(APIClient, "wait", _killed)
         patch.setattr(APIClient, "remove_container", lambda *_, **__: None)
         with pytest.raises(_KilledError):
-            close_off(runtime._engine, runtime._options, docker_site.owner, image, ready, {})
+            close_off(runtime.engine, runtime.options, docker_site.owner, image, ready, {})
     assert len(docker_site.helpers()) == 3
     with closing(docker_site.open(tmp_path)) as second:
         tended(second, 1)

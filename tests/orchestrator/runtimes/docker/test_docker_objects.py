@@ -530,7 +530,7 @@ def test_what_holds_a_container_is_told_and_no_user_of_its_own(tmp_path: Path, m
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
         assert runtime.isolation() == (), "nothing is known of an engine that is away"
         told = {"SecurityOptions": ["name=seccomp,profile=default", "name=userns", "name=other"]}
-        monkeypatch.setattr(runtime._follower, "info", lambda _: told)
+        monkeypatch.setattr(runtime.follower, "info", lambda _: told)
         assert runtime.isolation() == ("user 65532", "no capabilities", "user namespace", "seccomp")
 
 
@@ -687,12 +687,12 @@ def test_a_network_that_cannot_be_closed_off_is_told_before_the_first_start(
 
     monkeypatch.setattr(docker_runtime, "ensure_network", cannot)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
-        monkeypatch.setattr(runtime._follower, "info", lambda _: {})
-        runtime._prepare_early()
-        runtime._prepare_early()
+        monkeypatch.setattr(runtime.follower, "info", lambda _: {})
+        runtime.prepare_early()
+        runtime.prepare_early()
         assert runtime.blocked() == "no guard"
         monkeypatch.setattr(docker_runtime, "ensure_network", lambda *_: None)
-        runtime._prepare_early()
+        runtime.prepare_early()
         assert runtime.blocked() == ""
     assert caplog.text.count("site edge: nothing can be started: no guard") == 1, "said once"
 
@@ -705,10 +705,11 @@ def test_guards_that_earlier_releases_left_are_found_though_they_name_no_owner(
             pruned.append(filters)
 
     pruned: list[dict[str, Any]] = []
+    monkeypatch.setattr(docker_runtime, "ensure_network", lambda *_: None)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
-        monkeypatch.setattr(runtime, "_prepare", lambda: None)
-        monkeypatch.setattr(runtime._engine, "api", FakeApi)
-        runtime._prepare_early()
+        monkeypatch.setattr(runtime.follower, "info", lambda _: {})
+        monkeypatch.setattr(runtime.engine, "api", FakeApi)
+        runtime.prepare_early()
     assert pruned == [{"label": ["skytether.io/guard"], "until": "60s"}], "and none that is at work"
 
 
@@ -751,19 +752,19 @@ def test_what_a_start_has_given_up_is_no_run_and_is_begun_anew(tmp_path: Path, m
     nothing: Any = None
     begun = Seen("c1", "i1", 3, "running", host_port=40_123, ready=True)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
-        monkeypatch.setattr(runtime._follower, "seen", lambda _: [begun])
-        monkeypatch.setattr(runtime._follower, "of", lambda _: [begun])
-        job = runtime._jobs["i1"] = Job(
+        monkeypatch.setattr(runtime.follower, "seen", lambda _: [begun])
+        monkeypatch.setattr(runtime.follower, "of", lambda _: [begun])
+        job = runtime.jobs["i1"] = Job(
             launch(), nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None
         )
         job.unanswered = True
         runtime.start(launch())
-        assert runtime._jobs["i1"] is job, "it runs, whoever said so"
+        assert runtime.jobs["i1"] is job, "it runs, whoever said so"
         assert runtime.observe()["i1"].phase is Phase.RUNNING
         job.given_up.add("c1")
         assert runtime.observe() == {}
         runtime.start(launch())
-        again = runtime._jobs["i1"]
+        again = runtime.jobs["i1"]
         assert again is not job
         assert "c1" in again.given_up
 
@@ -779,17 +780,17 @@ def test_what_a_start_has_given_up_is_removed_though_nobody_asks_for_it(
         "skytether.orchestrator.runtimes.docker.runtime.remove", lambda *given: removed.append(given[-1])
     )
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
-        monkeypatch.setattr(runtime._follower, "seen", lambda _: there)
-        job = runtime._jobs["i1"] = Job(
+        monkeypatch.setattr(runtime.follower, "seen", lambda _: there)
+        job = runtime.jobs["i1"] = Job(
             launch(), nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None
         )
         job.unanswered = True
         job.given_up.add("c1")
         monkeypatch.setattr(Job, "ended", property(lambda _: False))
-        runtime._remove_unbegun()
+        runtime.remove_unbegun()
         assert removed == [], "who is at it does it"
         monkeypatch.setattr(Job, "ended", property(lambda _: True))
-        runtime._remove_unbegun()
+        runtime.remove_unbegun()
         assert removed == ["c1"]
 
 
@@ -808,7 +809,9 @@ def test_who_sees_that_a_start_failed_sees_that_nothing_is_left_of_it() -> None:
 
     nothing: Any = None
     job = Failing(nothing, nothing, nothing, "", nothing, nothing, nothing, Fence(nothing, ""), None)
-    job._run()
+    job.start()
+    job.join(30)
+    assert job.ended
     assert "no space left" in job.failure
 
 
@@ -829,7 +832,9 @@ def test_a_start_that_fails_under_another_leader_says_nothing_of_the_service() -
     nothing: Any = None
     job = Failing(nothing, nothing, nothing, "", nothing, nothing, nothing, Overtaken(nothing, ""), None)
     job.launch = launch()
-    job._run()
+    job.start()
+    job.join(30)
+    assert job.ended
     assert job.unanswered
     assert not job.failure
 
@@ -853,8 +858,8 @@ def test_an_engine_that_holds_no_limits_starts_nothing_unless_told(
     monkeypatch.setattr(docker_runtime, "ensure_network", lambda *_: None)
     given = options(engine=f"unix://{tmp_path}/none", without_limits=without)
     with closing(DockerRuntime("edge", tmp_path, given)) as runtime:
-        monkeypatch.setattr(runtime._follower, "info", lambda _: told)
-        runtime._prepare_early()
+        monkeypatch.setattr(runtime.follower, "info", lambda _: told)
+        runtime.prepare_early()
         assert blocked in runtime.blocked()
         assert bool(runtime.blocked()) == bool(blocked)
 

@@ -99,10 +99,10 @@ def test_a_quota_is_told_as_the_cluster_says_it(kubernetes_site: KubernetesSite,
 def test_a_run_that_was_made_and_not_begun_is_removed_by_who_leads_next(
     kubernetes_site: KubernetesSite, runtime: KubernetesRuntime, tmp_path: Path
 ) -> None:
-    body = pod(launch(kubernetes_site), runtime._options, kubernetes_site.owner, 20_123, {})
+    body = pod(launch(kubernetes_site), runtime.options, kubernetes_site.owner, 20_123, {})
     with closing(kubernetes_site.open(tmp_path)) as late:
         late.lead(1)
-        late._cluster.create(late._cluster.path("pods"), body)  # and killed then
+        late.cluster.create(late.cluster.path("pods"), body)  # and killed then
         until(lambda: runtime.observe())
         runtime.lead(2)
         assert runtime.observe() == {}
@@ -125,9 +125,9 @@ def test_no_run_is_begun_by_the_secret_of_an_earlier_pod_of_its_name(
     runtime.stop("i1", force=False)
     assert kubernetes_site.there("secrets", "skytether.io/instance=i1") == []  # and not only when it is collected
     earlier = {"metadata": {"name": before["metadata"]["name"]}, "kind": "Secret", "apiVersion": "v1"}
-    runtime._cluster.create(runtime._cluster.path("secrets"), earlier)
-    body = pod(lacking, runtime._options, kubernetes_site.owner, 20_123, {})
-    runtime._cluster.create(runtime._cluster.path("pods"), body)  # and killed then
+    runtime.cluster.create(runtime.cluster.path("secrets"), earlier)
+    body = pod(lacking, runtime.options, kubernetes_site.owner, 20_123, {})
+    runtime.cluster.create(runtime.cluster.path("pods"), body)  # and killed then
     with closing(kubernetes_site.open(tmp_path)) as late:
         late.lead(2)
         assert late.observe() == {}
@@ -159,8 +159,8 @@ def test_pods_stay_closed_off_whatever_becomes_of_the_policy(
     runtime.start(launch(kubernetes_site))
     (before,) = kubernetes_site.there("networkpolicies", f"skytether.io/owner={kubernetes_site.owner}")
     name, space = before["metadata"]["name"], ("-n", kubernetes_site.namespace)
-    asked = runtime._cluster.path("networkpolicies", name, group="networking.k8s.io/v1")
-    written_by = runtime._cluster.get(asked)["metadata"]["managedFields"]
+    asked = runtime.cluster.path("networkpolicies", name, group="networking.k8s.io/v1")
+    written_by = runtime.cluster.get(asked)["metadata"]["managedFields"]
     assert [(one["manager"], one["operation"]) for one in written_by] == [("skytether", "Apply")]
 
     def restored() -> bool:

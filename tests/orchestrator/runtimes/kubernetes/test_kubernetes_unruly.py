@@ -121,7 +121,7 @@ def test_who_was_overtaken_in_a_start_begins_nothing_though_what_tells_of_it_was
     """As of a leader that is frozen just before it makes a pod."""
     before, after = open_site(), open_site()
     before.lead(7)
-    make = before._cluster.create
+    make = before.cluster.create
 
     def frozen(path: str, body: Any) -> Any:
         if body["kind"] == "Pod":
@@ -130,7 +130,7 @@ def test_who_was_overtaken_in_a_start_begins_nothing_though_what_tells_of_it_was
             cluster.remove_one("configmaps")
         return make(path, body)
 
-    monkeypatch.setattr(before._cluster, "create", frozen)
+    monkeypatch.setattr(before.cluster, "create", frozen)
     with pytest.raises(SiteSilentError, match="somebody has removed the ConfigMap skytether-o1-leader"):
         before.start(launch("i1"))
     assert cluster.doubles == []

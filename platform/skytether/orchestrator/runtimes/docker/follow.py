@@ -39,7 +39,7 @@ _SHORT_S = 0.1
 _READY_S, _READY_MOST_S, _READY_SHARE = 0.02, 0.5, 0.02
 """Between two looks for the ready file of a container that starts; each costs the engine some 3 ms. One that takes long
 is looked at less often: a share of the time for which it has been waited for."""
-_BESIDE = 64
+BESIDE = 64
 """Containers that are followed each by a thread of its own, beside two for each instance that is to be there."""
 _MOST_LISTED = 20_000
 """Containers of a site, ended ones and those without a service included."""
@@ -70,7 +70,7 @@ class Follower:
         self._lock = threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._helpers: dict[str, Helper] = {}
-        self._most = _BESIDE
+        self._most = BESIDE
         self._awaited: set[str] = set()
         self._at_will: dict[str, bool] = {}
         """Containers that were looked at a moment ago because of `_AT_WILL`, and whether there was more of it since."""
@@ -81,7 +81,8 @@ class Follower:
         """The same of those that were forgotten last."""
         self._failure: RuntimeFailure | None = None
         self._connected = False
-        self._looked = threading.Event()
+        self.looked = threading.Event()
+        """Set when the engine was looked at, or did not answer."""
         self._closing = threading.Event()
         self._stream: Any = None
         self._info: Mapping[str, Any] = {}
@@ -116,7 +117,7 @@ class Follower:
         return self._info
 
     def _must_answer(self, timeout_s: float) -> None:
-        if not self._looked.wait(timeout_s):
+        if not self.looked.wait(timeout_s):
             raise EngineGoneError("the Docker engine has not answered yet")
         failure = self._failure
         if failure is not None:
@@ -124,7 +125,7 @@ class Follower:
 
     def expect(self, instances: int) -> None:
         """So many instances are to be there; of containers that an engine makes up beyond, none costs a thread."""
-        before, self._most = self._most, 2 * instances + _BESIDE
+        before, self._most = self._most, 2 * instances + BESIDE
         if self._most > before:
             with self._lock:
                 run = [seen for seen in self._seen.values() if seen.runs]
@@ -230,7 +231,7 @@ class Follower:
         while not self._closing.is_set():
             begun = time.monotonic()
             try:
-                self._follow()
+                self.follow()
                 if time.monotonic() < begun + _SHORT_S:  # an engine that ends each stream at once
                     self._closing.wait(_SHORT_S)
             except RuntimeFailure as error:
@@ -244,11 +245,16 @@ class Follower:
 
     def _lost(self, error: RuntimeFailure) -> None:
         self._failure, self._connected = error, False
-        self._looked.set()
+        self.looked.set()
         self._engine.drop()
         self._closing.wait(_AGAIN_S)
 
-    def _follow(self) -> None:
+    def follow(self) -> None:
+        """List what is there; if that was known already, hear of changes until the engine ends its stream of events.
+
+        Raises:
+            RuntimeFailure: The engine does not answer, or what it answers is not understood.
+        """
         with self._engine.asked():
             api = self._engine.api()
             self._info = pull_machine(api.info())
@@ -258,7 +264,7 @@ class Follower:
             before, rows = self._list(api)
         self._take(before, rows, anew=not self._connected)
         self._failure = None
-        self._looked.set()
+        self.looked.set()
         if not self._connected:
             self._connected = True
             self._on_connect()

@@ -64,6 +64,17 @@ class Namespaces:
         self._failed_at = -_AGAIN_S
         self._closing = threading.Event()
 
+    @property
+    def ready(self) -> tuple[Namespace, ...]:
+        """Those that the next starts get."""
+        with self._lock:
+            return tuple(self._ready)
+
+    @property
+    def busy(self) -> bool:
+        """One is made, or something that nobody needs is there still."""
+        return (self._thread is not None and self._thread.is_alive()) or bool(self._left())
+
     @contextmanager
     def taken(self) -> Iterator[Namespace | None]:
         """One for a start, which nobody else gets; None: there is none. The start is over with the block."""

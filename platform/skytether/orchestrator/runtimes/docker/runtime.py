@@ -63,6 +63,15 @@ class DockerRuntime(Runtime):
 
     Starts go on in threads of their own; what is seen comes from the engine's events. So ``start``, ``observe`` and
     ``capacity`` wait for nothing but the first connection.
+
+    Attributes:
+        options: What the operator says of the site.
+        engine: How it is asked.
+        fence: Who leads.
+        follower: What is seen of it.
+        namespaces: Networks that are ready for the next starts.
+        scales: What volumes hold.
+        jobs: Starts, the last one of each instance.
     """
 
     Options = DockerOptions
@@ -85,13 +94,13 @@ class DockerRuntime(Runtime):
         if options.registry_auth is not None:
             check_credentials(options.registry_auth)
         self._site = site
-        self._options = options
+        self.options = options
         self._owner = options.owner or kept_owner(folder)
-        self._engine = Engine(options, folder)
-        self._fence = Fence(self._engine, self._owner)
-        self._scales = Scales(self._engine, self._owner, options.data_mb)
+        self.engine = Engine(options, folder)
+        self.fence = Fence(self.engine, self._owner)
+        self.scales = Scales(self.engine, self._owner, options.data_mb)
         self._lock = threading.Lock()
-        self._jobs: dict[str, Job] = {}
+        self.jobs: dict[str, Job] = {}
         self._asked: set[str] = set()
         """Containers that were asked to end."""
         self._network_lock = threading.Lock()
@@ -103,12 +112,12 @@ class DockerRuntime(Runtime):
         self._early: threading.Thread | None = None
         self._early_lock = threading.Lock()
         """Held while that is begun: what is not begun yet cannot be waited for."""
-        self._follower = Follower(self._engine, self._owner, self._on_connect, options.timeout_s)
-        self._namespaces = Namespaces(
-            self._engine, options, self._owner, self._follower, self._prepare, self._fence.must_lead
+        self.follower = Follower(self.engine, self._owner, self._on_connect, options.timeout_s)
+        self.namespaces = Namespaces(
+            self.engine, options, self._owner, self.follower, self._prepare, self.fence.must_lead
         )
-        self._reports = ReportReader(self._engine, self._running)
-        self._follower.start()
+        self._reports = ReportReader(self.engine, self._running)
+        self.follower.start()
 
     @override
     @classmethod
@@ -116,7 +125,7 @@ class DockerRuntime(Runtime):
         return with_owner(options)
 
     def _running(self) -> list[str]:
-        return [seen.id for seen in self._follower.seen(self._options.timeout_s) if seen.runs]
+        return [seen.id for seen in self.follower.seen(self.options.timeout_s) if seen.runs]
 
     def _on_connect(self) -> None:
         self._network_ready = False  # network and guard's image may have been removed meanwhile
@@ -125,20 +134,21 @@ class DockerRuntime(Runtime):
     def _begin_early(self) -> None:
         self._tried_at = time.monotonic()
         with self._early_lock:
-            self._early = threading.Thread(target=self._prepare_early, name="docker-network", daemon=True)
+            self._early = threading.Thread(target=self.prepare_early, name="docker-network", daemon=True)
             self._early.start()
 
     def _wait_early(self) -> None:
         with self._early_lock:
             early = self._early
         if early is not None:
-            early.join(self._options.timeout_s)
+            early.join(self.options.timeout_s)
 
-    def _prepare_early(self) -> None:
+    def prepare_early(self) -> None:
+        """Make the site ready before the first start, and remove what is of no use; what cannot be done is told."""
         with suppress(RuntimeFailure):  # each start tries again, and says it to who asked
             self._prepare()
         with suppress(RuntimeFailure):  # they only take room
-            remove_old_guards(self._engine)
+            remove_old_guards(self.engine)
 
     def _prepare(self, *, anew: bool = False) -> None:
         with self._network_lock:
@@ -146,7 +156,7 @@ class DockerRuntime(Runtime):
                 self._network_ready = False
                 try:
                     self._must_hold_limits()
-                    ensure_network(self._engine, self._options)
+                    ensure_network(self.engine, self.options)
                 except EngineGoneError:
                     raise
                 except RuntimeFailure as error:
@@ -157,11 +167,11 @@ class DockerRuntime(Runtime):
                 self._network_ready, self._blocked = True, ""
 
     def _must_hold_limits(self) -> None:
-        told = self._follower.info(self._options.timeout_s)
+        told = self.follower.info(self.options.timeout_s)
         # Podman says what the machine has, and ignores the limits where cgroups are of version 1 and it is not root.
         none = told.get("Rootless", False) and told.get("CgroupVersion") == "1"
         lacking = [what for key, what in _LIMITS.items() if none or not told.get(key, True)]
-        if lacking and not self._options.without_limits:
+        if lacking and not self.options.without_limits:
             raise RuntimeFailure(
                 f"the engine holds no limit of {' and '.join(lacking)}, so one service could starve all others: give it"
                 " cgroup 2 with these controllers (docs/docker.md), or the site the option without_limits"
@@ -174,17 +184,17 @@ class DockerRuntime(Runtime):
     @override
     def isolation(self) -> tuple[str, ...]:
         try:
-            told = self._follower.info(0).get("SecurityOptions") or ()
+            told = self.follower.info(0).get("SecurityOptions") or ()
         except RuntimeFailure:
             return ()
         names = {row.partition(",")[0].removeprefix("name=") for row in told}
         return (f"user {USER}", "no capabilities", *(word for name, word in _HOLDS.items() if name in names))
 
     def refuses(self, spec: ServiceSpec) -> str | None:
-        return refusal(spec, self._options)
+        return refusal(spec, self.options)
 
     def capacity(self) -> Capacity:
-        info, options = self._follower.info(self._options.timeout_s), self._options
+        info, options = self.follower.info(self.options.timeout_s), self.options
         cpu = options.cpu or float(info["NCPU"])
         machine = str(info.get("Architecture", ""))
         memory = options.memory_mb or int(info["MemTotal"]) >> 20
@@ -192,15 +202,15 @@ class DockerRuntime(Runtime):
 
     @override
     def lead(self, epoch: int) -> None:
-        self._fence.lead(epoch)
-        self._follower.catch_up(self._options.timeout_s)  # after that: what the leader before has begun is in it
+        self.fence.lead(epoch)
+        self.follower.catch_up(self.options.timeout_s)  # after that: what the leader before has begun is in it
         with self._lock:
             # What came of starts for an earlier leader is seen; those that are under way are refused where they are.
-            self._jobs = {instance: job for instance, job in self._jobs.items() if not job.ended}
+            self.jobs = {instance: job for instance, job in self.jobs.items() if not job.ended}
 
     def _must_lead(self) -> None:
         with self._doubting():
-            self._fence.must_lead()
+            self.fence.must_lead()
 
     @contextmanager
     def _doubting(self) -> Iterator[None]:
@@ -208,17 +218,17 @@ class DockerRuntime(Runtime):
         try:
             yield
         except EngineGoneError as error:
-            self._follower.doubt(error)
+            self.follower.doubt(error)
             raise
 
     def start(self, launch: Launch) -> None:
-        self._follower.seen(self._options.timeout_s)  # or it could not be known whether it runs
+        self.follower.seen(self.options.timeout_s)  # or it could not be known whether it runs
         self._must_lead()
-        full = self._scales.exceeds(data_volume(self._owner, launch))
+        full = self.scales.exceeds(data_volume(self._owner, launch))
         if full:
             raise RuntimeFailure(full)
         with self._lock:
-            job, newest = self._jobs.get(launch.instance), self._newest(launch.instance)
+            job, newest = self.jobs.get(launch.instance), self._newest(launch.instance)
             if newest is not None and newest.runs and newest.attempt > launch.attempt:
                 raise OvertakenError(later_runs(newest))
             there = newest is not None and newest.attempt == launch.attempt
@@ -229,13 +239,13 @@ class DockerRuntime(Runtime):
                 newest is not None and there and newest.status != "created" and not (job and newest.id in job.given_up)
             ):
                 return
-            site = self._engine, self._options, self._owner, self._follower
-            job = Job(launch, *site, self._prepare, self._namespaces, self._fence, job)
-            self._jobs[launch.instance] = job
+            site = self.engine, self.options, self._owner, self.follower
+            job = Job(launch, *site, self._prepare, self.namespaces, self.fence, job)
+            self.jobs[launch.instance] = job
             job.start()
 
     def _newest(self, instance: str) -> Seen | None:
-        seen = self._follower.of(instance)
+        seen = self.follower.of(instance)
         return seen[-1] if seen else None
 
     @override
@@ -244,48 +254,48 @@ class DockerRuntime(Runtime):
 
     @override
     def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
-        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
+        cores = float(self.follower.info(self.options.timeout_s)["NCPU"])
         seen, wanted = self._newest(instance), limits_of(spec, cores)
         if seen is None or not seen.runs or seen.attempt != attempt:
             return False
         if seen.limits == wanted:
             return True
-        used = self._follower.meter.usage(seen.id)
+        used = self.follower.meter.usage(seen.id)
         if used is not None and wanted.memory < min(seen.limits.memory, least_memory_mb(used.memory_bytes) << 20):
             raise RuntimeFailure(f"it uses {used.memory_bytes >> 20} MiB, and so much would be taken from it")
         self._must_lead()  # a change by an earlier leader that comes late is seen, and made good
-        with self._doubting(), self._engine.asked():
-            api: Any = self._engine.api()  # a `Client`
+        with self._doubting(), self.engine.asked():
+            api: Any = self.engine.api()  # a `Client`
             api.change(seen.id, wanted.document())
-            after = self._follower.look(seen.id)
+            after = self.follower.look(seen.id)
         return after is not None and after.limits == wanted
 
     @override
     def expect(self, instances: int) -> None:
-        self._follower.expect(instances)
+        self.follower.expect(instances)
 
     def observe(self) -> Mapping[str, Observation]:
         with self._lock:
-            jobs = dict(self._jobs)
+            jobs = dict(self.jobs)
         begun = {
             instance for instance, job in jobs.items() if job.ended
         }  # before the look, which shows what came of it
         newest: dict[str, Seen] = {}
-        for seen in self._follower.seen(self._options.timeout_s):
+        for seen in self.follower.seen(self.options.timeout_s):
             # What a start has given up is no run, however it looks: an engine that answers late still ends it.
             if seen.instance in jobs and seen.id in jobs[seen.instance].given_up:
                 continue
             if seen.instance not in newest or newest[seen.instance].attempt < seen.attempt:
                 newest[seen.instance] = seen
         # One that was made and not begun is no run: the orchestrator was killed in between, or a job is just at it.
-        meter = self._follower.meter
-        helpers = self._follower.helpers()
+        meter = self.follower.meter
+        helpers = self.follower.helpers()
         found = {
             instance: observation(
                 seen,
-                self._options,
+                self.options,
                 meter.usage(seen.id),
-                self._scales.exceeds(seen.volume, seen.other_volumes),
+                self.scales.exceeds(seen.volume, seen.other_volumes),
                 cut_off=bool(seen.namespace) and not (seen.namespace in helpers and helpers[seen.namespace].runs),
                 reports=self._reports.of(seen.id),
                 step_s=self._reports.step_s(seen.id),
@@ -310,42 +320,42 @@ class DockerRuntime(Runtime):
 
     def stop(self, instance: str, *, force: bool) -> None:
         with self._lock:
-            job = self._jobs.get(instance)
+            job = self.jobs.get(instance)
         newest = self._newest(instance)
         if job is not None and not job.ended and (newest is None or newest.attempt < job.attempt or not newest.runs):
             job.cancel()
         for seen in self._to_be_ended(instance):
             if not seen.runs or (not force and seen.id in self._asked):
                 continue
-            kill(self._engine, seen.id, "KILL" if force else "TERM")
+            kill(self.engine, seen.id, "KILL" if force else "TERM")
             if not force:
                 self._asked.add(seen.id)  # once only: services may take a second signal for impatience
 
     def remove(self, instance: str) -> None:
         with self._lock:
-            job = self._jobs.pop(instance, None)
+            job = self.jobs.pop(instance, None)
         if job is not None:
             job.cancel()
-            job.join(self._options.timeout_s)
+            job.join(self.options.timeout_s)
         for seen in self._to_be_ended(instance):
-            remove(self._engine, self._follower, seen.id)
+            remove(self.engine, self.follower, seen.id)
             self._asked.discard(seen.id)
 
     def _to_be_ended(self, instance: str) -> list[Seen]:
         """All its containers, none of which a later leader has begun."""
-        self._follower.seen(self._options.timeout_s)  # or it could not be known what is there
-        there = self._follower.of(instance)
+        self.follower.seen(self.options.timeout_s)  # or it could not be known what is there
+        there = self.follower.of(instance)
         self._must_lead()  # after the look
         return there
 
     def logs(self, instance: str, lines: int) -> str:
-        self._follower.seen(self._options.timeout_s)  # who asks an engine that is away need not wait for it
+        self.follower.seen(self.options.timeout_s)  # who asks an engine that is away need not wait for it
         texts: list[str] = []
         left = lines
-        for seen in reversed(self._follower.of(instance)):
-            with self._engine.asked():
+        for seen in reversed(self.follower.of(instance)):
+            with self.engine.asked():
                 try:
-                    text = self._engine.api().logs(seen.id, tail=left).decode(errors="replace")
+                    text = self.engine.api().logs(seen.id, tail=left).decode(errors="replace")
                 except NotFound:
                     continue
             texts.append(text)
@@ -356,44 +366,44 @@ class DockerRuntime(Runtime):
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
-        self._follower.seen(self._options.timeout_s)
+        self.follower.seen(self.options.timeout_s)
         newest = self._newest(instance)
-        return ContainerLog(self._engine, newest.id, lines) if newest is not None and newest.runs else None
+        return ContainerLog(self.engine, newest.id, lines) if newest is not None and newest.runs else None
 
     @override
     def stored(self) -> Mapping[str, int]:
-        return self._scales.by_robot
+        return self.scales.by_robot
 
     @override
     def tidy(self) -> None:
         """Remove what was begun by halves, and see whether what the network lacked is there by now."""
-        if self._fence.epoch:
+        if self.fence.epoch:
             with self._doubting():
-                self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
-        self._remove_unbegun()
+                self.fence.lead(self.fence.epoch)  # anew, should somebody have removed what tells of it
+        self.remove_unbegun()
         if time.monotonic() - self._swept_at >= _SWEEP_S:
             self._swept_at = time.monotonic()
-            remove_left(self._engine, self._owner)
-        self._scales.begin()
+            remove_left(self.engine, self._owner)
+        self.scales.begin()
         self._reports.begin()
         with self._lock:
-            starting = any(not job.ended for job in self._jobs.values())
-        starting |= any(seen.runs and not seen.ready for seen in self._follower.seen(self._options.timeout_s))
-        self._namespaces.begin(resting=not starting and not self._blocked)
+            starting = any(not job.ended for job in self.jobs.values())
+        starting |= any(seen.runs and not seen.ready for seen in self.follower.seen(self.options.timeout_s))
+        self.namespaces.begin(resting=not starting and not self._blocked)
         trying = self._early is not None and self._early.is_alive()
         if self._blocked and not trying and time.monotonic() - self._tried_at >= _AGAIN_S:
             self._begin_early()
 
-    def _remove_unbegun(self) -> None:
+    def remove_unbegun(self) -> None:
         """What was made and never begun, or given up: an orchestrator was killed, or an engine answered too late.
 
         And end what a leader that was followed has begun beside a later run. Nobody else is told of these, so nobody
         else asks for their end.
         """
         with self._lock:
-            busy = {instance for instance, job in self._jobs.items() if not job.ended}
-            given_up = {container for job in self._jobs.values() if job.ended for container in job.given_up}
-        there = self._follower.seen(self._options.timeout_s)
+            busy = {instance for instance, job in self.jobs.items() if not job.ended}
+            given_up = {container for job in self.jobs.values() if job.ended for container in job.given_up}
+        there = self.follower.seen(self.options.timeout_s)
         latest: dict[str, int] = {}
         for seen in there:
             if seen.runs:
@@ -403,33 +413,33 @@ class DockerRuntime(Runtime):
         if unbegun or doubled:
             self._must_lead()  # after the look: nothing of it was made by a later leader
         for seen in unbegun:
-            remove(self._engine, self._follower, seen.id)
+            remove(self.engine, self.follower, seen.id)
         for seen in doubled:
-            kill(self._engine, seen.id, "KILL")
+            kill(self.engine, seen.id, "KILL")
 
     @override
     def dismantle(self) -> None:
         self._wait_early()  # or it makes the network again
-        self._remove_unbegun()
-        self._namespaces.clear()
-        remove_left(self._engine, self._owner)
-        self._fence.clear()
-        remove_network(self._engine, self._options)
+        self.remove_unbegun()
+        self.namespaces.clear()
+        remove_left(self.engine, self._owner)
+        self.fence.clear()
+        remove_network(self.engine, self.options)
 
     @override
     def erase(self) -> None:
-        remove_left(self._engine, self._owner, data=True)
+        remove_left(self.engine, self._owner, data=True)
 
     @override
     def close(self) -> None:
         with self._lock:
-            jobs = [job for job in self._jobs.values() if not job.ended]
+            jobs = [job for job in self.jobs.values() if not job.ended]
         for job in jobs:
             job.leave()
-        deadline = time.monotonic() + min(_LEAVE_S, self._options.timeout_s)
+        deadline = time.monotonic() + min(_LEAVE_S, self.options.timeout_s)
         for job in jobs:
             job.join(max(0.0, deadline - time.monotonic()))  # what it has begun is closed off, and seen in its network
-        self._namespaces.close()
-        self._follower.close()
+        self.namespaces.close()
+        self.follower.close()
         self._wait_early()  # or it leaves its container behind
-        self._engine.drop()
+        self.engine.drop()

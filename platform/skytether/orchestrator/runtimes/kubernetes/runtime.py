@@ -81,17 +81,17 @@ class KubernetesRuntime(Runtime):
         if not isinstance(options, KubernetesOptions):
             raise TypeError("options must be KubernetesOptions")
         self._site = site
-        self._options = options
+        self.options = options
         self._owner = options.owner or kept_owner(folder)
-        self._cluster = Cluster(options)
-        self._fence = Fence(self._cluster, self._owner)
-        self._watch = Watch(self._cluster, f"{OWNER}={self._owner}")
-        self._nodes = Nodes(self._cluster)
-        self._budget = Budget(self._cluster, self._owner)
-        self._services = Services(self._cluster, options, self._owner, self._must_lead)
-        self._reports = ReportReader(self._cluster, self._ready)
-        self._meter = Meter(self._cluster, self._owner, self._reports.usage)
-        self._health = Health(self._cluster, self._watch.changed.set)
+        self.cluster = Cluster(options)
+        self._fence = Fence(self.cluster, self._owner)
+        self._watch = Watch(self.cluster, f"{OWNER}={self._owner}")
+        self._nodes = Nodes(self.cluster)
+        self._budget = Budget(self.cluster, self._owner)
+        self._services = Services(self.cluster, options, self._owner, self._must_lead)
+        self._reports = ReportReader(self.cluster, self._ready)
+        self._meter = Meter(self.cluster, self._owner, self._reports.usage)
+        self._health = Health(self.cluster, self._watch.changed.set)
         self._lock = threading.Lock()
         self._unrun: dict[str, Observation] = {}
         """Of instances whose pod no node has taken when it was removed: nothing of it is left to be seen."""
@@ -130,15 +130,15 @@ class KubernetesRuntime(Runtime):
         return (f"user {USER}", "no capabilities", "seccomp", "network policy")
 
     def refuses(self, spec: ServiceSpec) -> str | None:
-        return refusal(spec, self._options)
+        return refusal(spec, self.options)
 
     def capacity(self) -> Capacity:
-        self._watch.seen(self._options.timeout_s)
+        self._watch.seen(self.options.timeout_s)
         if not self._new_enough:
-            self._cluster.check_version()
+            self.cluster.check_version()
             self._new_enough = True
         self._find_out()
-        total, self._closed = self._nodes.offered(self._options)
+        total, self._closed = self._nodes.offered(self.options)
         return total
 
     def _find_out(self) -> None:
@@ -146,7 +146,7 @@ class KubernetesRuntime(Runtime):
         if self._found_out_at is not None and time.monotonic() - self._found_out_at < _FIND_OUT_S:
             return
         try:
-            self._resizes = self._cluster.offers(SUBRESOURCE)
+            self._resizes = self.cluster.offers(SUBRESOURCE)
         except RefusedError as error:
             log.info("site %s: what the API server offers is not told: %s", self._site, error)
         self._found_out_at = time.monotonic()
@@ -157,7 +157,7 @@ class KubernetesRuntime(Runtime):
 
     @override
     def resize(self, instance: str, attempt: int, spec: ServiceSpec) -> bool:
-        there = self._watch.of(instance, self._options.timeout_s)
+        there = self._watch.of(instance, self.options.timeout_s)
         seen = there[-1] if there else None
         if seen is None or seen.attempt != attempt or not seen.running or self._over(seen):
             return False
@@ -175,9 +175,9 @@ class KubernetesRuntime(Runtime):
         if used is not None and wanted.memory_limit < min(has.memory_limit, least_memory_mb(used)):
             raise RuntimeFailure(f"it uses {used >> 20} MiB, and so much would be taken from it")
         self._must_lead()  # a change by an earlier leader that comes late is seen, and made good
-        path = self._cluster.path("pods", f"{seen.name}/resize")
+        path = self.cluster.path("pods", f"{seen.name}/resize")
         with self._doubting():
-            self._watch.take(self._cluster.merge_lists(path, patch(seen.uid, wanted)))
+            self._watch.take(self.cluster.merge_lists(path, patch(seen.uid, wanted)))
         return False  # until its node says so
 
     @override
@@ -200,7 +200,7 @@ class KubernetesRuntime(Runtime):
             raise
 
     def start(self, launch: Launch) -> None:
-        there = self._watch.of(launch.instance, self._options.timeout_s)
+        there = self._watch.of(launch.instance, self.options.timeout_s)
         self._must_lead()
         newest = there[-1] if there else None
         if newest is not None and newest.attempt > launch.attempt and not self._over(newest):
@@ -227,18 +227,18 @@ class KubernetesRuntime(Runtime):
     def _create(self, launch: Launch, preferred: int | None) -> None:
         """Have the pod made, and begun unless somebody else leads by now; ``preferred``: the UDP port."""
         openings = resolve(launch.spec.needs.openings)
-        port = self._port(launch.instance, preferred) if self._options.reach == "hostport" else None
+        port = self._port(launch.instance, preferred) if self.options.reach == "hostport" else None
         node_port = self._services.make(launch.instance)
-        if self._options.keep_data:
+        if self.options.keep_data:
             self._hold_claim(launch)
-        asked = launch, self._options, self._owner, port, openings
+        asked = launch, self.options, self._owner, port, openings
         body = pod(*asked, node_port=node_port, epoch=self._fence.epoch)
         try:
-            made = self._cluster.create(self._cluster.path("pods"), body)
+            made = self.cluster.create(self.cluster.path("pods"), body)
         except RefusedError as error:
             if error.reason == "AlreadyExists":
                 self._watch.catch_up()
-                there = self._watch.of(launch.instance, self._options.timeout_s)
+                there = self._watch.of(launch.instance, self.options.timeout_s)
                 if not any(seen.attempt == launch.attempt for seen in there):
                     raise SiteSilentError("a pod of this run was removed, and is not gone yet") from error
                 return  # another orchestrator has begun this very run
@@ -258,15 +258,15 @@ class KubernetesRuntime(Runtime):
 
     def _hold_claim(self, launch: Launch) -> None:
         """Have what keeps the data of a service, as it was made before or anew."""
-        body = claim(launch, self._options, self._owner)
+        body = claim(launch, self.options, self._owner)
         try:
-            made = self._cluster.create(self._cluster.path("persistentvolumeclaims"), body)
+            made = self.cluster.create(self.cluster.path("persistentvolumeclaims"), body)
         except RefusedError as error:
             if error.reason == "AlreadyExists":
                 return
             raise RuntimeFailure(f"the cluster refuses it: {error}") from error
         if not made["spec"].get("storageClassName"):
-            self._cluster.delete(self._cluster.path("persistentvolumeclaims", body["metadata"]["name"]))
+            self.cluster.delete(self.cluster.path("persistentvolumeclaims", body["metadata"]["name"]))
             raise RuntimeFailure(
                 "data is to be kept (option 'keep_data'), and the cluster has no default StorageClass: name one in the "
                 "site's option 'storage_class'"
@@ -275,16 +275,16 @@ class KubernetesRuntime(Runtime):
     def _put(self, kind: str, body: dict[str, Any], group: str = "") -> None:
         """Create what belongs to a pod, in the place of what an earlier pod of its name has left."""
         try:
-            self._cluster.create(self._cluster.path(kind, group=group), body)
+            self.cluster.create(self.cluster.path(kind, group=group), body)
         except RefusedError as error:
             if error.reason != "AlreadyExists":
                 raise
-            self._cluster.delete(self._cluster.path(kind, body["metadata"]["name"], group=group))
-            self._cluster.create(self._cluster.path(kind, group=group), body)
+            self.cluster.delete(self.cluster.path(kind, body["metadata"]["name"], group=group))
+            self.cluster.create(self.cluster.path(kind, group=group), body)
 
     def _port(self, instance: str, preferred: int | None) -> int:
-        ports = self._options.ports
-        there = self._watch.seen(self._options.timeout_s)
+        ports = self.options.ports
+        there = self._watch.seen(self.options.timeout_s)
         # Its own of the run before is free: that run is ended.
         taken = {seen.host_port for seen in there if not self._over(seen) and seen.instance != instance} | self._refused
         if preferred is None or not ports[0] <= preferred <= ports[1]:
@@ -315,9 +315,9 @@ class KubernetesRuntime(Runtime):
     def _hold_policy(self) -> None:
         """Have the NetworkPolicy of all pods, as it is to be, whoever has changed or removed it."""
         body = site_policy(self._owner)
-        path = self._cluster.path("networkpolicies", body["metadata"]["name"], group=_NETWORKING)
+        path = self.cluster.path("networkpolicies", body["metadata"]["name"], group=_NETWORKING)
         try:
-            self._cluster.apply(path, body)
+            self.cluster.apply(path, body)
         except RefusedError as error:
             self._blocked = str(error)
             raise
@@ -327,11 +327,11 @@ class KubernetesRuntime(Runtime):
     def observe(self) -> Mapping[str, Observation]:
         with self._lock:
             unrun = dict(self._unrun)
-        return self._observed(self._watch.seen(self._options.timeout_s), unrun)
+        return self._observed(self._watch.seen(self.options.timeout_s), unrun)
 
     @override
     def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
-        there = [seen for instance in instances for seen in self._watch.of(instance, self._options.timeout_s)]
+        there = [seen for instance in instances for seen in self._watch.of(instance, self.options.timeout_s)]
         with self._lock:
             unrun = {instance: self._unrun[instance] for instance in instances if instance in self._unrun}
         return self._observed(there, unrun)
@@ -347,7 +347,7 @@ class KubernetesRuntime(Runtime):
         found = {
             instance: observation(
                 seen,
-                self._options,
+                self.options,
                 self._nodes.address(seen.node),
                 self._reports.of(seen.name),
                 self._meter.of(seen),
@@ -369,7 +369,7 @@ class KubernetesRuntime(Runtime):
         return self._watch.over(seen)
 
     def stop(self, instance: str, *, force: bool) -> None:
-        there = self._watch.of(instance, self._options.timeout_s)
+        there = self._watch.of(instance, self.options.timeout_s)
         left = [seen for seen in there if not self._over(seen) and not (seen.stops and (seen.running or not force))]
         if not left:
             return  # it is asked again and again until all has ended: the API server is not
@@ -391,7 +391,7 @@ class KubernetesRuntime(Runtime):
         notes = {"annotations": {FAILURE: failure}} if failure else {}
         body = {"metadata": {"uid": seen.uid, **notes}, "spec": {"activeDeadlineSeconds": 1}}
         try:
-            self._watch.take(self._cluster.merge(self._cluster.path("pods", seen.name), body))
+            self._watch.take(self.cluster.merge(self.cluster.path("pods", seen.name), body))
         except RefusedError as error:
             if error.status not in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT):
                 raise
@@ -401,20 +401,18 @@ class KubernetesRuntime(Runtime):
         if (
             not seen.node
         ):  # gone at once; the cluster collects its Secret later, by which another pod of its name begins
-            self._cluster.delete(self._cluster.path("secrets", seen.name))
+            self.cluster.delete(self.cluster.path("secrets", seen.name))
         self._watch.forget(seen)
 
     def _remove_pod(self, name: str, uid: str, *, grace_s: int) -> None:
         try:
-            self._cluster.delete(
-                self._cluster.path("pods", name), gracePeriodSeconds=grace_s, preconditions={"uid": uid}
-            )
+            self.cluster.delete(self.cluster.path("pods", name), gracePeriodSeconds=grace_s, preconditions={"uid": uid})
         except RefusedError as error:
             if error.status != HTTPStatus.CONFLICT:  # another one has its name by now
                 raise
 
     def remove(self, instance: str) -> None:
-        there = self._watch.of(instance, self._options.timeout_s)
+        there = self._watch.of(instance, self.options.timeout_s)
         self._must_lead()
         for seen in there:
             self._delete(seen)
@@ -425,10 +423,10 @@ class KubernetesRuntime(Runtime):
     def logs(self, instance: str, lines: int) -> str:
         texts: list[str] = []
         left = lines
-        for seen in reversed(self._watch.of(instance, self._options.timeout_s)):
-            path = self._cluster.path("pods", f"{seen.name}/log")
+        for seen in reversed(self._watch.of(instance, self.options.timeout_s)):
+            path = self.cluster.path("pods", f"{seen.name}/log")
             try:
-                text = self._cluster.text(path, tailLines=left, limitBytes=4 << 20)
+                text = self.cluster.text(path, tailLines=left, limitBytes=4 << 20)
             except RefusedError as error:
                 if error.status not in (HTTPStatus.NOT_FOUND, HTTPStatus.BAD_REQUEST):
                     raise
@@ -441,8 +439,8 @@ class KubernetesRuntime(Runtime):
 
     @override
     def follow(self, instance: str, lines: int) -> LogStream | None:
-        there = self._watch.of(instance, self._options.timeout_s)
-        return PodLog(self._cluster, there[-1].name, lines) if there and there[-1].running else None
+        there = self._watch.of(instance, self.options.timeout_s)
+        return PodLog(self.cluster, there[-1].name, lines) if there and there[-1].running else None
 
     @override
     def tidy(self) -> None:
@@ -450,7 +448,7 @@ class KubernetesRuntime(Runtime):
         if self._fence.epoch:
             with self._doubting():
                 self._fence.lead(self._fence.epoch)  # anew, should somebody have removed what tells of it
-        there = self._watch.seen(self._options.timeout_s)
+        there = self._watch.seen(self.options.timeout_s)
         latest: dict[str, int] = {}
         for seen in there:
             if not self._over(seen):
@@ -479,23 +477,23 @@ class KubernetesRuntime(Runtime):
         for instance in self._services.look(all_, ready, all_ - live):
             self._must_lead()
             self._delete(ready[instance])
-            within = f"{self._options.load_balancer_timeout_s:g} s"
+            within = f"{self.options.load_balancer_timeout_s:g} s"
             why = f"the cluster's load balancer has given its Service no address within {within} (option 'reach')"
             self._leave(ready[instance], f"could not be started: {why}", unstarted=True)
 
     def _remove_unbegun(self) -> None:
         """Pods that have no Secret: who made them was killed, had no answer, or does not lead any more."""
-        for seen in self._watch.seen(self._options.timeout_s):
+        for seen in self._watch.seen(self.options.timeout_s):
             if not (self._over(seen) or seen.running or self._is_begun(seen)):
                 self._must_lead()
                 self._delete(seen)
-        self._begun &= {seen.uid for seen in self._watch.seen(self._options.timeout_s)}
+        self._begun &= {seen.uid for seen in self._watch.seen(self.options.timeout_s)}
 
     def _is_begun(self, seen: Seen) -> bool:
         if seen.uid in self._begun:
             return True
         try:
-            there = self._cluster.get(self._cluster.path("secrets", seen.name))
+            there = self.cluster.get(self.cluster.path("secrets", seen.name))
         except RefusedError as error:
             if error.status == HTTPStatus.NOT_FOUND:
                 return False
@@ -507,11 +505,11 @@ class KubernetesRuntime(Runtime):
 
     @override
     def dismantle(self) -> None:
-        for seen in self._watch.seen(self._options.timeout_s):
+        for seen in self._watch.seen(self.options.timeout_s):
             self._delete(seen)
         self._services.clear()
-        for one in self._cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=_NETWORKING):
-            self._cluster.delete(self._cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
+        for one in self.cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=_NETWORKING):
+            self.cluster.delete(self.cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
         self._budget.remove()
         self._fence.clear()
 
@@ -521,4 +519,4 @@ class KubernetesRuntime(Runtime):
         self._reports.close()
         self._watch.close()
         self._nodes.close()
-        self._cluster.close()
+        self.cluster.close()
