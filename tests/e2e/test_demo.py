@@ -54,8 +54,9 @@ def test_demo_prints_one_json_object_and_leaves_nothing_behind(tmp_path):
     assert 295 < document["rtt_ms"] < 350
     assert set(document["topics"]) == {"force", "wheels", "odom", "cmd_vel"}
     for topic in document["topics"].values():
-        assert set(topic) == {"sent", "delivered", "lost", "delay_p50_ms", "delay_p99_ms", "jitter_ms"}
-        assert topic["delivered"] + topic["lost"] <= topic["sent"]
+        ended = {"delivered", "superseded", "lost", "unsettled"}
+        assert set(topic) == {"refused", "dropped", "sent", "delay_p50_ms", "delay_p99_ms", "jitter_ms", *ended}
+        assert sum(topic[name] for name in ended) == topic["sent"]
         assert topic["delivered"] > 0.97 * topic["sent"]
         assert 145 < topic["delay_p50_ms"] < 200
     assert Path(document["plot"]).read_bytes().startswith(b"\x89PNG")

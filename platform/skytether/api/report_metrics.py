@@ -8,7 +8,10 @@ from typing import NamedTuple
 from .exposition import Family, Sample, Sums, counter, gauge
 from .rest import GateReport, Report
 
-OUTCOMES = ("sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded", "duplicate")
+OUTCOMES = (
+    "refused", "offered", "sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded",
+    "duplicate",
+)  # fmt: skip
 SOURCES = ("cloud", "fallback", "stop")
 INSTANCE = ("robot", "service", "site")
 _TOPIC = ("topic", "priority", "direction")

@@ -116,6 +116,7 @@ class Bridge:
         """Whether the bridge's thread is going to look at the handover."""
         self._looked_at = -math.inf
         self._overrun: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._last_stats = SessionStats(connected=False)
         self._thread: threading.Thread | None = None
@@ -174,16 +175,19 @@ class Bridge:
                 f"topic '{topic}': {size} bytes are more than a message may have, {self._config.max_message}"
             )
         if self._thread is None:
-            return False
+            return self._refuse(topic)
         agreed = self._driver.agreed
         row = agreed.get(topic) or self._sends[topic]
         if topic not in agreed and (agreed or not row.reliable):
-            return False
+            return self._refuse(topic)
         # The caller may use its buffer again, so anything but bytes is copied; it compresses in its own time.
         payload = bytes(payload)
         if row.compression:
             payload = compress(payload)
         with self._lock:
+            if self._stopping:
+                self._refused[topic] += 1
+                return False
             self._handover.append((topic, payload, time.monotonic()))
             self._handover_bytes += len(payload) + _ENTRY_BYTES
             while self._handover_bytes > self._config.queue_limit and len(self._handover) > 1:
@@ -258,10 +262,13 @@ class Bridge:
 
     def stats(self) -> SessionStats:
         """A snapshot; after `stop` the last one."""
+        return self._with_unseen(self._session_stats())
+
+    def _session_stats(self) -> SessionStats:
         if threading.current_thread() is self._thread:
-            return self._take_stats()
+            return self._driver.stats()
         answer: concurrent.futures.Future[SessionStats] = concurrent.futures.Future()
-        if self._soon(lambda: answer.set_result(self._take_stats())):
+        if self._soon(lambda: answer.set_result(self._driver.stats())):
             try:
                 return answer.result(_STATS_TIMEOUT)
             except concurrent.futures.TimeoutError:
@@ -324,27 +331,37 @@ class Bridge:
             self._driver.publish(messages)
 
     def _on_stop(self) -> None:
+        self._on_handover()  # what was taken is sent, or counted
         self._driver.close()
-        self._last_stats = self._take_stats()
+        self._last_stats = self._driver.stats()
         self._loop.stop()
-
-    def _take_stats(self) -> SessionStats:
-        stats = self._driver.stats()
-        if not self._overrun:
-            return stats
-        # Dropped before the session saw them: offered and replaced all the same.
-        topics = tuple(
-            replace(t, offered=t.offered + dropped, replaced=t.replaced + dropped)
-            if t.topic in self._sends and (dropped := self._overrun[t.topic])
-            else t
-            for t in stats.topics
-        )
-        return replace(stats, topics=topics)
 
     def _look(self) -> dict[Network, LocalPath]:
         return select(self._wanted, addresses(self._socket.family))
 
     # --- helpers ---------------------------------------------------------------------------------------------------
+
+    def _refuse(self, topic: str) -> bool:
+        with self._lock:
+            self._refused[topic] += 1
+        return False
+
+    def _with_unseen(self, stats: SessionStats) -> SessionStats:
+        """With messages that the session never saw: refused, or too many (those count as offered and replaced)."""
+        with self._lock:
+            refused, dropped = self._refused.copy(), self._overrun.copy()
+        topics = tuple(
+            replace(
+                t,
+                refused=t.refused + refused[t.topic],
+                offered=t.offered + dropped[t.topic],
+                replaced=t.replaced + dropped[t.topic],
+            )
+            if t.topic in refused or t.topic in dropped
+            else t
+            for t in stats.topics
+        )
+        return replace(stats, topics=topics)
 
     def _soon(self, callback: Callable[[], None]) -> bool:
         """Have something done in the bridge's thread; False if that has ended or was never started."""

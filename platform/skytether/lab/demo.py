@@ -124,9 +124,13 @@ class DemoResult:
             "fallback_s": _round(self.fallback_s),
             "topics": {
                 topic.topic: {
+                    "refused": topic.refused,
+                    "dropped": topic.dropped,
                     "sent": topic.sent,
                     "delivered": topic.delivered,
+                    "superseded": topic.superseded,
                     "lost": topic.lost,
+                    "unsettled": topic.unsettled,
                     "delay_p50_ms": _round(topic.delay_p50 * 1000),
                     "delay_p99_ms": _round(topic.delay_p99 * 1000),
                     "jitter_ms": _round(topic.jitter * 1000),

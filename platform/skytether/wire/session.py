@@ -136,6 +136,7 @@ class Session:
             ours = self._table.get(topic)
             if ours is None or ours.direction.sender is not self.role:
                 raise KeyError(f"topic '{topic}' is not one that this end ({self.role}) sends")
+            self._counters.refuse(topic)
             return False
         if not isinstance(payload, bytes):
             payload = bytes(payload)

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 class TopicStats:
     """One topic in one direction. Counters count messages since the session object was made, over all its peers.
 
+    They add up: ``published == refused + offered``, ``offered == sent + dropped``,
+    ``sent == delivered + superseded + lost + unsettled``.
+
     Sender's counters are exact at the sender and as of its last report at the receiver, and the other
     way round; times are in seconds, NaN where nothing was measured yet.
     """
@@ -16,6 +19,9 @@ class TopicStats:
     topic: str
     direction: str
     priority: int
+    refused: int = 0
+    """Handed to ``publish``, which returned False, for there was no session, or the peer has no such topic. Known at
+    the sender only."""
     offered: int = 0
     """Handed to ``publish`` while connected; on reliable topics at any time."""
     sent: int = 0
@@ -60,6 +66,21 @@ class TopicStats:
     period_p50: float = float("nan")
     """Time between arrivals."""
     period_p99: float = float("nan")
+
+    @property
+    def published(self) -> int:
+        """Handed to ``publish``, whatever became of it."""
+        return self.refused + self.offered
+
+    @property
+    def dropped(self) -> int:
+        """Taken, and not sent: too old, too many (`expired`, `replaced`), or waiting now."""
+        return max(0, self.offered - self.sent)
+
+    @property
+    def unsettled(self) -> int:
+        """Sent, and nobody told what became of it: under way, or `unknown`."""
+        return max(0, self.sent - self.delivered - self.superseded - self.lost)
 
 
 @dataclass(frozen=True, slots=True)

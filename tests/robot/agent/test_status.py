@@ -15,6 +15,7 @@ from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.status import StatusServer, document, metrics
 from skytether.robot.offload.site_prober import TaskConfig
 from skytether.robot.offload.task_manager import Option
+from skytether.ros.followed import Followed
 from skytether.wire.stats import PathStats, SessionStats, TopicStats
 
 CONFIG = AgentConfig(
@@ -53,6 +54,30 @@ def test_the_document_says_everything_in_plain_numbers(busy):
     assert found["link"]["paths"][0]["mtu"] == 1400
     assert found["transitions"] == [{"ago_s": 10.0, "source": "fallback", "reason": "start"}]
     assert "secret" not in json.dumps(found)
+
+
+def test_topics_stand_beside_what_became_of_their_messages(busy, monkeypatch):
+    scan = TopicStats("scan", "in", 5, refused=3, offered=10, sent=8, delivered=5, superseded=1, lost=1)
+    seen = (
+        Followed("scan", "/scan", "sensor_msgs/msg/LaserScan", "from", ("/laser",), True, "best effort"),
+        Followed("map", "/map", "nav_msgs/msg/OccupancyGrid", "from"),
+        Followed("goal", "/goal", "x", "to", refused="another type hash"),
+    )
+    status = replace(busy.status(), session=SessionStats(True, (scan,)), topics=seen, rates={("scan", "in"): 39.96})
+    (first, *rest) = document("walker", "guide", status, 60.0)["topics"]
+    counts = first["messages"]
+    assert counts["published"] == counts["refused"] + counts["dropped"] + counts["sent"] == 13
+    assert counts["sent"] == sum(counts[n] for n in ("delivered", "superseded", "lost", "unsettled"))
+    assert (first["hz"], first["graph"]["nodes"], first["graph"]["quality"]) == (40.0, ["/laser"], "best effort")
+    assert [(t["topic"], t["messages"]) for t in rest] == [("map", None), ("goal", None)]
+    monkeypatch.setattr(type(busy), "status", lambda _: status)
+    busy._serve()
+    shown = CliRunner().invoke(app, ["robot", "status", "--port", str(busy.status_port)], env={"COLUMNS": "200"})
+    busy.close()
+    assert "/scan from /laser (best effort)" in shown.output
+    assert "/map: nobody publishes it yet" in shown.output
+    assert "not carried: another type hash" in shown.output
+    assert "published = refused + dropped + sent" in shown.output
 
 
 def test_metrics_are_those_of_the_report_and_the_robots_own(busy):

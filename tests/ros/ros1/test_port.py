@@ -71,6 +71,24 @@ def test_topics_are_found_under_the_namespaces_of_their_sources_both_ways(make_p
     wait_for(lambda: back == [string("hello")], "the answer")
 
 
+def test_how_topics_stand_is_seen_as_they_come(make_pair, other):
+    """As ``skytether robot status`` shows them."""
+    pair, robot, _ = make_pair(CHAT, {**CHAT, "name": "answer", "direction": "out"})
+
+    def seen(name):
+        return next((topic for topic in pair.robot.topics() if topic.name == name), None)
+
+    wait_for(lambda: seen("answer"), "what was agreed")
+    assert (seen("chat").way, seen("chat").there, seen("chat").graph) == ("from", False, "/walker/chat")
+    assert (seen("answer").way, seen("answer").there, seen("answer").graph) == ("to", False, "/navigation/answer")
+    talker = other(robot, "talker")
+    talker.advertise("/walker/chat", STRING, MD5, latched=True)
+    hear(talker, "/navigation/answer", STRING, MD5)
+    wait_for(lambda: seen("chat").there and seen("answer").there, "both")
+    assert (seen("chat").nodes, seen("chat").quality) == (("/talker",), "latched")
+    assert seen("answer").nodes == ("/talker",)
+
+
 def test_remapped_names_and_real_tools_at_both_ends(make_pair):
     _, robot, service = make_pair(
         CHAT, config={"namespace": "/", "remap": {"chat": "/front/chat"}}, remap={"chat": "/chat"}

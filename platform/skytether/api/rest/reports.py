@@ -40,6 +40,10 @@ class TopicReport(Strict):
     topic: Annotated[str, Field(max_length=255)]
     direction: Literal["in", "out"]
     priority: Annotated[int, Field(ge=0, le=127)]
+    refused: _Count = 0
+    """Published while there was no session, or the service had no such topic; of topics that the robot sends."""
+    offered: _Count = 0
+    """All others that were published. What of them was not sent was too old or too many, or waits."""
     sent: _Count = 0
     delivered: _Count = 0
     lost: _Count = 0

@@ -129,15 +129,14 @@ def _facts(result: DemoResult) -> Table:
 def _topics(result: DemoResult) -> Table:
 
     table = Table(title="Topics: one-way delay and jitter in ms")
-    for heading in ("topic", "sent", "delivered", "lost", "delay p50", "delay p99", "jitter"):
+    counted = ("refused", "dropped", "sent", "delivered", "superseded", "lost", "unsettled")
+    for heading in ("topic", *counted, "delay p50", "delay p99", "jitter"):
         table.add_column(heading, justify="left" if heading == "topic" else "right")
     for topic in result.topics:
         times = (topic.delay_p50, topic.delay_p99, topic.jitter)
         table.add_row(
             topic.topic,
-            str(topic.sent),
-            str(topic.delivered),
-            str(topic.lost),
+            *(str(getattr(topic, name)) for name in counted),
             *(f"{seconds * 1000:.1f}" for seconds in times),
         )
     return table

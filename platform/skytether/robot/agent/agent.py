@@ -28,7 +28,7 @@ from ..control import fallback
 from ..control.command import Source
 from ..control.control_loop import Clocks, ControlLoop, Observer, RobotHardware
 from ..control.service_manager import ServiceManager, terms
-from ..graphs.graph_base import Graph
+from ..graphs.graph_base import Graph, TellsTopics
 from ..graphs.wheels_watch import NOBODY, WatchesWheels
 from ..log_throttle import LogThrottle
 from ..offload.lease_client import InstanceReported, LeaseClient, MoveFailed, Orchestrator, Wanted
@@ -38,6 +38,7 @@ from ..offload.site_prober import SiteProber
 from ..offload.task_manager import PathQuality, RobotView
 from ..session.counter_totals import CounterTotals
 from ..session.link_quality import Quality
+from ..session.rates import Rates
 from ..session.session import LiveSession
 from .clocks import read_clocks
 from .config import AgentConfig
@@ -151,6 +152,7 @@ class Agent:
         self._log_throttle = LogThrottle(_log)
         self._resolver = Resolver()
         self._stats: SessionStats | None = None
+        self._rates = Rates()
         self._totals = CounterTotals(uuid.uuid4().hex)
         self._trouble = ""
         self._asked_at: float | None = None
@@ -259,6 +261,8 @@ class Agent:
             load=self._site_prober.robot.load if self._site_prober else nan,
             battery=self._site_prober.robot.battery if self._site_prober else None,
             others=self._graph.others if isinstance(self._graph, WatchesWheels) else NOBODY,
+            topics=tuple(self._graph.topics()) if isinstance(self._graph, TellsTopics) else (),
+            rates=self._rates.now,
         )
 
     def report(self) -> rest.Report:
@@ -387,6 +391,7 @@ class Agent:
         if session is None or session.bridge is None:
             return
         self._stats = session.bridge.stats()
+        self._rates.sample(self._stats, now)
         if self._manager is not None:
             self._control_loop.quality = self._manager.watch(self._stats, now)
             if self._site_prober is not None:

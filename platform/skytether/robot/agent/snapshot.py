@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import isfinite, nan
 
 from skytether.api import rest
+from skytether.ros.followed import Followed
 from skytether.wire.stats import SessionStats
 
 from ..control.control_loop import ControlStatus
@@ -35,6 +37,8 @@ class AgentStatus:
         battery: Charge, 0 to 1; None: not known.
         others: Who else publishes what the wheels listen to.
         gate: What the gate says of itself; None: there is none.
+        topics: How the topics stand in the robot's graph; empty: it has none.
+        rates: Messages a second, by topic and direction.
     """
 
     driver: ControlStatus
@@ -53,6 +57,8 @@ class AgentStatus:
     battery: float | None = None
     others: Others = NOBODY
     gate: rest.GateReport | None = None
+    topics: tuple[Followed, ...] = ()
+    rates: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
 
 def report(

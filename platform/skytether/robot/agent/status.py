@@ -36,6 +36,8 @@ _PATIENCE_S = 2.0
 """For one request, from its first byte to the last of its answer."""
 _MOST = 16
 """Connections at a time, each of which has a thread; who comes on top is closed."""
+_ACCOUNT = ("published", "refused", "dropped", "sent", "delivered", "superseded", "lost", "unsettled")
+"""What becomes of messages; it adds up: see `skytether.wire.stats.TopicStats`."""
 _TRANSITIONS = 20
 """The newest that ``/status`` tells."""
 
@@ -78,6 +80,7 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
                 for path in (status.session.paths if status.session else ())
             ],
         },
+        "topics": _topics(status),
         "other_publishers": {"names": list(status.others.names), "noticed": status.others.noticed},
         "velocity": {"linear_m_s": driver.velocity.linear, "angular_rad_s": driver.velocity.angular},
         "gate": None if status.gate is None else status.gate.model_dump(),
@@ -246,6 +249,37 @@ def _families(robot: str, service: str, status: AgentStatus, report: rest.Report
     yield counter("control_stalls", "Times that the control loop stood still", ("robot", "service"), stalls.items())
     labels = ("robot", "service", "option")
     yield gauge("task_cost", "What the task manager reckons for each site and for local; +Inf: ruled out", labels, cost)
+
+
+def _topics(status: AgentStatus) -> list[dict[str, Any]]:
+    """How each topic stands in the robot's graph, and what the bridge has counted of it."""
+    counted = {topic.topic: topic for topic in (status.session.topics if status.session else ())}
+    followed = {topic.name: topic for topic in status.topics}
+    found = []
+    for name in (*followed, *(name for name in counted if name not in followed)):
+        graph, bridge = followed.get(name), counted.get(name)
+        hz = None if bridge is None else status.rates.get((name, bridge.direction))
+        found.append(
+            {
+                "topic": name,
+                "direction": None if bridge is None else bridge.direction,
+                "hz": None if hz is None else round(hz, 1),
+                "graph": None
+                if graph is None
+                else {
+                    "name": graph.graph,
+                    "type": graph.type,
+                    "way": graph.way,
+                    "there": graph.there,
+                    "nodes": list(graph.nodes),
+                    "quality": graph.quality,
+                    "refused": graph.refused,
+                    "dropped": graph.dropped,
+                },
+                "messages": None if bridge is None else {name: getattr(bridge, name) for name in _ACCOUNT},
+            }
+        )
+    return found
 
 
 def _decision(decision: Decision, now: float) -> dict[str, Any]:

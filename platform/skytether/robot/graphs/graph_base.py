@@ -10,11 +10,12 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from skytether.api.manifest import TopicSpec
 from skytether.bridge.port import Port
 from skytether.messages import DecodeError, Encoding, Message, Twist, decode, encode
+from skytether.ros.followed import Followed
 from skytether.ros.names import Names, resolve
 from skytether.wire.topic import Topic
 
@@ -43,6 +44,15 @@ class Graph(Protocol):
         Raises:
             ValueError: A topic cannot be in this graph; the text names it.
         """
+        ...
+
+
+@runtime_checkable
+class TellsTopics(Protocol):
+    """A graph that knows how its topics stand."""
+
+    def topics(self) -> list[Followed]:
+        """Each topic of the service and of the robot's own control; from any thread, never waits."""
         ...
 
 

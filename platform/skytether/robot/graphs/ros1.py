@@ -12,11 +12,14 @@ from skytether.bridge.port import Port
 from skytether.guard.clock import now as boottime
 from skytether.messages import Encoding, Message, Twist, hash_of, type_of
 from skytether.ros import notes, permissions
+from skytether.ros.followed import Followed
 from skytether.ros.names import Names, bridge_type, namespace_of, resolve
 from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
+from skytether.ros.ros1.followed import taken
 from skytether.ros.ros1.master import MasterError, RefusedError
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.port import CLOCK, SIM_TIME, Ros1Port
+from skytether.ros.ros1.publication import Publication
 from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import ANY, Role, Topic
 
@@ -104,10 +107,11 @@ class Ros1Robot:
         self._config = config
         self._node = node
         self._port: Ros1Port | None = None
+        self._wheels: Publication | None = None
         send: Callable[[bytes], object] = nowhere
         if config.cmd_vel is not None:
             topic = resolve(config.cmd_vel, config.home)
-            wheels = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+            self._wheels = wheels = node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
 
             def send(payload: bytes) -> None:
                 wheels.publish(payload, boottime() + config.fresh_s)
@@ -131,6 +135,17 @@ class Ros1Robot:
     def others(self) -> Others:
         """Who else publishes what the wheels listen to."""
         return self._watch.others if self._watch is not None else NOBODY
+
+    def topics(self) -> list[Followed]:
+        """How the service's topics, and the robot's own, stand in the graph now; from any thread."""
+        found = [] if self._port is None else self._port.topics()
+        known = {(topic.graph, topic.way) for topic in found}
+        names, seen = self._config.names(()), self._node.look()
+        own = [taken(name, names.own(name), kind, seen) for name, kind in self._config.readings.items()]
+        if self._wheels is not None and self._config.cmd_vel is not None:
+            listeners = tuple(self._wheels.subscribers)
+            own.append(Followed(self._config.cmd_vel, self._wheels.topic, Twist.TYPE, "to", listeners, bool(listeners)))
+        return [*found, *(topic for topic in own if (topic.graph, topic.way) not in known)]
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         specs = spoken(specs, "action")

@@ -12,9 +12,11 @@ from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
 from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, encode, hash_of, type_of
 from skytether.ros import permissions
+from skytether.ros.followed import Followed
 from skytether.ros.names import Names, namespace_of, resolve
 from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
 from skytether.ros.ros2.dialect import Endpoint, Kind
+from skytether.ros.ros2.followed import followed
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Handle
@@ -106,6 +108,8 @@ class Ros2Robot:
         self._clock = clock
         self._port: Ros2Port | None = None
         self._handles: list[Handle] = []
+        self._own: list[tuple[str, Handle]] = []
+        """Readings and wheels, by the robot's names."""
         self._told = False
         own = config.names(())
         send: Callable[[bytes], object] = nowhere
@@ -114,6 +118,7 @@ class Ros2Robot:
             endpoint = self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type)
             wheels = node.publish(endpoint, farewell=encode(stand))
             self._handles.append(wheels)
+            self._own.append((config.cmd_vel, wheels))
 
             def send(velocity: bytes) -> None:
                 if wheels.put(velocity):
@@ -127,6 +132,7 @@ class Ros2Robot:
         for name, cls in readings.items():
             endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
             self._handles.append(node.subscribe(endpoint, partial(self.base.put, name)))
+            self._own.append((name, self._handles[-1]))
         self._watch: WheelsWatch | None = None
         if config.wheels is not None:
             self._watch = WheelsWatch(config.wheels, config.drivers, partial(self._publishers, config.wheels))
@@ -139,6 +145,18 @@ class Ros2Robot:
     def others(self) -> Others:
         """Who else publishes what the wheels listen to."""
         return self._watch.others if self._watch is not None else NOBODY
+
+    def topics(self) -> list[Followed]:
+        """How the service's topics, and the robot's own, stand in the graph now; from any thread."""
+        found = [] if self._port is None else self._port.topics()
+        known = {(topic.graph, topic.way) for topic in found}
+        own = (followed(self._node, name, handle.endpoint, handle) for name, handle in self._own)
+        waits = (
+            Followed(name, name, "any", "from")
+            for name in (resolve(name, self._config.home) for name in self._config.topics)
+            if (name, "from") not in known
+        )
+        return [*found, *(topic for topic in (*own, *waits) if (topic.graph, topic.way) not in known)]
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         specs = spoken(specs, "ros2_action")

@@ -14,7 +14,8 @@ from weakref import WeakSet
 from skytether.wire.stats import SessionStats, TopicStats
 
 COUNTERS = (
-    "sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded", "duplicate", "bytes_sent",
+    "refused", "offered", "sent", "delivered", "lost", "late", "unknown", "expired", "replaced", "superseded",
+    "duplicate", "bytes_sent",
 )  # fmt: skip
 """Of `skytether.wire.stats.TopicStats`; ``lost`` with those that came late after all, so that it only goes up, and
 ``unknown`` with those under way when their session ended."""

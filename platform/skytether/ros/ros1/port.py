@@ -17,6 +17,7 @@ from skytether.bridge.calls import REQUEST, RESPONSE, CallError, call_names
 from skytether.bridge.port import Publisher
 from skytether.messages import definition_of, hash_of
 from skytether.ros import notes as graph_notes
+from skytether.ros.followed import Followed
 from skytether.ros.names import GraphNameError, Names, ros1_type
 from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
@@ -25,6 +26,7 @@ from skytether.ros.static_tf import StaticTransforms
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Direction, Role, Topic
 
+from .followed import taken
 from .master import MasterError, RefusedError
 from .node import Node
 from .publication import QUEUE, Publication
@@ -176,6 +178,24 @@ class Ros1Port:
             self._node.unadvertise(publication)
         for server in servers.values():
             self._node.unserve(server)
+
+    def topics(self) -> list[Followed]:
+        """How each topic stands in the graph now; those that the other end gives are there once agreed."""
+        seen = self._node.look()
+        found = []
+        for row in self._sends:
+            name = self._names.of(row.name)
+            found.append(taken(row.name, name, row.type, seen))
+        with self._lock:
+            publications = dict(self._publications)
+        for row in list(self._agreed.values()):
+            name = self._names.of(row.name)
+            publication = publications.get(row.name)
+            listeners = tuple(publication.subscribers) if publication else ()
+            refusal = self._permissions.refusal(Access.PUBLISH, name) if self._permissions is not None else ""
+            quality = "latched" if row.latched else ""
+            found.append(Followed(row.name, name, row.type, "to", listeners, bool(listeners), quality, refused=refusal))
+        return found
 
     def subscribers(self, topic: str) -> list[str]:
         """Names of the nodes that listen to a topic of the bridge which is published here."""

@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
 from skytether.messages import Encoding, hash_of
+from skytether.ros.followed import Followed
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
@@ -21,6 +22,7 @@ from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Role, Topic
 
 from .dialect import Endpoint, Kind
+from .followed import followed
 from .names import check_type, full_name
 from .qos import SERVICE, qos_of
 from .seam import Client, GraphNode, Handle, Publication
@@ -157,6 +159,14 @@ class Ros2Port:
         """Topics that are not carried, each with a sentence that says why."""
         ways = {name: way.refusal or (way.handle.refused if way.handle else "") for name, way in self._ways.items()}
         return {name: why for name, why in ways.items() if why}
+
+    def topics(self) -> list[Followed]:
+        """How each topic of the table stands in the graph now; those that the peer named late are there once named."""
+        found = []
+        for name, endpoint in list(self._endpoints.items()):
+            way = self._ways[name]
+            found.append(followed(self._node, name, endpoint, way.handle, way.refusal))
+        return found
 
     # --- topics ------------------------------------------------------------------------------------------------------
 

@@ -98,6 +98,12 @@ def clash(offered: Qos, asked: Qos) -> str:
     return ", ".join(f"{want} is asked for, {have} is offered" for want, have in found)
 
 
+def describe(qos: Qos) -> str:
+    """In words, as ROS 2's own tools say it."""
+    reliability = "reliable" if qos.reliable else "best effort"
+    return f"{reliability}, transient local" if qos.transient_local else reliability
+
+
 def history_missed(offers: Collection[Qos]) -> bool:
     """Whether a newcomer misses what some of these publishers keep for it, because others of them keep nothing."""
     return len({offer.transient_local for offer in offers}) > 1

@@ -36,7 +36,13 @@ class TopicCounters:
         self._past_out: dict[str, Counter[str]] = {}
         self._past_in: dict[str, Counter[str]] = {}
         """What peers before had reported last, summed."""
+        self._refused: Counter[str] = Counter()
+        """Of topics in our own table, whatever the peer has of it."""
         self._turn = 0
+
+    def refuse(self, name: str) -> None:
+        """A message of this topic was not taken: there is no session, or it does not have the topic."""
+        self._refused[name] += 1
 
     def outbound(self, name: str) -> Outbound:
         """Counters of a topic that this end sends."""
@@ -141,7 +147,7 @@ class TopicCounters:
             out = self._out.get(topic.name, Outbound())
             base = replace(
                 base, offered=out.offered, sent=out.sent, expired=out.expired, replaced=out.replaced,
-                bytes_sent=out.bytes_sent, retransmitted=out.retransmitted,
+                bytes_sent=out.bytes_sent, retransmitted=out.retransmitted, refused=self._refused[topic.name],
             )  # fmt: skip
             row, received = self._peer_in.get(topic.name), self._past_in.get(topic.name, _NOTHING)
             counts: dict[str, Any] = {f: received[f] + getattr(row, f, 0) for f in _RECEIVED}

@@ -120,9 +120,11 @@ def _table(role: str, stats: SessionStats) -> Table:
     for path in stats.paths:
         rtt, loss = _number(path.rtt, 1000, " ms"), _number(path.loss_out, 100, " %")
         state += f"; path {path.path}: round trip {rtt}, loss {loss}"
-    # Ten columns in 80 characters, so that a narrow terminal shows whole names.
+    # Eleven columns in 80 characters, so that a narrow terminal shows whole names.
     table = Table(
         title=f"{role}: {state}; delays in ms",
+        caption="published = refused + dropped + sent; sent = delivered + old + lost + open",
+        caption_justify="left",
         title_justify="left",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
@@ -130,10 +132,10 @@ def _table(role: str, stats: SessionStats) -> Table:
     )
     table.add_column("topic", overflow="fold", min_width=14)
     table.add_column("dir", min_width=3)
-    for column in ("prio", "sent", "delivered", "lost", "expired", "p50", "p99", "jitter"):
+    for column in ("refused", "dropped", "sent", "delivered", "old", "lost", "open", "p50", "p99", "jitter"):
         table.add_column(column, justify="right", min_width=len(column))
     for t in stats.topics:
-        counts = (t.priority, t.sent, t.delivered, t.lost, t.expired)
+        counts = (t.refused, t.dropped, t.sent, t.delivered, t.superseded, t.lost, t.unsettled)
         times = (t.delay_p50, t.delay_p99, t.jitter)
         table.add_row(
             t.topic,

@@ -14,6 +14,16 @@ from ...connection import Json
 from ...output import cell, fail, print_json, print_whole
 
 _TIMEOUT_S = 5.0
+_COUNTED = {
+    "refused": "refused",
+    "dropped": "dropped",
+    "sent": "sent",
+    "delivered": "delivered",
+    "superseded": "old",
+    "lost": "lost",
+    "unsettled": "open",
+}
+_ADDS_UP = "published = refused + dropped + sent; sent = delivered + old + lost + open"
 _NO_AGENT = "what answers on port {} of this machine is no agent; give its status_port with --port"
 
 
@@ -99,11 +109,43 @@ def _tables(found: dict[str, Any]) -> list[Table]:
             cost = "-" if option["cost"] is None else f"{option['cost']:.2f}"
             options.add_row(cell(option["name"]), cost, cell(option["refused"] or parts))
         tables.append(options)
+    if found["topics"]:
+        tables.append(_topics(found["topics"]))
     changes = Table("ago [s]", "driven by", "because", title="Hand-overs", title_justify="left")
     for change in reversed(found["transitions"]):
         changes.add_row(f"{change['ago_s']:.1f}", cell(change["source"]), cell(change["reason"]))
     tables.append(changes)
     return tables
+
+
+def _topics(topics: list[dict[str, Any]]) -> Table:
+    """How each topic stands in the robot's graph, and what became of its messages."""
+    from rich.table import Table
+
+    table = Table(title="Topics", title_justify="left", caption=_ADDS_UP, caption_justify="left")
+    table.add_column("topic", overflow="fold")
+    table.add_column("in the robot's graph", overflow="fold")
+    for name in ("Hz", *_COUNTED.values()):
+        table.add_column(name, justify="right")
+    for topic in topics:
+        messages, hz = topic["messages"], topic["hz"]
+        counts = ("-" if messages is None else str(messages[name]) for name in _COUNTED)
+        table.add_row(cell(topic["topic"]), cell(_stands(topic["graph"])), "-" if hz is None else f"{hz:.1f}", *counts)
+    return table
+
+
+def _stands(graph: dict[str, Any] | None) -> str:
+    if graph is None:
+        return "-"
+    if graph["refused"]:
+        return f"not carried: {graph['refused']}"
+    verb = "publishes" if graph["way"] == "from" else "listens to"
+    if not graph["there"]:
+        return f"{graph['name']}: nobody {verb} it yet"
+    nodes = ", ".join(graph["nodes"]) or "somebody"
+    quality = f" ({graph['quality']})" if graph["quality"] else ""
+    dropped = f"; {graph['dropped']} dropped on the way" if graph["dropped"] else ""
+    return f"{graph['name']} {graph['way']} {nodes}{quality}{dropped}"
 
 
 def _instance(instance: dict[str, Any] | None) -> str:
