@@ -55,6 +55,17 @@ def test_some_attacks_on_real_processes():
 
 
 @pytest.mark.slow
+def test_some_attacks_on_a_robot_on_real_ros_2(ros2, monkeypatch):
+    """What waits in a node's program that hangs is told nobody later, and who takes over from it makes no jump."""
+    monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
+    few = ("writer-killed", "writer-program-frozen-1", "program-frozen-stop", "button-gate-frozen", "stranger")
+    rows = list(bench_safety(select([f"ros2-{name}" for name in few], with_ros2=True), 1, safety=UNHURRIED))
+    assert [what for row in rows for what in row.what] == []
+    assert len(rows) == len(few)
+    assert max(row.velocity_max_m_s for row in rows) > 0.4
+
+
+@pytest.mark.slow
 def test_what_is_not_staged_is_no_success(monkeypatch):
     """A robot that does not drive keeps every promise of standing; that is told as a violation."""
     monkeypatch.setattr(robot, "PATIENCE_S", 1.0)

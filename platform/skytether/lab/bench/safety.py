@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from skytether.lab.safety import cloud, deaths, hardware, ros1, starve, stops, storm, suspend
+from skytether.lab.safety import cloud, deaths, hardware, ros1, ros2, starve, stops, storm, suspend
 from skytether.lab.safety.attacks import Attack, Attacks, MakeRobot
 from skytether.lab.safety.checker import Finding, tightest
 from skytether.lab.safety.cores import busy_cores
@@ -72,11 +72,12 @@ HEADING = """\
 """Of the lines of ``--markdown``."""
 
 
-def attacks(with_ros1: bool = False) -> list[Attack]:
+def attacks(with_ros1: bool = False, with_ros2: bool = False) -> list[Attack]:
     """All that there are, in the order in which they are staged.
 
     Args:
         with_ros1: Those that need a ROS 1 master, too.
+        with_ros2: Those that need ROS 2, too.
     """
     known = Attacks()
     deaths.enter(known)
@@ -88,20 +89,23 @@ def attacks(with_ros1: bool = False) -> list[Attack]:
     storm.enter(known)
     if with_ros1:
         ros1.enter(known)
+    if with_ros2:
+        ros2.enter(known)
     return known.all
 
 
-def select(names: Sequence[str], with_ros1: bool = False) -> list[Attack]:
+def select(names: Sequence[str], with_ros1: bool = False, with_ros2: bool = False) -> list[Attack]:
     """Those of that name, or whose name begins with it and a hyphen; without a name all of them.
 
     Args:
         names: Of attacks.
         with_ros1: See `attacks`.
+        with_ros2: See `attacks`.
 
     Raises:
         ValueError: There is none.
     """
-    known = attacks(with_ros1)
+    known = attacks(with_ros1, with_ros2)
     chosen = []
     for name in names:
         found = [attack for attack in known if attack.name == name or attack.name.startswith(f"{name}-")]

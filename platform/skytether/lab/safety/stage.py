@@ -51,7 +51,8 @@ class Promised:
         limits = config.limits or Limits()
         period = 1 / config.rate_hz
         brakes = max(limits.linear_max / limits.linear_braking, limits.angular_max / limits.angular_braking)
-        turns = _TURNS if config.ros1 is None else _TURNS + 1  # the writer's
+        on_graph = config.ros1 is not None or config.ros2 is not None
+        turns = _TURNS + 1 if on_graph else _TURNS  # the writer's
         rest = turns * period + brakes + period
         return cls(
             agent=limits.max_gap_s + rest,
@@ -61,7 +62,7 @@ class Promised:
             joystick=(config.joystick.max_age_s if config.joystick else 0.0) + rest,
             still=((config.joystick and config.joystick.max_still_s) or 0.0) + rest,
             stop=rest,
-            silence=config.guard_s + (_TURNS * period if config.ros1 is None else rest),
+            silence=config.guard_s + (rest if on_graph else _TURNS * period),
             jitter=period,
         )
 
@@ -71,7 +72,7 @@ def wheels_of(config: SafetyConfig) -> Wheels:
 
     On a graph two periods of tolerance: the time is that of the receipt, and the writer has turns of its own.
     """
-    periods = 1 if config.ros1 is None else 2
+    periods = 1 if config.ros1 is None and config.ros2 is None else 2
     return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=periods / config.rate_hz)
 
 

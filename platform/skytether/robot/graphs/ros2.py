@@ -32,6 +32,10 @@ WHEELS = (Twist.TYPE, TwistStamped.TYPE)
 """What wheels may take: nav2 and ros2_control have the second from Jazzy on."""
 
 
+_FRESH_S = 0.1
+"""Nobody gets a velocity that waited for longer in the program that has our node [s]."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ros2RobotConfig:
     """Where in its graph the robot's things are.
@@ -116,7 +120,7 @@ class Ros2Robot:
         if config.cmd_vel is not None:
             stand: Message = Twist() if config.cmd_vel_type == Twist.TYPE else TwistStamped()
             endpoint = self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type)
-            wheels = node.publish(endpoint, farewell=encode(stand))
+            wheels = node.publish(endpoint, farewell=encode(stand), fresh_s=_FRESH_S)
             self._handles.append(wheels)
             self._own.append((config.cmd_vel, wheels))
 
@@ -124,7 +128,9 @@ class Ros2Robot:
                 if wheels.put(velocity):
                     self._told = True
                 elif self._told:  # then the loop goes on from standstill when they can be told again
-                    raise ConnectionError(wheels.refused or "the wheels cannot be told: the ROS 2 graph was lost")
+                    raise ConnectionError(
+                        wheels.refused or "the wheels cannot be told: our ROS 2 node is lost, or hangs"
+                    )
 
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
         make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is

@@ -254,6 +254,22 @@ class SafetyConfig(SourcesConfig):
         writer = 0.0 if self.ros1 is None and self.ros2 is None else period
         return Stages(self.zones.sensing_s, period, self.guard_s, writer, self.zones.reaction_s)
 
+    def fresh_s(self) -> float:
+        """How old a velocity may get that another process sends for whoever tells the wheels [s].
+
+        By then the other one is to speak: it claims the wheels 1.5 periods later, and speaks 0.75 after that, or a turn
+        more, which is within `guard_s`.
+        """
+        period = 1 / self.rate_hz
+        return max(1.5 * period, self.guard_s - 3.25 * period)
+
+    def brakes_s(self) -> float:
+        """Within this time the gate has stopped wheels that nobody else tells anything [s]."""
+        bounds = self.bounds()
+        fastest = max(bounds.linear_max, -bounds.linear_min)
+        braking = max(fastest / bounds.linear_braking, bounds.angular_max / bounds.angular_braking)
+        return self.guard_s + 3 / self.rate_hz + braking
+
     def wheels_at(self) -> str:
         """Where the wheels are, in words that tell one robot's from another's."""
         if self.ros1 is not None:

@@ -56,7 +56,7 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
     if config.ros2 is not None:
         from .ros2 import Ros2Wheels
 
-        return Ros2Wheels(config.ros2, role, enable or "")
+        return Ros2Wheels(config.ros2, role, config.fresh_s(), config.brakes_s(), enable or "")
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 
 from skytether.control.admittance import Velocity
@@ -22,6 +23,9 @@ from skytether.ros.ros2.seam import GraphNode, Ros2Error
 from .config import Ros2Way
 from .inbox import Inbox, Topics
 
+_STOPS = 10_000
+"""Words of a button, bumper or cliff sensor that wait while the gate hangs: minutes of them."""
+
 
 class Ros2Wheels:
     """The wheels' topic, geometry_msgs/msg/Twist or TwistStamped.
@@ -29,20 +33,23 @@ class Ros2Wheels:
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
+        fresh_s: Nobody gets a velocity or a level that is older [s]: the program that has the node sends them, and it,
+            or this process, may stand still meanwhile. While it does, nobody listens.
+        brakes_s: Within this time the gate stops the wheels if the writer is gone [s].
         enable_topic: Of the enable signal, std_msgs/msg/Bool; empty: there is none.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros2Way, role: str, enable_topic: str = "") -> None:
+    def __init__(self, way: Ros2Way, role: str, fresh_s: float, brakes_s: float = 0.0, enable_topic: str = "") -> None:
         self._way = way
         self._node = _start(way, role)
         self._topic = resolve(way.cmd_vel, way.namespace)
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
-        self._publication = self._node.publish(endpoint, farewell=farewell)
+        self._publication = self._node.publish(endpoint, farewell=farewell, farewell_after_s=brakes_s, fresh_s=fresh_s)
         self._watch = None
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
@@ -50,7 +57,7 @@ class Ros2Wheels:
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
-            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE))
+            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE), fresh_s=fresh_s)
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
@@ -71,7 +78,9 @@ class Ros2Wheels:
         return False
 
     def listeners(self) -> frozenset[str]:
-        """Wheels: the nodes that listen."""
+        """Wheels: the nodes that listen, none while they cannot be told anything."""
+        if self._publication.stuck or self._publication.refused:
+            return frozenset()
         return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))
 
     @property
@@ -106,6 +115,8 @@ class Ros2Sensors:
         self._node = _start(way, "sensors")
         for name, kind in topics.kinds.items():
             endpoint = _endpoint(Kind.SUBSCRIPTION, resolve(name, way.namespace), kind.TYPE)
+            if name in topics.stops:  # whatever the gate does meanwhile, none may be pushed out by a release
+                endpoint = replace(endpoint, qos=replace(endpoint.qos, depth=_STOPS), priority=1)
             self._node.subscribe(endpoint, partial(self._inbox.put, name))
 
     def stops(self) -> Iterable[tuple[str, Message]]:

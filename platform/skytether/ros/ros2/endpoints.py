@@ -93,6 +93,7 @@ class Publication(Handle):
     _publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher | None = None
     _kept: bytes | memoryview | None = None
     """The newest message of a transient-local topic, for when there is a publisher."""
+    stuck = False
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain, repeat
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -78,9 +79,17 @@ class Ros2Node(NodeBase):
     def _interrupt(self) -> None:
         self._wake.set()
 
-    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
-        """Be a publisher; a farewell is not said, because a router has no way to do it for us."""
-        del farewell
+    def publish(
+        self,
+        endpoint: Endpoint,
+        *,
+        waits: bool = False,
+        farewell: bytes = b"",
+        farewell_after_s: float = 0.0,
+        fresh_s: float = inf,
+    ) -> Publication:
+        """Be a publisher; a farewell is not said, because a router has no way to do it for us, and none waits here."""
+        del farewell, farewell_after_s, fresh_s
         publication = Publication(self, endpoint)
         publication.waits = waits
         return self._add(publication)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
+from math import inf
 from typing import Protocol
 
 from .dialect import Endpoint, Kind
@@ -40,6 +41,11 @@ class Handle(Protocol):
 class Publication(Handle, Protocol):
     """A publisher."""
 
+    @property
+    def stuck(self) -> bool:
+        """Whether what was put before waits for longer than it may, see `GraphNode.publish`; then none is taken."""
+        ...
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         ...
@@ -64,13 +70,24 @@ class Client(Handle, Protocol):
 class GraphNode(Protocol):
     """Our node; every method may be called from any thread."""
 
-    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
+    def publish(
+        self,
+        endpoint: Endpoint,
+        *,
+        waits: bool = False,
+        farewell: bytes = b"",
+        farewell_after_s: float = 0.0,
+        fresh_s: float = inf,
+    ) -> Publication:
         """Be a publisher.
 
         Args:
             endpoint: Which; a type hash that is not known is learned from subscriptions on the graph.
             waits: No message is dropped because there is no room for it now, unless very many wait.
             farewell: Published when this process ends, however it ends, where the way to the graph can do that.
+            farewell_after_s: So much later: who else speaks there comes first [s].
+            fresh_s: Where another process has the way to the graph: what waits there for longer than this, or behind
+                something that does, is never published [s].
         """
         ...
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from skytether.lab.bench.ros2_node import check_python
 from skytether.lab.bench.safety import HEADING, bench_safety, estimate, select
+from skytether.lab.bench.transports.base import TransportError
 from skytether.lab.safety.ros1_hardware import available
 
 from ...output import console, fail, print_json
@@ -26,6 +28,9 @@ def safety(
     ros1: Annotated[
         bool, typer.Option("--ros1", help="Attacks on a robot that is a ROS 1 graph, too; needs rosmaster.")
     ] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Attacks on a robot that is a ROS 2 graph, too; needs rclpy.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print a list of rows, one for each attack.")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the table of docs/safety-attacks.md.")] = False,
 ) -> None:
@@ -37,8 +42,13 @@ def safety(
     """
     if ros1 and not available():
         fail("there is no program 'rosmaster': install ros-core, or leave out --ros1", 2)
+    if ros2:
+        try:
+            check_python()
+        except TransportError as error:
+            fail(str(error), 2)
     try:
-        chosen = select(attack or (), ros1)
+        chosen = select(attack or (), ros1, ros2)
     except ValueError as error:
         fail(str(error), 2)
     console.print(f"{len(chosen)} attacks, about {estimate(chosen, n) / 60:.1f} minutes", style="dim", markup=False)

@@ -6,16 +6,19 @@ import base64
 import itertools
 import logging
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
+from math import inf
 from typing import Protocol
 
 from skytether.bridge.calls import CallError
 
 from ..dialect import Endpoint
 from ..qos import Qos, follow
-from .side.frames import Frame, Kind, control, numbered, pull_number
+from .side.frames import Frame, Kind, control, fresh, numbered, pull_number
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)
@@ -80,12 +83,28 @@ class Handle:
 
 
 class Publication(Handle):
-    """A publisher."""
+    """A publisher; see `skytether.ros.ros2.seam.GraphNode.publish`."""
 
-    def __init__(self, host: Host, channel: int, endpoint: Endpoint, *, waits: bool, farewell: bytes) -> None:
+    def __init__(
+        self,
+        host: Host,
+        channel: int,
+        endpoint: Endpoint,
+        *,
+        waits: bool = False,
+        farewell: bytes = b"",
+        farewell_after_s: float = 0.0,
+        fresh_s: float = inf,
+    ) -> None:
         super().__init__(host, channel, endpoint)
         self._waits = waits
         self._farewell = farewell
+        self._farewell_after_s = farewell_after_s
+        self._fresh_s = fresh_s
+        self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+        self._waiting: deque[tuple[int, float]] = deque()
+        """Number and time [s] of each that the program has not dealt with, where `fresh_s` says how old one may get."""
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
@@ -95,12 +114,36 @@ class Publication(Handle):
         if self.endpoint.qos.transient_local:
             self._kept = body
         sender = self._sender
-        if sender is None or self.refused:
+        if sender is None or self.refused or self.stuck:
             self.dropped += 1
             return False
+        frame = Frame(Kind.DATA, self.channel, body) if self._fresh_s == inf else self._fresh(body)
         # What is pushed out is an older one of this topic.
-        self.dropped += sender.put(Frame(Kind.DATA, self.channel, body))
+        self.dropped += sender.put(frame)
         return True
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the program has not dealt with one for longer than it may wait; then none is taken."""
+        with self._lock:
+            return bool(self._waiting) and not 0 <= _now() - self._waiting[0][1] <= self._fresh_s
+
+    def _fresh(self, body: bytes) -> Frame:
+        with self._lock:
+            number, now = next(self._numbers), _now()
+            self._waiting.append((number, now))
+            return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
+
+    def take(self, frame: Frame) -> None:
+        number, _ = pull_number(frame.body)
+        with self._lock:
+            while self._waiting and self._waiting[0][0] <= number:
+                self._waiting.popleft()
+
+    def leave(self) -> None:
+        super().leave()
+        with self._lock:
+            self._waiting.clear()
 
     def join(self, sender: Sender) -> None:
         ours = self.endpoint
@@ -116,6 +159,7 @@ class Publication(Handle):
                 transient_local=ours.qos.transient_local,
                 depth=ours.qos.depth,
                 farewell=base64.b64encode(self._farewell).decode(),
+                farewell_after_s=self._farewell_after_s,
             )
         )
         if self._kept is not None:
@@ -261,3 +305,8 @@ class Client(Handle):
             answer.set_result(body)
         else:
             answer.set_exception(CallError(body.decode(errors="replace")))
+
+
+def _now() -> float:
+    """Of the clock that the program has, too [s]."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -14,6 +14,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -85,9 +86,27 @@ class RclpyNode(NodeBase):
             if self._link is not None:
                 self._link.shutdown(socket.SHUT_RDWR)
 
-    def publish(self, endpoint: Endpoint, *, waits: bool = False, farewell: bytes = b"") -> Publication:
+    def publish(
+        self,
+        endpoint: Endpoint,
+        *,
+        waits: bool = False,
+        farewell: bytes = b"",
+        farewell_after_s: float = 0.0,
+        fresh_s: float = inf,
+    ) -> Publication:
         """Be a publisher; see `skytether.ros.ros2.seam.GraphNode`."""
-        return self._add(Publication(self, next(self._channels), endpoint, waits=waits, farewell=farewell))
+        return self._add(
+            Publication(
+                self,
+                next(self._channels),
+                endpoint,
+                waits=waits,
+                farewell=farewell,
+                farewell_after_s=farewell_after_s,
+                fresh_s=fresh_s,
+            )
+        )
 
     def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Subscription:
         """Be a subscription; the function gets each serialised message, in the node's thread."""
@@ -229,7 +248,9 @@ class RclpyNode(NodeBase):
         ours = handle.endpoint
         others = self.endpoints(ours.name, ours.kind.answers)
         found = mismatches(ours, others)
-        handle.refused = found[0].reason if found else ""
+        # A publisher is taken from nobody who fits by somebody who does not: ROS 2 connects the former alone.
+        fits = ours.kind is Kind.PUBLISHER and len(found) < len(others)
+        handle.refused = found[0].reason if found and not fits else ""
         sentences = [mismatch.reason for mismatch in found]
         if ours.kind is Kind.PUBLISHER:
             sentences += [f"{ours.name}: {c}" for c in clashes(ours, others)]

@@ -6,7 +6,9 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - CONTROL: a JSON object; from the agent what to do, from the node what is;
 - DATA: one serialised message;
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
-- FAILURE: uint64 number of the call, why it failed as UTF-8.
+- FAILURE: uint64 number of the call, why it failed as UTF-8;
+- FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, serialised message, which is published until then
+  or never; from the node the number alone: this message, and those before it, wait no more.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from typing import Any, NamedTuple, Protocol
 
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
+FRESH = struct.Struct("<Qd")
 MAX_BODY = 512 * 1024 * 1024
 """Bytes; the largest message that a socket may carry."""
 
@@ -30,6 +33,7 @@ class Kind(IntEnum):
     REQUEST = 2
     RESPONSE = 3
     FAILURE = 4
+    FRESH = 5
 
 
 class Frame(NamedTuple):
@@ -73,6 +77,16 @@ def control(**what: Any) -> Frame:
 def numbered(kind: Kind, channel: int, number: int, body: bytes) -> Frame:
     """A frame of a call."""
     return Frame(kind, channel, NUMBER.pack(number) + body)
+
+
+def fresh(channel: int, number: int, until: float, body: bytes) -> Frame:
+    """A frame of a message that is published until then [s], or never."""
+    return Frame(Kind.FRESH, channel, FRESH.pack(number, until) + body)
+
+
+def pull_fresh(body: bytes) -> tuple[int, float, bytes]:
+    """Number, time and message of `fresh`."""
+    return *FRESH.unpack_from(body), body[FRESH.size :]
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

@@ -28,7 +28,7 @@ except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
 from . import graph, types
-from .frames import Frame, Kind, control, numbered, pull_frame, pull_number, push_head
+from .frames import Frame, Kind, control, numbered, pull_frame, pull_fresh, pull_number, push_head
 from .outbox import FIRST, Sender
 
 LOOK_S = 0.2
@@ -97,7 +97,7 @@ class Program:
         self._lock = threading.Lock()
         self._names: dict[int, str] = {}
         self._publishers: dict[int, Any] = {}
-        self._farewells: dict[int, bytes] = {}
+        self._farewells: dict[int, tuple[bytes, float]] = {}
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -127,15 +127,24 @@ class Program:
         self._leave()
 
     def _leave(self) -> None:
-        for channel, body in list(self._farewells.items()):
+        began = time.monotonic()
+        for channel, (body, after_s) in sorted(self._farewells.items(), key=lambda item: item[1][1]):
+            time.sleep(max(0.0, began + after_s - time.monotonic()))
             with contextlib.suppress(Exception):
-                self._publishers[channel].publish(body)
+                if not after_s or not self._is_followed(channel):
+                    self._publishers[channel].publish(body)
         for channel in list(self._farewells):
             with contextlib.suppress(Exception):
                 self._publishers[channel].wait_for_all_acked(Duration(seconds=FAREWELL_S))
         self._sender.close()
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()
+
+    def _is_followed(self, channel: int) -> bool:
+        """Whether another node of our name publishes the topic by now."""
+        ours = (self._node.get_name(), self._node.get_namespace())
+        infos = self._node.get_publishers_info_by_topic(self._publishers[channel].topic_name)
+        return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
 
     def _say(self, **what: Any) -> None:
         self._sender.put(control(**what))
@@ -163,6 +172,12 @@ class Program:
             publisher = self._publishers.get(frame.channel)
             if publisher is not None:
                 publisher.publish(frame.body)
+        elif frame.kind is Kind.FRESH:
+            number, until, body = pull_fresh(frame.body)
+            publisher = self._publishers.get(frame.channel)
+            if publisher is not None and time.clock_gettime(time.CLOCK_BOOTTIME) <= until:
+                publisher.publish(body)
+            self._sender.put(numbered(Kind.FRESH, frame.channel, number, b""))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -180,13 +195,22 @@ class Program:
                 server.leave(number)
 
     def _do_publish(
-        self, channel: int, name: str, kind: str, reliable: bool, transient_local: bool, depth: int, farewell: str
+        self,
+        channel: int,
+        name: str,
+        kind: str,
+        reliable: bool,
+        transient_local: bool,
+        depth: int,
+        farewell: str,
+        farewell_after_s: float,
     ) -> None:
         self._names[channel] = name
+        self._sender.set(channel, FIRST, 1)
         qos = graph.profile(reliable, transient_local, depth)
         self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
         if farewell:
-            self._farewells[channel] = base64.b64decode(farewell)
+            self._farewells[channel] = base64.b64decode(farewell), farewell_after_s
 
     def _do_watch(self, channel: int, name: str) -> None:
         self._names[channel] = name
