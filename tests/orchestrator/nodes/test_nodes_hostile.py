@@ -23,7 +23,7 @@ from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.store import NodeError, new_key, request_for
 from skytether.orchestrator.config.settings import Settings, Timing
 from skytether.orchestrator.core import Orchestrator
-from skytether.orchestrator.http import node_listener as door
+from skytether.orchestrator.http import node_echo
 from skytether.orchestrator.http.app import create_app
 from skytether.orchestrator.nodes import ways
 from skytether.orchestrator.nodes.authority import Authority
@@ -220,18 +220,18 @@ def test_a_node_whose_name_takes_for_ever_to_resolve_keeps_nobody_waiting(
     """It says under which name its echo is, and has that resolved by a server of its own."""
     nodes.join("edge")
     ended = threading.Event()
-    monkeypatch.setattr(door, "echo_answers", lambda *_: ended.wait(30))
-    monkeypatch.setattr(door, "_ECHO_PATIENCE_S", 0.05)
+    monkeypatch.setattr(node_echo, "echo_answers", lambda *_: ended.wait(30))
+    monkeypatch.setattr(node_echo, "_PATIENCE_S", 0.05)
     try:
         nodes.join("other", echo=free_port())
         hostile = context_of(nodes.store("other"))
-        for _ in range(door.ECHOES + 4):  # more than there are threads
+        for _ in range(node_echo.ECHOES + 4):  # more than there are threads
             assert calls.call(nodes.url, hostile, Standing(), Stands).echo is None
         assert calls.call(nodes.url, context_of(nodes.store("edge")), Standing(), Stands).state == "unreachable"
         nodes.shut()  # nor whoever ends the orchestrator
     finally:
         ended.set()
-    assert sum(thread.name == "node-echo" for thread in threading.enumerate()) <= door.ECHOES
+    assert sum(thread.name == "node-echo" for thread in threading.enumerate()) <= node_echo.ECHOES
 
 
 def free_port() -> int:

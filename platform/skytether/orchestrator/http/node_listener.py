@@ -44,7 +44,6 @@ from skytether.api.node import (
     read_request,
 )
 from skytether.api.splice import closed, keep_alive
-from skytether.bridge.echo import EchoClient
 
 from ..config.settings import Limits
 from ..domain.errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
@@ -55,6 +54,7 @@ from ..nodes.ways import LinkedNode, Ways
 from ..store.engine import GONE
 from ..telemetry.logs import AUDIT
 from .connections import Connection, ConnectionTable, forget_frames, place_of
+from .node_echo import EchoLooks
 
 log = logging.getLogger(__name__)
 audit = logging.getLogger(AUDIT)
@@ -77,9 +77,6 @@ _AT_ONCE_S = 0.002
 the same process."""
 _AT_ONCE = 4
 """Requests of one node under way, its links and ways not counted."""
-_ECHO_S, _ECHO_TRIES = 0.5, 3
-ECHOES, _ECHO_PATIENCE_S = 8, 3.0
-"""Looks for echoes at once, of all nodes, and how long a node waits for one."""
 
 
 class _NodeConnection(Connection):
@@ -118,9 +115,7 @@ class NodeListener:
         self._enrolment = enrolment
         self._ways = ways
         self._standing = standing
-        self._echo = echo
-        self._echoes = 0
-        """Looks for echoes that are under way."""
+        self._echoes = EchoLooks(echo)
         self._leave = leave
         self._clock = clock
         self._table = ConnectionTable(Limits(strangers=STRANGERS, connections_per_address=_MOST), _MOST)
@@ -360,7 +355,7 @@ class NodeListener:
                 return Refused(error=text, final=False, over=True)
             if isinstance(request, Standing):
                 stands = await asyncio.to_thread(self._standing, name)
-                echo = None if stands.state == "gone" else await self._echo_answers(name)
+                echo = None if stands.state == "gone" else await self._echoes.answers(name)
                 return stands.model_copy(update={"seen_as": connection.host, "echo": echo})
             if isinstance(request, Leave):
                 stands = await asyncio.to_thread(self._leave, name, request.force)
@@ -374,33 +369,6 @@ class NodeListener:
             why = await self._ways.serve(node, reader)
         finally:
             self._ways.end(node, why)
-        return None
-
-    async def _echo_answers(self, name: str) -> bool | None:
-        """Whether the echo of a node answers; None: it has none, or that could not be found out soon.
-
-        In a thread that nobody waits for: a node says the name under which it is, and whoever resolves that may hang.
-        """
-        where = await asyncio.to_thread(self._echo, name)
-        if where is None or self._echoes >= ECHOES:
-            return None
-        answered: asyncio.Future[bool] = self._loop.create_future()
-
-        def tell(answers: bool) -> None:
-            self._echoes -= 1
-            if not answered.done():
-                answered.set_result(answers)
-
-        def look() -> None:
-            answers = echo_answers(*where)
-            with contextlib.suppress(RuntimeError):  # all of it has ended meanwhile
-                self._loop.call_soon_threadsafe(tell, answers)
-
-        self._echoes += 1
-        threading.Thread(target=look, name="node-echo", daemon=True).start()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_ECHO_PATIENCE_S):
-                return await answered
         return None
 
     @contextlib.contextmanager
@@ -501,12 +469,3 @@ class NodeListener:
                 return
         text = " ".join(str(value) for value in fields.values())
         (audit if name else strangers).info("%s", text, extra={"fields": fields})
-
-
-def echo_answers(host: str, port: int) -> bool:
-    """Whether the UDP echo of a node answers us, as it would robots that are where we are."""
-    try:
-        with EchoClient(host, port) as client:
-            return any(client.ask(_ECHO_S) is not None for _ in range(_ECHO_TRIES))
-    except (OSError, UnicodeError):  # UnicodeError: it is no name that could be looked up
-        return False

@@ -36,9 +36,7 @@ from .health import Health
 from .logs import PodLog
 from .nodes import Nodes
 from .objects import (
-    FAILURE,
     OWNER,
-    claim,
     free_port,
     openings_policy,
     pod,
@@ -48,6 +46,7 @@ from .objects import (
     usual_port,
 )
 from .options import KubernetesOptions
+from .pod_changes import NETWORKING, end_pod, hold_claim, put, remove_pod
 from .reports import ReportReader
 from .resize import SUBRESOURCE, in_class_of, patch, resources_of
 from .seen import Seen, observation, refused
@@ -59,7 +58,6 @@ log = logging.getLogger(__name__)
 
 _KEPT = 2
 """Earlier runs whose pods stay, for their logs."""
-_NETWORKING = "networking.k8s.io/v1"
 _FIND_OUT_S = 300.0
 """Seconds between two looks at what the API server offers."""
 _POLICY_S = 10.0
@@ -230,7 +228,7 @@ class KubernetesRuntime(Runtime):
         port = self._port(launch.instance, preferred) if self.options.reach == "hostport" else None
         node_port = self._services.make(launch.instance)
         if self.options.keep_data:
-            self._hold_claim(launch)
+            hold_claim(self.cluster, launch, self.options, self._owner)
         asked = launch, self.options, self._owner, port, openings
         body = pod(*asked, node_port=node_port, epoch=self._fence.epoch)
         try:
@@ -246,41 +244,15 @@ class KubernetesRuntime(Runtime):
         try:
             self._must_lead()  # now that it is there for a later leader to see
             if openings:
-                self._put("networkpolicies", openings_policy(openings, made, self._owner), _NETWORKING)
-            self._put("secrets", secret(launch, self._owner, made))
+                put(self.cluster, "networkpolicies", openings_policy(openings, made, self._owner), NETWORKING)
+            put(self.cluster, "secrets", secret(launch, self._owner, made))
         except BaseException:
             with suppress(RuntimeFailure):
-                self._remove_pod(made["metadata"]["name"], made["metadata"]["uid"], grace_s=0)
+                remove_pod(self.cluster, made["metadata"]["name"], made["metadata"]["uid"], grace_s=0)
             raise
         self._begun.add(made["metadata"]["uid"])
         self._waiting[made["metadata"]["uid"]] = launch
         self._watch.take(made)
-
-    def _hold_claim(self, launch: Launch) -> None:
-        """Have what keeps the data of a service, as it was made before or anew."""
-        body = claim(launch, self.options, self._owner)
-        try:
-            made = self.cluster.create(self.cluster.path("persistentvolumeclaims"), body)
-        except RefusedError as error:
-            if error.reason == "AlreadyExists":
-                return
-            raise RuntimeFailure(f"the cluster refuses it: {error}") from error
-        if not made["spec"].get("storageClassName"):
-            self.cluster.delete(self.cluster.path("persistentvolumeclaims", body["metadata"]["name"]))
-            raise RuntimeFailure(
-                "data is to be kept (option 'keep_data'), and the cluster has no default StorageClass: name one in the "
-                "site's option 'storage_class'"
-            )
-
-    def _put(self, kind: str, body: dict[str, Any], group: str = "") -> None:
-        """Create what belongs to a pod, in the place of what an earlier pod of its name has left."""
-        try:
-            self.cluster.create(self.cluster.path(kind, group=group), body)
-        except RefusedError as error:
-            if error.reason != "AlreadyExists":
-                raise
-            self.cluster.delete(self.cluster.path(kind, body["metadata"]["name"], group=group))
-            self.cluster.create(self.cluster.path(kind, group=group), body)
 
     def _port(self, instance: str, preferred: int | None) -> int:
         ports = self.options.ports
@@ -315,7 +287,7 @@ class KubernetesRuntime(Runtime):
     def _hold_policy(self) -> None:
         """Have the NetworkPolicy of all pods, as it is to be, whoever has changed or removed it."""
         body = site_policy(self._owner)
-        path = self.cluster.path("networkpolicies", body["metadata"]["name"], group=_NETWORKING)
+        path = self.cluster.path("networkpolicies", body["metadata"]["name"], group=NETWORKING)
         try:
             self.cluster.apply(path, body)
         except RefusedError as error:
@@ -387,29 +359,16 @@ class KubernetesRuntime(Runtime):
             self._unrun[seen.instance] = Observation(seen.attempt, Phase.EXITED, detail=detail, unstarted=unstarted)
 
     def _end(self, seen: Seen, failure: str = "") -> None:
-        """SIGTERM, and after `GRACE_S` SIGKILL; the pod and its log stay."""
-        notes = {"annotations": {FAILURE: failure}} if failure else {}
-        body = {"metadata": {"uid": seen.uid, **notes}, "spec": {"activeDeadlineSeconds": 1}}
-        try:
-            self._watch.take(self.cluster.merge(self.cluster.path("pods", seen.name), body))
-        except RefusedError as error:
-            if error.status not in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT):
-                raise
+        if (pod := end_pod(self.cluster, seen.name, seen.uid, failure)) is not None:
+            self._watch.take(pod)
 
     def _delete(self, seen: Seen) -> None:
-        self._remove_pod(seen.name, seen.uid, grace_s=1 if seen.node else 0)
+        remove_pod(self.cluster, seen.name, seen.uid, grace_s=1 if seen.node else 0)
         if (
             not seen.node
         ):  # gone at once; the cluster collects its Secret later, by which another pod of its name begins
             self.cluster.delete(self.cluster.path("secrets", seen.name))
         self._watch.forget(seen)
-
-    def _remove_pod(self, name: str, uid: str, *, grace_s: int) -> None:
-        try:
-            self.cluster.delete(self.cluster.path("pods", name), gracePeriodSeconds=grace_s, preconditions={"uid": uid})
-        except RefusedError as error:
-            if error.status != HTTPStatus.CONFLICT:  # another one has its name by now
-                raise
 
     def remove(self, instance: str) -> None:
         there = self._watch.of(instance, self.options.timeout_s)
@@ -508,8 +467,8 @@ class KubernetesRuntime(Runtime):
         for seen in self._watch.seen(self.options.timeout_s):
             self._delete(seen)
         self._services.clear()
-        for one in self.cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=_NETWORKING):
-            self.cluster.delete(self.cluster.path("networkpolicies", one["metadata"]["name"], group=_NETWORKING))
+        for one in self.cluster.labelled("networkpolicies", f"{OWNER}={self._owner}", group=NETWORKING):
+            self.cluster.delete(self.cluster.path("networkpolicies", one["metadata"]["name"], group=NETWORKING))
         self._budget.remove()
         self._fence.clear()
 
