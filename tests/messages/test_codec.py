@@ -226,8 +226,8 @@ def test_a_marker_has_textures_in_ros2_only() -> None:
         Time(sec=2**31),
         Time(nanosec=-1),
         Twist(linear=None),
-        JointState(name=[1]),
-        Path(poses=[Twist()]),
+        JointState(name=[1]),  # type: ignore[list-item]
+        Path(poses=[Twist()]),  # type: ignore[list-item]
     ],
     ids=lambda message: repr(message)[:40],
 )

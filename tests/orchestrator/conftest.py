@@ -149,7 +149,7 @@ class Fleet:
     made: dict[str, FakeRuntime] = field(default_factory=dict)
 
     def __call__(self, name: str) -> type[Any]:
-        kind = getattr(runtimes, f"{name.capitalize()}Runtime", None)
+        kind: Any = getattr(runtimes, f"{name.capitalize()}Runtime", None)
         if kind is None or not name:
             return load_runtime(name)
         fleet = self

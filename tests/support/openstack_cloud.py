@@ -146,7 +146,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _base(self) -> str:
-        host, port = self.server.server_address[:2]
+        host, port = self.server.server_address[0], self.server.server_address[1]
         return f"http://{host!s}:{port}"
 
     def _identity(self, path: str, asked: Document) -> tuple[int, Document, dict[str, str]]:

@@ -141,10 +141,10 @@ class UnrulyCluster:
         thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         thread.start()
         try:
-            self.do(self._open)
+            _: object = self.do(self._open)
             yield self.address
         finally:
-            self.do(self._close)
+            _ = self.do(self._close)
             self._loop.call_soon_threadsafe(self._loop.stop)
             thread.join()
             self._loop.close()

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from skytether.cli.app import app
 from skytether.lab.embedded import EmbeddedOrchestrator
 
-MANIFEST = {
+MANIFEST: dict[str, Any] = {
     "apiVersion": "skytether.io/v1",
     "kind": "Service",
     "metadata": {"name": "toy"},

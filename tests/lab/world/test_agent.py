@@ -1,4 +1,5 @@
 from collections import Counter
+from typing import Any
 
 import pytest
 
@@ -85,7 +86,7 @@ def test_a_graph_carries_readings_out_and_what_a_service_publishes_in() -> None:
     graph.publish("goal", String("kitchen"))
     assert [topic for topic, _ in sent] == ["scan", "scan", "goal"]
     assert len(decode(LaserScan, sent[0][1], "cdr").ranges) == 541
-    heard = []
+    heard: list[Any] = []
     graph.subscribe("progress", heard.append)
     port.deliver(MessageReceived("progress", encode(String("half"), "cdr"), 0, 0.0, 0.0, 0.0))
     assert decode(String, heard[0], "cdr").data == "half"

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def rules(sensor: RangeSensor | None = None, **changes) -> Rules:
 
 
 def scan(ranges, first=-180.0, step=1.0, **fields) -> LaserScan:
-    values = {"angle_min": math.radians(first), "angle_increment": math.radians(step)}
+    values: dict[str, Any] = {"angle_min": math.radians(first), "angle_increment": math.radians(step)}
     values |= {"range_min": 0.05, "range_max": 8.0, "ranges": np.array(ranges, dtype=np.float32)}
     return LaserScan(**(values | fields))
 

@@ -1,4 +1,5 @@
 import json
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -6,7 +7,7 @@ from typer.testing import CliRunner
 from skytether.cli.app import app
 from skytether.cli.commands.robot import gate_orders
 
-STATUS = {
+STATUS: dict[str, Any] = {
     "stopped": "",
     "hand": "agent",
     "zone": "clear",

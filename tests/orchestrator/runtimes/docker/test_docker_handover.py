@@ -58,7 +58,7 @@ class Scene:
     def kill(self, _container: str, signal: str) -> None:
         self.calls.append(f"kill {signal}")
 
-    def remove_container(self, _container: str, **_: object) -> None:
+    def remove_container(self, container: str, **_: object) -> None:
         self.calls.append("remove")
 
     # The follower and the fence
