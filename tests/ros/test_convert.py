@@ -65,6 +65,19 @@ def test_types_without_a_class_are_taken_by_their_fields():
     assert (again.header.seq, again.header.frame_id, list(again.D)) == (0, "cam", list(numbers[:5]))
 
 
+@pytest.mark.parametrize(("seconds", "nanoseconds"), [(1, 999_999_999), (-2, 5)])
+def test_durations_arrive_to_the_nanosecond(seconds, nanoseconds):
+    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
+    name, none = "trajectory_msgs/msg/JointTrajectoryPoint", np.zeros(0)
+    duration = ros1.types["builtin_interfaces/msg/Duration"](seconds, nanoseconds)
+    sent = ros1.types[name](np.arange(2.0), none, none, none, duration)
+    there = converter(name, "ros1", "cdr")
+    assert there is not None
+    seen = ros2.deserialize_cdr(there(ros1.serialize_ros1(sent, name)), name)
+    assert (seen.time_from_start.sec, seen.time_from_start.nanosec) == (seconds, nanoseconds)
+    assert list(seen.positions) == [0.0, 1.0]
+
+
 def test_services_of_both_generations():
     for part, ros1, cdr in (
         ("_Request", b"", bytes([0, 1, 0, 0, 0])),

@@ -44,25 +44,32 @@ def masquerade(router: Namespace, device: str, first_port: int) -> None:
 
 
 class Program:
-    """``skytether COMMAND --config FILE --json`` in a namespace.
+    """``skytether COMMAND --config FILE --json`` in a namespace, or here.
 
     Attributes:
         told: What it printed so far, oldest first.
     """
 
-    def __init__(self, where: Namespace, command: str, folder: Path, config: dict) -> None:
+    def __init__(self, where: Namespace | None, command: str, folder: Path, config: dict) -> None:
         file = folder / f"{command}-{len(list(folder.iterdir()))}.yaml"
         file.write_text(json.dumps(config))  # YAML all the same
         arguments = [sys.executable, "-m", "skytether.cli", command, "--config", str(file), "--json"]
         self.told: list[dict] = []
         self._log = file.with_suffix(".log")
         with self._log.open("w") as log:
-            self._process = where.run(
-                lambda: subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=log, text=True)
-            )
+
+            def start() -> subprocess.Popen:
+                return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=log, text=True)
+
+            self._process = start() if where is None else where.run(start)
         self._changed = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    @property
+    def log(self) -> str:
+        """What it wrote on standard error."""
+        return self._log.read_text()
 
     def wait(self, condition, seconds: float = 30) -> dict:
         """Wait until the latest of what it prints is so; returns it."""

@@ -157,7 +157,7 @@ class Ros1Graph:
                     pipe.close()
 
 
-_PACKAGE = """<package format="2"><name>{name}</name><version>1.0.0</version><description>-</description>
+PACKAGE = """<package format="2"><name>{name}</name><version>1.0.0</version><description>-</description>
 <maintainer email="a@b.c">-</maintainer><license>BSD</license>{more}</package>"""
 _PLUGINS = """<library path="lib/libimage_proc">
 <class name="image_proc/debayer" type="image_proc::DebayerNodelet" base_class_type="nodelet::Nodelet"/>
@@ -180,7 +180,7 @@ def debian_packages(folder: Path) -> dict[str, str]:
     depends = "<depend>nodelet</depend>" + exported
     for name, more in (("nodelet", ""), ("topic_tools", ""), ("image_proc", depends)):
         (share / name).mkdir(parents=True)
-        (share / name / "package.xml").write_text(_PACKAGE.format(name=name, more=more))
+        (share / name / "package.xml").write_text(PACKAGE.format(name=name, more=more))
     (share / "image_proc" / "nodelet_plugins.xml").write_text(_PLUGINS)
     for name, program in (("topic_tools", "relay"), ("topic_tools", "throttle"), ("image_proc", "image_proc")):
         (share / name / program).symlink_to(f"/usr/lib/{name}/{program}")

@@ -50,11 +50,9 @@ except BaseException:
 
 
 class Node:
-    """One process with one node, ``node`` in its code; what it says with ``say`` is read with `next`."""
+    """One process with one node; what it says as lines of JSON is read with `next`, first that it is ready."""
 
-    def __init__(self, python: str, name: str, namespace: str, code: str, environment: dict[str, str]) -> None:
-        text = f"NAME, NAMESPACE = {name!r}, {namespace!r}\n{_BEFORE}{code}{_AFTER}"
-        command = [python, "-c", text]
+    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
@@ -107,11 +105,12 @@ class Ros2Nodes:
         self._nodes: list[Node] = []
 
     def start(self, code: str, name: str = "peer", namespace: str = "/", where: Namespace | None = None) -> Node:
-        """Start a node; returns when it spins."""
+        """Start a node, ``node`` in its code, which says things with ``say``; returns when it spins."""
         environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain)}
+        text = f"NAME, NAMESPACE = {name!r}, {namespace!r}\n{_BEFORE}{code}{_AFTER}"
 
         def start() -> Node:
-            return Node(self.python, name, namespace, code, environment)
+            return Node([self.python, "-c", text], environment)
 
         self._nodes.append(start() if where is None else where.run(start))
         return self._nodes[-1]
@@ -119,6 +118,17 @@ class Ros2Nodes:
     def close(self) -> None:
         for node in self._nodes:
             node.close()
+
+
+def first(node: Node, what: str, limit_s: float = LIMIT_S) -> Any:
+    """The next thing that a node says of this, a list that begins with it; what it says of others waits."""
+    deadline = time.monotonic() + limit_s
+    while True:
+        for said in node.heard:
+            if said[0] == what:
+                node.heard.remove(said)
+                return said
+        node.heard.append(node.next(deadline - time.monotonic()))
 
 
 @contextmanager

@@ -323,8 +323,8 @@ class ServiceSpec(Strict):
     def _graphs_of_ros2_are_joined(cls, graph: Any) -> Any:
         if graph == "ros2":
             raise ValueError(
-                "graphs of ROS 2 are not started here, only those of ros1; start the nodes yourself, with their Zenoh "
-                "router, and join them with ros2: in the configuration of `skytether bridge`"
+                "graphs of ROS 2 are not started here, only those of ros1; start the nodes yourself, and join "
+                "them with ros2: in the configuration of `skytether bridge`"
             )
         return graph
 

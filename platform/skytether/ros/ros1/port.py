@@ -80,6 +80,7 @@ class Ros1Port:
         params: Names or namespaces of parameters that the other end gets.
         sim_time: Tell the other end that its time is a simulation's.
         on_notes: Called in the bridge's thread with what the other end tells; must return at once.
+        on_event: The same with connected, disconnected, moved and refused.
         survey_s: Between looks for services and parameters.
     """
 
@@ -95,6 +96,7 @@ class Ros1Port:
         params: Collection[str] = (),
         sim_time: bool = False,
         on_notes: Callable[[Notes], None] = lambda _: None,
+        on_event: Callable[[Event], object] = lambda _: None,
         survey_s: float = SURVEY_S,
     ) -> None:
         self._node = node
@@ -104,6 +106,7 @@ class Ros1Port:
         self._params = params
         self._sim_time = sim_time
         self._on_notes = on_notes
+        self._on_event = on_event
         self._survey_s = survey_s
         table = tuple(topics)
         self._calls = call_names(table)
@@ -153,6 +156,7 @@ class Ros1Port:
             self._early[message.topic].append(message.payload)
 
     def notify(self, event: Event) -> None:
+        self._on_event(event)
         if not isinstance(event, Connected):
             return
         for topic in event.topics:

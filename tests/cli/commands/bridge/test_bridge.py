@@ -235,6 +235,10 @@ def ros2_end(**ros2):
     }
 
 
+def ros1_end(**ros1):
+    return {k: v for k, v in BOTH.items() if k != "sources"} | {"role": "service", "ros1": ros1}
+
+
 @pytest.mark.parametrize(
     ("document", "text"),
     [
@@ -248,10 +252,16 @@ def ros2_end(**ros2):
         (ros2_end(namespace="/3po"), "ros2: namespace: '/3po' is no name of a ROS 2 graph"),
         (ros2_end(remap={"skan": "/scan"}), "ros2.remap.skan: there is no such topic or call"),
         (ros2_end(zenoh_config="none.json5"), "ros2: Zenoh does not take the configuration"),
+        (ros2_end() | {"ros1": {}}, "ros1, ros2: the graph at this end is one of the two"),
+        (BOTH | {"ros1": {}}, "ros1: is for role 'robot' or 'service', and without sources"),
+        (ros1_end(master="localhost:11311"), "ros1.master: must be an address such as http://localhost:11311"),
+        (ros1_end(namespace="3po"), "ros1: namespace: '3po' is no name of a graph"),
+        (ros1_end(node="a b"), "ros1: node: 'a b' is no name of a graph"),
+        (ros1_end(remap={"skan": "/scan"}), "ros1.remap.skan: there is no such topic or call"),
         (ros2_end() | {"topics": [{"name": "a", "type": "Twist", "direction": "in"}]}, "topic 'a': 'Twist' is no type"),
     ],
 )
-def test_a_ros2_end_that_cannot_be_is_named(run, document, text):
+def test_an_end_of_ros_that_cannot_be_is_named(run, document, text):
     result = run(document, "--seconds", "0.1")
     assert result.exit_code == 2, result.output
     assert text in result.output

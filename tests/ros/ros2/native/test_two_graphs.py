@@ -1,10 +1,8 @@
 """Two real graphs of ROS 2 in two networks with a bad link between them, and ``skytether bridge`` at either end."""
 
-import time
-
 import pytest
 from networks import Program
-from ros2_nodes import far_nodes, ros2_nodes
+from ros2_nodes import far_nodes, first, ros2_nodes
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.lab.tun import ROBOT, SERVICE, TunEmulator
@@ -109,17 +107,6 @@ def spin(node):
     executor.spin()
 rclpy.spin = spin
 """
-
-
-def first(node, what, limit_s=30.0):
-    """The next thing that a node says of this; what it says of others waits."""
-    deadline = time.monotonic() + limit_s
-    while True:
-        for said in node.heard:
-            if said[0] == what:
-                node.heard.remove(said)
-                return said
-        node.heard.append(node.next(deadline - time.monotonic()))
 
 
 def test_topics_calls_and_actions_cross_a_bad_link(ros2_nodes, far_nodes, tmp_path):

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from skytether.api.config_file import ConfigError
 from skytether.bridge.endpoint import BridgeError
+from skytether.ros.notes import NOTES
 
 from ...output import console, fail, print_json
 from .config import load_config, load_key, write_new_key
@@ -42,8 +43,8 @@ def bridge(
 ) -> None:
     """Join two graphs over UDP without an orchestrator: run it at each end with the same id, key and topics.
 
-    With ros2: in the configuration this end is a ROS 2 graph. Sources publish made-up messages instead, so that a
-    network can be measured before a robot depends on it.
+    With ros1: or ros2: in the configuration this end is a graph of ROS. Sources publish made-up messages instead, so
+    that a network can be measured before a robot depends on it.
     """
     try:
         if new_key is not None:
@@ -134,7 +135,7 @@ def _table(role: str, stats: SessionStats) -> Table:
     table.add_column("dir", min_width=3)
     for column in ("refused", "dropped", "sent", "delivered", "old", "lost", "open", "p50", "p99", "jitter"):
         table.add_column(column, justify="right", min_width=len(column))
-    for t in stats.topics:
+    for t in (t for t in stats.topics if t.topic not in NOTES.values()):
         counts = (t.refused, t.dropped, t.sent, t.delivered, t.superseded, t.lost, t.unsettled)
         times = (t.delay_p50, t.delay_p99, t.jitter)
         table.add_row(

@@ -13,7 +13,8 @@ from skytether.api.config_file import ConfigError, Endpoint, read_config
 from skytether.api.manifest import ANY_TOPIC, Strict, TopicSpec
 from skytether.bridge.local_network import LocalNetwork
 from skytether.bridge.spec import KEY_BYTES, parse_key
-from skytether.ros.names import check_name
+from skytether.ros.names import Generation, check_name
+from skytether.ros.ros1.config import Ros1Link
 from skytether.ros.ros2.config import Ros2Graph
 from skytether.wire.topic import Direction, Role
 
@@ -47,21 +48,49 @@ class Link(Strict):
     down: LinkConfig = LinkConfig()
 
 
-class Ros2End(Ros2Graph):
-    """A ROS 2 graph at this end."""
+class GraphEnd(Strict):
+    """What a graph at this end has in either generation of ROS."""
 
     namespace: str = "/"
     """Of the topics and calls, which are found in the graph under their names."""
     remap: dict[str, str] = {}
     """Other names in the graph, by topic or call."""
 
-    @model_validator(mode="after")
-    def _names_are_legal(self) -> Ros2End:
+    def check_names(self, ros: Generation) -> None:
+        """Refuse what this generation refuses.
+
+        Raises:
+            ValueError: The text names the key.
+        """
         for key, name in {"namespace": self.namespace, **{f"remap.{k}": v for k, v in self.remap.items()}}.items():
             try:
-                check_name(name, 2)
+                check_name(name, ros)
             except ValueError as error:
                 raise ValueError(f"{key}: {error}") from None
+
+
+class Ros1End(GraphEnd, Ros1Link):
+    """A ROS 1 graph at this end."""
+
+    node: Annotated[str, Field(min_length=1)] = "skytether"
+    """Name of our node in the graph."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros1End:
+        self.check_names(1)
+        try:
+            check_name(self.node)
+        except ValueError as error:
+            raise ValueError(f"node: {error}") from None
+        return self
+
+
+class Ros2End(GraphEnd, Ros2Graph):
+    """A ROS 2 graph at this end."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros2End:
+        self.check_names(2)
         return self
 
 
@@ -80,8 +109,9 @@ class BridgeConfig(Strict):
     topics: Annotated[tuple[TopicSpec, ...], Field(min_length=1)]
     sources: tuple[Source, ...] = ()
     """Publishers of made-up messages, on topics that this end sends."""
+    ros1: Ros1End | None = None
     ros2: Ros2End | None = None
-    """The graph at this end; null: none, only ``sources``."""
+    """The graph at this end, one of the two; null: none, only ``sources``."""
     rate_mbps: Annotated[float, Field(gt=0)] | None = None
     """What this end may send; null: the protocol's default."""
     link: Link | None = None
@@ -104,8 +134,11 @@ class BridgeConfig(Strict):
             raise ValueError("peer: only role 'robot' has one; the service's end learns where its robot is")
         if self.role == "service" and self.paths:
             raise ValueError("paths: only the robot's end has them; the service's end learns them")
-        if self.ros2 is not None and (self.role == "both" or self.sources):
-            raise ValueError("ros2: is for role 'robot' or 'service', and without sources: the graph has its own")
+        for key, graph in (("ros1", self.ros1), ("ros2", self.ros2)):
+            if graph is not None and (self.role == "both" or self.sources):
+                raise ValueError(f"{key}: is for role 'robot' or 'service', and without sources: the graph has its own")
+        if self.ros1 is not None and self.ros2 is not None:
+            raise ValueError("ros1, ros2: the graph at this end is one of the two")
         if self.role != "both" and self.link is not None:
             raise ValueError("link: only role 'both' can have one; across machines the network is what it is")
         sent = [
