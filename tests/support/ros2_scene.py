@@ -139,6 +139,14 @@ class Agent:
         return found
 
     @property
+    def taken(self) -> dict[str, int]:
+        """Messages that came from the robot's graph, by topic: handed to the bridge, or newer ones came before that."""
+        topics = [
+            t for t in self.status.get("topics", ()) if t["graph"] and t["messages"] and t["graph"]["way"] == "from"
+        ]
+        return {t["topic"]: t["messages"]["published"] + t["graph"]["dropped"] for t in topics}
+
+    @property
     def settled(self) -> bool:
         """What became of every message that either end sent is known."""
         counts = self.counts

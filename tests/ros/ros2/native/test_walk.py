@@ -46,6 +46,7 @@ def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, make_walker):
     until(lambda: walker.look() and walker.judge.completed, "the end of the trail", WALK_S)
     published = walker.park()
     until(lambda: agent.settled, "both ends to agree on what became of every message")
+    until(lambda: agent.taken == published, "every message of the walker's nodes to be accounted for")
     result, counts = walker.result(), agent.counts
     assert result.kte_m < 0.05, agent.log
     assert result.deviation_max_m < 0.15
@@ -55,7 +56,7 @@ def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, make_walker):
         assert outcomes["lost"] - outcomes["late"] <= 0.001 * outcomes["sent"], topic
         assert outcomes["unknown"] == 0, topic
     for topic, messages in published.items():
-        # What is newest by the time that it is its turn goes on; on a busy machine that is not each.
+        # What is newest by the time that it is its turn goes on: on a busy machine not each.
         assert 0.9 * messages < counts[topic]["sent"] <= messages, topic
     assert walker.heard > 3000
 
