@@ -234,6 +234,36 @@ node.create_timer(0.05, lambda: out.publish(Twist()))
     assert not ours.troubles
 
 
+def test_a_program_that_hung_publishes_nothing_that_waited_in_it(ros2_nodes, ours):
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/bot/cmd_vel", lambda m: say(m.linear.x), 100)
+"""
+    )
+    wheels = ours.publish(publisher("/bot/cmd_vel"), fresh_s=0.1)
+    until(lambda: wheels.put(encode(FAST)) and peer.all(), "the first velocity")
+    os.kill(ours.pid, signal.SIGSTOP)
+    until(lambda: not wheels.put(encode(Twist(linear=Vector3(x=2.5)))), "the program to be stuck")
+    assert wheels.stuck
+    peer.all()
+    os.kill(ours.pid, signal.SIGCONT)
+    until(lambda: not wheels.stuck, "the program to go on")
+    assert wheels.put(encode(Twist()))
+    until(lambda: peer.heard.extend(peer.all()) or 0.0 in peer.heard, "a velocity again")
+    assert 2.5 not in peer.heard
+
+
+def test_there_is_a_node_where_no_log_can_be_written(ros2_nodes, monkeypatch):
+    """As below systemd's ProtectHome; ROS 2 has its log files below the home folder."""
+    for name in ("ROS_LOG_DIR", "ROS_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", "/proc/no-home")
+    with RclpyNode(say=lambda _: None) as node:
+        until(lambda: node.wait_until_joined(0.1) or node.troubles, "the node")
+        assert not node.troubles
+
+
 @pytest.mark.parametrize("unread", [False, True])
 def test_when_the_agent_is_killed_the_wheels_are_told_to_stand(ros2_nodes, unread):
     """Also where it was killed before it had read all that came."""

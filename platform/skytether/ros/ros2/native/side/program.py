@@ -86,7 +86,8 @@ class Program:
 
     def __init__(self, link: socket.socket, start: dict[str, Any]) -> None:
         self._ended = threading.Event()
-        arguments = ["skytether", "--ros-args", *start["arguments"]]
+        # A log file below the home folder is of use to nobody, and where that cannot be written there is no node.
+        arguments = ["skytether", "--ros-args", "--disable-external-lib-logs", *start["arguments"]]
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node(start["node"], namespace=start["namespace"], start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
