@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,6 +19,7 @@ from skytether.ros.ros2.followed import followed
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Handle
+from skytether.ros.ros2.sim_time import GraphClock
 from skytether.wire.topic import Role, Topic
 
 from ..session.topic_table import Offer, robot_table, spoken
@@ -101,15 +101,15 @@ class Ros2Robot:
     Args:
         config: What is where.
         node: Started; it stays the caller's.
-        clock: Unix time in seconds, for stamped velocities.
+        clock: Seconds, for stamped velocities; None: the graph's time.
     """
 
     encoding: Encoding = "cdr"
 
-    def __init__(self, config: Ros2RobotConfig, node: GraphNode, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, config: Ros2RobotConfig, node: GraphNode, *, clock: Callable[[], float] | None = None) -> None:
         self._config = config
         self._node = node
-        self._clock = clock
+        self._clock = clock or GraphClock(node)
         self._port: Ros2Port | None = None
         self._handles: list[Handle] = []
         self._own: list[tuple[str, Handle]] = []
@@ -185,6 +185,8 @@ class Ros2Robot:
             self._port.close()
         for handle in self._handles:
             handle.close()
+        if isinstance(self._clock, GraphClock):
+            self._clock.close()
 
     def _stamped(self, twist: Twist) -> TwistStamped:
         return TwistStamped(Header(Time.from_seconds(self._clock()), self._config.frame), twist)

@@ -6,7 +6,6 @@ that is told nothing must stop by itself.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -19,6 +18,7 @@ from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.join import make_node
 from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Ros2Error
+from skytether.ros.ros2.sim_time import GraphClock
 
 from .config import Ros2Way
 from .inbox import Inbox, Topics
@@ -45,6 +45,7 @@ class Ros2Wheels:
     def __init__(self, way: Ros2Way, role: str, fresh_s: float, brakes_s: float = 0.0, enable_topic: str = "") -> None:
         self._way = way
         self._node = _start(way, role)
+        self._clock = GraphClock(self._node)
         self._topic = resolve(way.cmd_vel, way.namespace)
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
@@ -63,7 +64,7 @@ class Ros2Wheels:
         """Wheels: publish it."""
         twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
         if self._way.cmd_vel_type == TwistStamped.TYPE:
-            header = Header(Time.from_seconds(time.time()), self._way.frame)
+            header = Header(Time.from_seconds(self._clock()), self._way.frame)
             self._publication.put(encode(TwistStamped(header, twist)))
         else:
             self._publication.put(encode(twist))

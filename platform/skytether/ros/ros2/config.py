@@ -44,6 +44,8 @@ class Ros2Link(Strict):
     """False for ROS 2 Humble, whose types have no hash; of ``rmw_zenoh``."""
     bridge_namespace: str = "/"
     """The ``namespace`` that zenoh-bridge-ros2dds is configured with; of ``ros2dds``."""
+    use_sim_time: bool = False
+    """Stamp what we publish with the time of ``/clock``, as any node with that parameter."""
     node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "skytether"
     """Name of our node in the graph."""
 

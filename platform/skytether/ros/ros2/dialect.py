@@ -54,6 +54,7 @@ class Endpoint:
         qos: Quality of service.
         node: Name of its node with namespace; empty where tokens do not tell.
         priority: Of ours: which messages go first where several wait.
+        parts: Type hashes of a service's request and response, where these are known and not the service's own (DDS).
     """
 
     kind: Kind
@@ -63,6 +64,7 @@ class Endpoint:
     qos: Qos = SERVICE
     node: str = ""
     priority: int = 0
+    parts: tuple[str, str] = ("", "")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+
+from skytether.messages import hash_of
 
 from .dialect import Dialect, Endpoint, Kind
 
@@ -64,10 +66,20 @@ def mismatches(ours: Endpoint, others: Iterable[Endpoint]) -> list[Mismatch]:
             what = f"type {other.type}, this end's is {ours.type}"
         elif other.type_hash and ours.type_hash and other.type_hash != ours.type_hash:
             what = f"{other.type} with type hash {other.type_hash}, this end's is {ours.type_hash}"
+        else:
+            what = next(_other_parts(other), "")
         if what:
             node = f" of {other.node}" if other.node else ""
             found.append(Mismatch(other, f"{ours.name}: the {_WORDS[other.kind]}{node} has {what}; it is not joined"))
     return found
+
+
+def _other_parts(other: Endpoint) -> Iterator[str]:
+    """Request and response of a service whose hashes are not those of the type that we know."""
+    for part, told in zip(("Request", "Response"), other.parts, strict=True):
+        known = hash_of(f"{other.type}_{part}", "cdr") if told else ""
+        if known and known != told:
+            yield f"{other.type}_{part} with type hash {told}, this end's is {known}"
 
 
 def learned_hash(ours: Endpoint, others: Iterable[Endpoint]) -> str:

@@ -23,6 +23,8 @@ class Joining(Protocol):
     @property
     def ros_args(self) -> Sequence[str]: ...
     @property
+    def use_sim_time(self) -> bool: ...
+    @property
     def domain(self) -> int | None: ...
     @property
     def router(self) -> str | None: ...
@@ -64,10 +66,11 @@ def make_node(how: Joining, name: NodeName, zenoh_config: Path | None) -> GraphN
     if how.dialect == "rclpy":
         from .native.node import RclpyNode
 
-        return RclpyNode(name, python=how.python, domain=how.domain, arguments=how.ros_args)
+        arguments = [*how.ros_args, *(["-p", "use_sim_time:=true"] if how.use_sim_time else [])]
+        return RclpyNode(name, python=how.python, domain=how.domain, arguments=arguments)
     from .node import Ros2Node  # Zenoh is an extra
 
     dialect = (
         RmwZenoh(how.domain or 0, how.type_hashes) if how.dialect == "rmw_zenoh" else Ros2Dds(how.bridge_namespace)
     )
-    return Ros2Node(dialect, router=how.router, config_file=zenoh_config, name=name)
+    return Ros2Node(dialect, router=how.router, config_file=zenoh_config, name=name, sim_time=how.use_sim_time)

@@ -49,6 +49,7 @@ class Ros2Node(NodeBase):
         config_file: Zenoh's configuration (JSON5), for certificates and the like; we are a client whatever it says.
         name: Who we are.
         say: Told each trouble once, and its end; by default it is logged.
+        sim_time: Use simulated time.
 
     Raises:
         Ros2Error: The configuration file cannot be used.
@@ -62,9 +63,11 @@ class Ros2Node(NodeBase):
         config_file: Path | None = None,
         name: NodeName | None = None,
         say: Callable[[str], object] | None = None,
+        sim_time: bool = False,
     ) -> None:
         super().__init__(name, say)
         self.dialect = dialect
+        self.sim_time = sim_time
         self._router = router or ("the one that its configuration names" if config_file else DEFAULT_ROUTER)
         self._config = _config(router or (None if config_file else DEFAULT_ROUTER), config_file)
         self._lock = threading.Lock()

@@ -128,6 +128,11 @@ class GraphNode(Protocol):
         """A trouble is over; nothing is said."""
         ...
 
+    @property
+    def sim_time(self) -> bool:
+        """Whether our node uses simulated time (``use_sim_time``)."""
+        ...
+
     def start(self) -> None:
         """Begin to join the graph; returns at once."""
         ...

@@ -11,6 +11,7 @@ from ros2_nodes import ros2_nodes, until
 
 from skytether.bridge.calls import CallError
 from skytether.messages import Twist, Vector3, decode, encode, hash_of
+from skytether.ros.ros2 import graph
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.native.node import RclpyNode
 from skytether.ros.ros2.qos import Qos
@@ -209,6 +210,39 @@ node.create_timer(0.05, lambda: (other.publish(String()), same.publish(Twist()))
     assert not got
 
 
+def test_services_of_another_type_hash_are_refused_both_ways_with_both_hashes(ros2_nodes, ours, monkeypatch):
+    """DDS tells the hashes of request and response; this end's are made others, for peers have the same ROS 2."""
+    wrong = "RIHS01_" + "0" * 64
+    request, response = (hash_of(f"{TRIGGER}_{part}", "cdr") for part in ("Request", "Response"))
+    monkeypatch.setattr(
+        graph, "hash_of", lambda kind, _: wrong if kind == f"{TRIGGER}_Response" else hash_of(kind, "cdr")
+    )
+    peer = ros2_nodes.start(
+        """
+from std_srvs.srv import Trigger
+node.create_service(Trigger, "/theirs", lambda request, response: say("asked") or response)
+client = node.create_client(Trigger, "/ours")
+"""
+    )
+    client = ours.client(Endpoint(Kind.CLIENT, "/theirs", TRIGGER, hash_of(TRIGGER, "cdr")))
+    until(lambda: client.refused, "the refusal")
+    assert client.refused == (
+        f"/theirs: the service of /peer has {TRIGGER}_Response with type hash {response}, this end's is {wrong}; "
+        "it is not joined"
+    )
+    assert ours.troubles == (client.refused,)
+    with pytest.raises(CallError, match="it is not joined"):
+        client.call(b"\0\1\0\0\0", 5.0)
+    monkeypatch.setattr(graph, "hash_of", lambda *_: wrong)
+    server = ours.serve(Endpoint(Kind.SERVER, "/ours", TRIGGER, hash_of(TRIGGER, "cdr")), lambda _: b"")
+    until(lambda: server.refused, "the other refusal")
+    assert server.refused == (
+        f"/ours: the client of /peer has {TRIGGER}_Request with type hash {request}, this end's is {wrong}; "
+        "it is not joined"
+    )
+    assert not peer.all()
+
+
 def test_a_program_that_dies_is_started_again(ros2_nodes, ours):
     peer = ros2_nodes.start(
         """
@@ -287,6 +321,7 @@ threading.Thread(target=work, daemon=True).start()
     agent = f"""
 import time
 from skytether.messages import Twist, Vector3, encode, hash_of
+from skytether.ros.ros2 import graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.native.node import RclpyNode
 from skytether.ros.ros2.qos import Qos

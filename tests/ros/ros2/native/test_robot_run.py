@@ -157,6 +157,39 @@ def test_the_gate_drives_the_wheels(ros2_nodes, config, skytether):
     until(lambda: not programs(), "all of them to end")
 
 
+def test_the_check_names_a_publisher_that_is_an_inactive_lifecycle_node(ros2_nodes, config, skytether):
+    change(config)
+    laser = ros2_nodes.start(
+        """
+from rclpy.lifecycle import LifecycleNode
+from sensor_msgs.msg import LaserScan
+node = LifecycleNode("laser")
+def work():
+    for line in sys.stdin:
+        getattr(node, "trigger_" + line.strip())()
+        if line.strip() == "configure":
+            node.create_lifecycle_publisher(LaserScan, "/scan", 10)
+        say(line.strip())
+threading.Thread(target=work, daemon=True).start()
+""",
+        "laser",
+    )
+
+    def check():
+        process = skytether("robot", "run", str(config), "--check")
+        found, said = process.communicate(timeout=60)
+        return " ".join((found + said).split())
+
+    assert "nobody publishes it yet; it is waited for; lifecycle nodes that are not active: /laser" in check()
+    laser.tell("configure")
+    assert laser.next() == "configure"
+    found = check()
+    assert "from /laser; /laser is a lifecycle node and inactive: it does nothing until it is activated" in found
+    laser.tell("activate")
+    assert laser.next() == "activate"
+    assert "inactive" not in check()
+
+
 def test_the_check_looks_topic_by_topic(ros2_nodes, config, skytether):
     change(config, cmd_vel_type="geometry_msgs/msg/Twist")
     process = skytether("robot", "run", str(config), "--check")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from skytether.ros.names import Names
 from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
+from skytether.ros.ros2.lifecycle import ACTIVE, states
 from skytether.ros.ros2.native.node import RclpyNode, clashes
 from skytether.ros.ros2.qos import Qos, history_missed, row_settings
 from skytether.ros.ros2.seam import GraphNode
@@ -34,6 +35,8 @@ from .check import (
 
 _JOIN_S = 10.0
 """For the node to come up, or the router to answer and to tell of the graph."""
+_LIFECYCLE_S = 3.0
+"""For lifecycle nodes to tell their states."""
 _LOOK_S = 5.0
 """For nodes on DDS to be discovered: nobody says when all of them are."""
 
@@ -108,7 +111,8 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
                     awaited.append((Kind.SUBSCRIPTION, config.names(()).own(config.cmd_vel)))
                 _wait(node, awaited)
                 findings[graph] = _graph(ros2, node)
-            findings += [_row(settings, part, names, node) for part in rows]
+            idle = {name: label for name, label in states(node, _LIFECYCLE_S).items() if label != ACTIVE}
+            findings += [_row(settings, part, names, node, idle) for part in rows]
             findings += forbidden(config.permissions(), specs, names, settings.command_topic)
             if config.cmd_vel is not None:
                 findings.append(_wheels(config, config.cmd_vel, node))
@@ -150,7 +154,8 @@ def _wait(node: RclpyNode, awaited: list[tuple[Kind, str]]) -> None:
         time.sleep(0.05)
 
 
-def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: GraphNode) -> Finding:
+def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: GraphNode, idle: Mapping[str, str]) -> Finding:
+    """One row of the service's topics; ``idle`` are the lifecycle nodes that are not active, with their states."""
     if row.kind == "topic" and row.direction == "out" and row.name == settings.command_topic:
         return Finding(row.name, "", row.type, "drives, past the supervisor")
     if row.kind == "call":
@@ -174,16 +179,22 @@ def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: GraphNode) -
     if wrong:
         return Finding(row.name, name, row.type, wrong[0], good=False)
     if waits and not others:
-        return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for")
+        asleep = ", ".join(f"{who} ({label})" for who, label in sorted(idle.items()))
+        hint = f"; lifecycle nodes that are not active: {asleep}" if asleep else ""
+        return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for{hint}", missing=True)
     who = ", ".join(sorted({o.node for o in others if o.node}))
     says = f"{verb} {who}".strip() if waits else verb
+    still = sorted({o.node for o in others if o.node in idle}) if waits else []
+    if still:
+        sleeping = ", ".join(f"{node_name} is a lifecycle node and {idle[node_name]}" for node_name in still)
+        says += f"; {sleeping}: it does nothing until it is activated (ros2 lifecycle set {still[0]} activate)"
     if kind is Kind.SUBSCRIPTION and not row.latched and any(row_settings(o.qos)["latched"] for o in others):
         says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
     if kind is Kind.SUBSCRIPTION and isinstance(node, RclpyNode) and history_missed([o.qos for o in others]):
         kept = ", ".join(sorted({o.node for o in others if o.qos.transient_local}))
         lost = ", ".join(sorted({o.node for o in others if not o.qos.transient_local}))
         says += f"; what {kept} keeps for newcomers (transient local) is missed, because {lost} offers volatile"
-    return Finding(row.name, name, row.type, says)
+    return Finding(row.name, name, row.type, says, missing=bool(still) and all(o.node in idle for o in others))
 
 
 def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: GraphNode) -> Finding:

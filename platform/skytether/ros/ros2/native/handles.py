@@ -227,7 +227,9 @@ class Server(Handle):
 
     def take(self, frame: Frame) -> None:
         number, request = pull_number(frame.body)
-        if not self._host.work(lambda: self._work(number, request)):
+        if self.refused:
+            self._fail(number, self.refused)
+        elif not self._host.work(lambda: self._work(number, request)):
             self._fail(number, "too many calls at the same time")
 
     def _work(self, number: int, request: bytes) -> None:

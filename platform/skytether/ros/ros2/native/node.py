@@ -24,10 +24,12 @@ from ..node_base import NodeBase
 from ..qos import Qos, clash
 from .handles import Client, Handle, Publication, Server, Subscription
 from .interpreter import find_python
-from .side.frames import Frame, control, pull_frame
+from .side.frames import SHUT_DOWN, Frame, control, pull_frame
 from .side.frames import Kind as FrameKind
 from .side.outbox import Sender
 
+SILENT_S = 5.0
+"""Without a sign of life of the program, which gives one each half second: then it hangs, and is ended."""
 LEAVE_S = 3.0
 """For the program to end by itself."""
 _SIDE = Path(__file__).parent / "side" / "__main__.py"
@@ -77,9 +79,14 @@ class RclpyNode(NodeBase):
         """``ROS_DOMAIN_ID``, once joined."""
         self.pid = 0
         """Of the program; 0: there is none now."""
+        self.sim_time = False
+        """Whether our node's parameter ``use_sim_time`` is set now."""
+        self._heard = 0
+        """Frames of the program."""
+        self._hung = False
 
     def _jobs(self) -> Sequence[Callable[[], None]]:
-        return (self._run,)
+        return (self._run, self._see_that_it_answers)
 
     def _interrupt(self) -> None:
         with self._lock:
@@ -165,10 +172,30 @@ class RclpyNode(NodeBase):
                 tried = 0
                 self._joined.clear()
             if not self._closing.is_set():
-                how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
-                self.report("program", f"the program that is our ROS 2 node ended {how}; it is started again")
+                self.report("program", f"the program that is our ROS 2 node {self._why(code)}; it is started again")
                 self._closing.wait(_RETRY_S[min(tried, len(_RETRY_S) - 1)])
                 tried += 1
+
+    def _why(self, code: int) -> str:
+        """How the program ended."""
+        hung, self._hung = self._hung, False
+        if hung:
+            return f"did not answer for {SILENT_S:g} s and was ended"
+        if code == SHUT_DOWN:
+            return "ended because ROS 2 was shut down in it"
+        return f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+
+    def _see_that_it_answers(self) -> None:
+        """Thread that ends a program which hangs; counts its own turns, for this process may stand still, too."""
+        turn_s, heard, silent = SILENT_S / 10, 0, 0
+        while not self._closing.wait(turn_s):
+            silent = silent + 1 if self._heard == heard and self.middleware and self.pid else 0
+            heard = self._heard
+            if silent >= 10:
+                silent, self._hung = 0, True
+                with self._lock:
+                    if self._link is not None:  # then it is ended by whoever started it
+                        self._link.shutdown(socket.SHUT_RDWR)
 
     def _keep(self, link: socket.socket) -> None:
         """Tell a new program what to be, and take what it tells until it ends."""
@@ -183,13 +210,14 @@ class RclpyNode(NodeBase):
         try:
             with link.makefile("rb", buffering=_BUFFER) as stream:
                 while (frame := pull_frame(stream)) is not None:
+                    self._heard += 1
                     self._take(frame)
         except OSError:
             pass
         finally:
             with self._lock:
                 self._link = self._sender = None
-                self._known = {}
+                self._known, self.middleware = {}, ""
                 for handle in self._handles.values():
                     handle.leave()
             sender.close()
@@ -223,7 +251,7 @@ class RclpyNode(NodeBase):
 
     def _look(self, told: dict[str, Any]) -> None:
         """The graph is another."""
-        self.nodes = told["nodes"]
+        self.nodes, self.sim_time = told["nodes"], told["sim_time"]
         known = {str(row[0]): _endpoint(row) for row in told["endpoints"]}
         changed = known != self._known
         self._known = known
@@ -276,9 +304,9 @@ def clashes(ours: Endpoint, others: Sequence[Endpoint]) -> list[str]:
 
 
 def _endpoint(row: list[Any]) -> Endpoint:
-    _, kind, name, type_name, type_hash, node, reliable, transient_local, depth, deadline, manual = row
+    _, kind, name, type_name, type_hash, node, reliable, transient_local, depth, deadline, manual, *parts = row
     qos = Qos(reliable, transient_local, depth, deadline, manual)
-    return Endpoint(Kind(kind), name, type_name, type_hash, qos, node)
+    return Endpoint(Kind(kind), name, type_name, type_hash, qos, node, parts=(parts[0], parts[1]))
 
 
 def _end(program: subprocess.Popen[bytes]) -> int:

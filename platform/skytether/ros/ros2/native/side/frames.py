@@ -21,6 +21,8 @@ from typing import Any, NamedTuple, Protocol
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
 FRESH = struct.Struct("<Qd")
+SHUT_DOWN = 3
+"""Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
 """Bytes; the largest message that a socket may carry."""
 

@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-PUBLISHER, SUBSCRIPTION, SERVER = "MP", "MS", "SS"
+PUBLISHER, SUBSCRIPTION, SERVER, CLIENT = "MP", "MS", "SS", "SC"
 """Letters of the kinds of endpoints, as the platform has them."""
 _KEPT = 10_000
 """What a history that keeps all is told as."""
@@ -29,7 +29,8 @@ def look(node: Any, names: list[str] | None) -> list[list[Any]]:
     """Endpoints of other nodes, sorted.
 
     Each is a list: its id, which is another after it was away; kind; name; type; type hash or nothing; node; reliable;
-    transient local; depth, 0 if it is not told; deadline in seconds or nothing; liveliness by hand.
+    transient local; depth, 0 if it is not told; deadline in seconds or nothing; liveliness by hand; of a service the
+    hashes of request and response.
 
     Args:
         node: Ours.
@@ -48,12 +49,15 @@ def look(node: Any, names: list[str] | None) -> list[list[Any]]:
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
-def look_at_services(node: Any, ours: set[str]) -> list[list[Any]]:
-    """Services that other nodes offer, as `look` tells endpoints; their nodes where the middleware tells them.
+def look_at_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]:
+    """Services that other nodes offer, and clients of ours, as `look` tells endpoints.
+
+    Their nodes and the hashes of their types are there where the middleware tells them.
 
     Args:
         node: Ours.
         ours: Names of the services that we offer.
+        asked: Of those that we are a client of.
     """
     found = []
     own = (node.get_name(), node.get_namespace())
@@ -62,12 +66,23 @@ def look_at_services(node: Any, ours: set[str]) -> list[list[Any]]:
         others = [s for s in servers if (s.node_name, s.node_namespace) != own]
         if (servers and not others) or (not servers and name in ours):
             continue
-        gids = [(_gid(s), _node(s)) for s in others] or [("", "")]
-        found += [
-            [f"{gid}{name} {kind}", SERVER, name, kind, "", where, True, False, 10, None, False]
-            for kind in kinds
-            for gid, where in gids
+        replies = node.get_publishers_info_by_topic(f"rr{name}Reply", no_mangle=True) if name in asked else []
+        responses = {(r.node_name, r.node_namespace): _hash(r) for r in replies}
+        seen = [(_gid(s), _node(s), _hash(s), responses.get((s.node_name, s.node_namespace), "")) for s in others] or [
+            ("", "", "", "")
         ]
+        found += [
+            [f"{gid}{name} {kind}", SERVER, name, kind, "", where, True, False, 10, None, False, request, response]
+            for kind in kinds
+            for gid, where, request, response in seen
+        ]
+    for name in ours:
+        for info in node.get_publishers_info_by_topic(f"rq{name}Request", no_mangle=True):
+            kind = info.topic_type.replace("::dds_::", "/").replace("::", "/").removesuffix("_Request_")
+            if (info.node_name, info.node_namespace) != own:
+                found.append(
+                    [_gid(info), CLIENT, name, kind, "", _node(info), True, False, 10, None, False, _hash(info), ""]
+                )
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
@@ -93,6 +108,8 @@ def _endpoint(kind: str, name: str, info: Any) -> list[Any]:
         _KEPT if qos.history == HistoryPolicy.KEEP_ALL else int(qos.depth),
         deadline if 0 < deadline < _ENDLESS else None,
         qos.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC,
+        "",
+        "",
     ]
 
 

@@ -28,7 +28,7 @@ except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
 from . import graph, types
-from .frames import Frame, Kind, control, numbered, pull_frame, pull_fresh, pull_number, push_head
+from .frames import SHUT_DOWN, Frame, Kind, control, numbered, pull_frame, pull_fresh, pull_number, push_head
 from .outbox import FIRST, Sender
 
 LOOK_S = 0.2
@@ -37,6 +37,9 @@ EVERY = 10
 """Each so many of them it is the whole graph."""
 GRAPH = 0xFFFF_FFFF
 """Channel in which the newest graph waits; where it is read slowly, older ones are left out."""
+ALIVE = 0xFFFF_FFFE
+"""Channel of a sign of life each `ALIVE_S`, from the thread that does the work."""
+ALIVE_S = 0.5
 MAX_ASKED = 64
 """Calls of one service that wait for the agent; who comes then is not answered."""
 NAMED_S = 1.0
@@ -89,12 +92,13 @@ class Program:
         # A log file below the home folder is of use to nobody, and where that cannot be written there is no node.
         arguments = ["skytether", "--ros-args", "--disable-external-lib-logs", *start["arguments"]]
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node(start["node"], namespace=start["namespace"], start_parameter_services=False)
+        self._node = rclpy.create_node(start["node"], namespace=start["namespace"])
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         # The reader sees the end too, behind what was told before it: no velocity may follow the farewell.
         self._sender = Sender(link, lambda: None)
-        self._sender.set(GRAPH, FIRST, 1)
+        for channel in (GRAPH, ALIVE):
+            self._sender.set(channel, FIRST, 1)
         self._lock = threading.Lock()
         self._names: dict[int, str] = {}
         self._publishers: dict[int, Any] = {}
@@ -114,18 +118,24 @@ class Program:
             name=self._node.get_fully_qualified_name(),
         )
 
-    def run(self, stream: Any) -> None:
-        """Be the node until the agent's end of the socket is closed."""
+    def run(self, stream: Any) -> int:
+        """Be the node until the agent's end of the socket is closed, or ROS 2 is shut down; returns the exit code."""
         for job in (lambda: self._read(stream), self._watch):
             threading.Thread(target=job, daemon=True).start()
+        alive_at = 0.0
         while not self._ended.is_set() and rclpy.ok():
+            if time.monotonic() >= alive_at:
+                alive_at = time.monotonic() + ALIVE_S
+                self._sender.put(control(what="alive"), ALIVE)
             try:
-                self._executor.spin_once(timeout_sec=0.5)
+                self._executor.spin_once(timeout_sec=ALIVE_S)
             except ExternalShutdownException:
                 break
             except Exception as error:  # one bad message or request must not end the node
                 self._say(what="trouble", channel=0, why=f"{type(error).__name__}: {error}")
+        code = 0 if self._ended.is_set() else SHUT_DOWN
         self._leave()
+        return code
 
     def _leave(self) -> None:
         began = time.monotonic()
@@ -329,24 +339,27 @@ class Program:
         wanted = {self._node.resolve_topic_name(name): name for name in list(self._names.values())}
         if whole:
             served = {self._names.get(channel, "") for channel in list(self._servers)}
-            self._all = graph.look(self._node, None) + graph.look_at_services(self._node, served)
+            asked = {self._names.get(channel, "") for channel in list(self._clients)}
+            self._all = graph.look(self._node, None) + graph.look_at_services(self._node, served, asked)
         else:
-            services = [e for e in self._all if e[1] == graph.SERVER]
-            rest = [e for e in self._all if e[1] != graph.SERVER and e[2] not in wanted]
+            services = [e for e in self._all if e[1] in (graph.SERVER, graph.CLIENT)]
+            rest = [e for e in self._all if e not in services and e[2] not in wanted]
             self._all = rest + services + graph.look(self._node, sorted(wanted))
         known = self._known(sorted(self._all, key=lambda e: str(e[0])))
         endpoints = [[*e[:2], wanted.get(e[2], e[2]), *e[3:]] for e in known]
         nodes, same = graph.others(self._node)
         dropped = self._sender.dropped()
         lost = {c: [dropped.get(c, 0), self._lost.get(c, 0)] for c in {*dropped, *self._lost}}
-        return {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
+        news = {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
+        return {**news, "sim_time": self._node.get_parameter_or("use_sim_time").value is True}
 
     def _known(self, endpoints: list[list[Any]]) -> list[list[Any]]:
         """Those whose nodes are known, or will not be."""
         now = time.monotonic()
         unnamed = {e[0] for e in endpoints if not e[5]}
         self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
-        return [e for e in endpoints if e[5] or e[1] == graph.SERVER or now - self._unnamed[e[0]] >= NAMED_S]
+        services = (graph.SERVER, graph.CLIENT)
+        return [e for e in endpoints if e[5] or e[1] in services or now - self._unnamed[e[0]] >= NAMED_S]
 
 
 def main(arguments: list[str]) -> int:
@@ -369,6 +382,6 @@ def main(arguments: list[str]) -> int:
             frame = control(what="refused", why=f"{type(error).__name__}: {error}")
             link.sendall(push_head(frame) + frame.body)
         return 1
-    program.run(stream)
+    code = program.run(stream)
     sys.stdout.flush()
-    os._exit(0)  # threads of the middleware may hang
+    os._exit(code)  # threads of the middleware may hang

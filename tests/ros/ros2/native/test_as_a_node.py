@@ -1,0 +1,235 @@
+"""What ROS 2 expects of any node, of ours: time, parameters, lifecycle; and what becomes of it when ROS 2 fails it."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from ros2_nodes import ros2_nodes, until
+
+from skytether.messages import Twist, TwistStamped, encode, hash_of
+from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
+from skytether.ros.ros2.lifecycle import states
+from skytether.ros.ros2.native import node as native
+from skytether.ros.ros2.native.node import RclpyNode
+from skytether.ros.ros2.qos import Qos
+from skytether.ros.ros2.sim_time import GraphClock
+
+__all__ = ["ros2_nodes"]
+pytestmark = [pytest.mark.slow, pytest.mark.ros2]
+
+WHEELS = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(depth=1))
+SIMULATION = """
+from rosgraph_msgs.msg import Clock
+from geometry_msgs.msg import TwistStamped
+from builtin_interfaces.msg import Time
+clock = node.create_publisher(Clock, "/clock", qos(reliable=False, depth=1))
+node.create_subscription(TwistStamped, "/cmd_vel", lambda m: say([m.header.stamp.sec, m.header.stamp.nanosec]), 10)
+seconds = [0]
+def tick():
+    if seconds[0]:
+        clock.publish(Clock(clock=Time(sec=seconds[0], nanosec=500_000_000)))
+node.create_timer(0.05, tick)
+def work():
+    for line in sys.stdin:
+        seconds[0] = int(line)
+threading.Thread(target=work, daemon=True).start()
+"""
+
+
+def test_stamps_are_of_simulated_time_if_our_node_uses_it(ros2_nodes):
+    """As ROS nodes do it: zero until /clock says something, then what it said last, also if it goes back."""
+    peer = ros2_nodes.start(SIMULATION)
+    config = Ros2RobotConfig(robot="walker", service="guide", namespace="/", cmd_vel_type=TwistStamped.TYPE)
+    with RclpyNode(NodeName(), arguments=["-p", "use_sim_time:=true"]) as node:
+        robot = Ros2Robot(config, node)
+        until(lambda: node.sim_time and node.endpoints("/cmd_vel", Kind.SUBSCRIPTION), "our node and the peer")
+
+        def stamps():
+            robot.base.read(0.0)
+            robot.base.write(Twist())
+            return peer.all()
+
+        until(lambda: [0, 0] in stamps(), "a stamp before there is a clock")
+        for second in (1200, 30):
+            peer.tell(str(second))
+            until(lambda second=second: [second, 500_000_000] in stamps(), "the simulation's time")
+        robot.close()
+
+
+def test_the_parameter_can_be_changed_while_it_runs(ros2_nodes):
+    """Our node has the parameters that every node has: they are listed, told, described and set through services."""
+    peer = ros2_nodes.start(
+        """
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+client = AsyncParameterClient(node, "/bot/skytether")
+def then(future, what):
+    future.add_done_callback(lambda f: say(what(f.result())))
+def work():
+    client.wait_for_services()
+    then(client.list_parameters(), lambda r: ["list", "use_sim_time" in r.result.names])
+    then(client.get_parameters(["use_sim_time"]), lambda r: ["get", r.values[0].bool_value])
+    then(client.describe_parameters(["use_sim_time"]), lambda r: ["describe", r.descriptors[0].type])
+    sys.stdin.readline()
+    value = Parameter("use_sim_time", value=True)
+    then(client.set_parameters([value]), lambda r: ["set", r.results[0].successful])
+threading.Thread(target=work, daemon=True).start()
+"""
+    )
+    with RclpyNode(NodeName("/bot", "skytether")) as node:
+        assert {tuple(peer.next()) for _ in range(3)} == {("list", True), ("get", False), ("describe", 1)}
+        clock = GraphClock(node, lambda: 5.0)
+        until(lambda: node.nodes, "the peer")
+        assert (node.sim_time, clock()) == (False, 5.0)
+        peer.tell("set")
+        assert peer.next() == ["set", True]
+        until(lambda: node.sim_time, "the parameter to be seen")
+        assert clock() == 0.0
+
+
+def test_states_of_lifecycle_nodes_are_told(ros2_nodes):
+    peer = ros2_nodes.start(
+        """
+from rclpy.lifecycle import LifecycleNode
+node = LifecycleNode("camera", namespace="/front")
+def work():
+    for line in sys.stdin:
+        getattr(node, "trigger_" + line.strip())()
+        say(line.strip())
+threading.Thread(target=work, daemon=True).start()
+"""
+    )
+    ros2_nodes.start("", "plain")
+    with RclpyNode() as node:
+        until(lambda: states(node, 5.0) == {"/front/camera": "unconfigured"}, "the state")
+        for step, state in (("configure", "inactive"), ("activate", "active")):
+            peer.tell(step)
+            assert peer.next() == step
+            assert states(node, 10.0) == {"/front/camera": state}
+
+
+def test_a_program_that_hangs_is_ended_and_started_again(ros2_nodes, monkeypatch):
+    monkeypatch.setattr(native, "SILENT_S", 2.0)
+    monkeypatch.setattr(native, "LEAVE_S", 0.2)
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+"""
+    )
+    said = []
+    with RclpyNode(say=said.append) as node:
+        wheels = node.publish(WHEELS)
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels")
+        hung = node.pid
+        os.kill(hung, signal.SIGSTOP)
+        until(lambda: not wheels.put(encode(Twist())), "the loss to be seen")
+        until(lambda: not Path(f"/proc/{hung}").exists(), "its end")
+        until(lambda: len(said) == 2, "the node to be there again")
+        peer.all()
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels again")
+    assert said == [
+        "the program that is our ROS 2 node did not answer for 2 s and was ended; it is started again",
+        "our ROS 2 node is there again",
+    ]
+
+
+def test_when_ros_is_shut_down_under_our_node_that_is_named_and_it_comes_back(ros2_nodes, monkeypatch, tmp_path):
+    """The context is shut down from within, as a signal handler of a library's would."""
+    (tmp_path / "sitecustomize.py").write_text(
+        f"""
+import pathlib, threading, time
+def wait():
+    file = pathlib.Path({str(tmp_path / "now")!r})
+    while not file.exists():
+        time.sleep(0.05)
+    file.unlink()
+    import rclpy
+    rclpy.shutdown()
+threading.Thread(target=wait, daemon=True).start()
+"""
+    )
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+"""
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH", "")])))
+    said = []
+    with RclpyNode(say=said.append) as node:
+        wheels = node.publish(WHEELS)
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels")
+        (tmp_path / "now").touch()
+        until(lambda: not wheels.put(encode(Twist())), "the loss to be seen")
+        until(lambda: len(said) == 2, "the node to be there again")
+        peer.all()
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels again")
+    assert said == [
+        "the program that is our ROS 2 node ended because ROS 2 was shut down in it; it is started again",
+        "our ROS 2 node is there again",
+    ]
+
+
+def test_a_publisher_that_overruns_us_is_named_and_harms_no_other_topic(ros2_nodes):
+    """Messages come quicker than they are taken: the newest win, the loss is counted, the wheels go on."""
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+from std_msgs.msg import UInt8MultiArray
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+flood = node.create_publisher(UInt8MultiArray, "/flood", qos(reliable=False, depth=1))
+message = UInt8MultiArray(data=bytes(100_000))
+def work():
+    sys.stdin.readline()
+    while True:
+        flood.publish(message)
+threading.Thread(target=work, daemon=True).start()
+"""
+    )
+    kind = "std_msgs/msg/UInt8MultiArray"
+    go, taken = [], []
+
+    def take(payload):
+        taken.append(len(payload))
+        until(lambda: go, "the test to go on")
+
+    with RclpyNode() as node:
+        wheels = node.publish(WHEELS)
+        flood = node.subscribe(Endpoint(Kind.SUBSCRIPTION, "/flood", kind, "", Qos(reliable=False, depth=1)), take)
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels")
+        peer.tell("flood")
+        until(lambda: taken, "the flood")
+        peer.all()
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels, while the flood is not taken")
+        go.append(True)
+        until(lambda: flood.dropped, "the loss to be counted")
+        until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels, in the flood")
+    assert min(taken) > 100_000
+
+
+def test_a_node_that_is_discovered_late_is_joined_all_the_same(ros2_nodes):
+    """Nobody listens at first; whoever comes later is told the newest, and we hear them."""
+    got = []
+    with RclpyNode() as node:
+        kind = "std_msgs/msg/String"
+        node.subscribe(Endpoint(Kind.SUBSCRIPTION, "/late", kind, "", Qos(reliable=False, depth=1)), got.append)
+        assert node.wait_until_joined(30.0)
+        until(lambda: node.middleware, "the node")
+        assert not node.nodes
+        ros2_nodes.start(
+            """
+from std_msgs.msg import String
+late = node.create_publisher(String, "/late", 10)
+node.create_timer(0.05, lambda: late.publish(String(data="here")))
+"""
+        )
+        until(lambda: got, "a message")
+        assert decode_text(got[0]) == "here"
+
+
+def decode_text(payload):
+    size = int.from_bytes(payload[4:8], "little")
+    return payload[8 : 8 + size - 1].decode()
