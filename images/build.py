@@ -51,6 +51,14 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "orchestrator": ("orchestrator", "docker", "kubernetes", "openstack", "postgres", "recorder"),
 }
 """Images with wheels of their own, and the extras that these are; all but the base's, which they are built on."""
+ROS2 = "ros2-base"
+"""The image with wheels of ROS 2, which have a lock file of their own."""
+_ROS2_TESTS = ("ros-test-msgs", "cyclonedds")
+"""Of those the ones that are for tests and benches only."""
+_ROS2_LACKS = ("empy", "lark-parser", "numpy", "setuptools")
+"""What they say they need, and the image does without: the base has it, or only builds use it."""
+_ROS2_MACHINE = "x86_64"
+"""What PyPI has those wheels for."""
 _NUMERICAL = ("numpy", "numpy.libs")
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """By architecture, as images name it: what wheels call it."""
@@ -127,7 +135,22 @@ def requirements(extras: Iterable[str], machine: str) -> dict[str, str]:
     """By package, the pinned requirement of Skytether with these extras for Debian's Python on such a machine."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = project["dependencies"] + [row for extra in extras for row in project["optional-dependencies"][extra]]
-    environment = {
+    packages = locked((ROOT / "requirements.lock").read_text(), environment(machine))
+    wanted = closure((canonicalize_name(Requirement(row).name) for row in names), packages)
+    return {name: packages[name][0] for name in wanted}
+
+
+def ros2_requirements(machine: str) -> dict[str, str]:
+    """By package, the pinned requirement of ROS 2 for Debian's Python on such a machine."""
+    packages = locked((ROOT / "requirements-ros2.lock").read_text(), environment(machine))
+    asked = re.findall(r"^[a-z][\w-]*", (ROOT / "requirements-ros2.in").read_text(), re.MULTILINE)
+    wanted = closure((name for name in asked if name not in _ROS2_TESTS), packages) - set(_ROS2_LACKS)
+    return {name: packages[name][0] for name in wanted}
+
+
+def environment(machine: str) -> dict[str, str]:
+    """What markers of requirements see of Debian's Python on such a machine."""
+    return {
         "python_version": PYTHON,
         "python_full_version": f"{PYTHON}.2",
         "implementation_name": "cpython",
@@ -137,15 +160,12 @@ def requirements(extras: Iterable[str], machine: str) -> dict[str, str]:
         "platform_system": "Linux",
         "os_name": "posix",
     }
-    packages = locked((ROOT / "requirements.lock").read_text(), environment)
-    wanted = closure((canonicalize_name(Requirement(row).name) for row in names), packages)
-    return {name: packages[name][0] for name in wanted}
 
 
 def fetch(group: str, machine: str) -> None:
     """Have the wheels of an image, and the list that they are installed from."""
-    rows = requirements(EXTRAS[group], machine)
-    if group != "base":
+    rows = ros2_requirements(machine) if group == ROS2 else requirements(EXTRAS[group], machine)
+    if group not in ("base", ROS2):
         rows = {name: row for name, row in rows.items() if name not in requirements((), machine)}
     text = "\n".join(rows[name] for name in sorted(rows)) + "\n"
     listed, folder = WORK / f"{group}-{machine}.txt", WORK / "wheels" / machine / group
@@ -207,7 +227,7 @@ def context(name: str, machine: str) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
         tar.add(IMAGES / name, ".", filter=_plain)
-        if name in EXTRAS:
+        if name in (*EXTRAS, ROS2):
             tar.add(WORK / f"{name}-{machine}.txt", f"{name}.txt", filter=_plain)
             tar.add(WORK / "wheels" / machine / name, f"wheels/{name}", filter=_plain)
             tar.add(Path(pip.__file__).parent, "pip/pip", filter=_plain)
@@ -391,13 +411,18 @@ def run(asked: argparse.Namespace, client: docker.DockerClient, pusher: Pusher |
     if "base" in names:
         make_wheel()
     for target in targets(client, asked.platform, asked.debian):
-        for group in EXTRAS:
-            if group in names:
+        for_it = [name for name in names if name != ROS2 or target.machine == _ROS2_MACHINE]
+        if for_it != names:
+            if ROS2 in asked.name:
+                raise BuildError(f"{ROS2} is for linux/amd64 only, as ROS 2's wheels are")
+            print(f"note: {ROS2} is left out for {target.platform}: ROS 2's wheels are for amd64", file=sys.stderr)
+        for group in (*EXTRAS, ROS2):
+            if group in for_it:
                 fetch(group, target.machine)
-        source = sources(client, names, target) if pusher or asked.tag == SOURCE else {}
-        tagged = {name: f"{source[name] if asked.tag == SOURCE else asked.tag}{target.suffix}" for name in names}
+        source = sources(client, for_it, target) if pusher or asked.tag == SOURCE else {}
+        tagged = {name: f"{source[name] if asked.tag == SOURCE else asked.tag}{target.suffix}" for name in for_it}
         debian = client.api.inspect_image(target.debian)["RootFS"]["Layers"] if pusher else []
-        for name in names:
+        for name in for_it:
             rows.append(build(client, name, asked.prefix, tagged, target))
             if asked.sbom:
                 write_bill(client, rows[-1].image, asked.sbom)
@@ -412,7 +437,7 @@ def run(asked: argparse.Namespace, client: docker.DockerClient, pusher: Pusher |
         if asked.json:
             print(json.dumps([asdict(row) for row in rows], indent=2))
         return
-    pushed = [pusher.tag(name, _tags(asked.tag, made_from[name])) for name in names]
+    pushed = [pusher.tag(name, _tags(asked.tag, made_from[name])) for name in names if made_from[name]]
     if asked.digests:
         asked.digests.write_text(yaml.safe_dump(values(pushed), sort_keys=False))
     _tell(pushed, as_json=asked.json)

@@ -12,9 +12,9 @@ from packaging.utils import canonicalize_name
 
 _LISTED = """
 dpkg-query -W -f 'deb\\t${Package}\\t${Version}\\t${Architecture}\\n'
-[ ! -x /app/bin/python ] || /app/bin/python -c '
+for python in /app/bin/python /opt/ros2/bin/python; do [ ! -x $python ] || $python -c '
 from importlib.metadata import distributions
-for one in distributions(): print("pypi", one.name, one.version, sep="\\t")'
+for one in distributions(): print("pypi", one.name, one.version, sep="\\t")'; done
 """
 """Says a row of an image's every package: its kind, name, version, architecture."""
 

@@ -1,7 +1,7 @@
 import pytest
 from pydantic import ValidationError
 
-from skytether.api.manifest import ROS1_ENTRYPOINT, ServiceSpec, TopicSpec
+from skytether.api.manifest import GRAPH_ENTRYPOINTS, ServiceSpec, TopicSpec
 from skytether.bridge.spec import topics_from_api
 from skytether.wire.topic import Role
 
@@ -57,8 +57,25 @@ def test_an_action_is_neither_latched_nor_unreliable():
 
 def test_a_service_with_a_graph_needs_only_its_launch_file():
     spec = ServiceSpec(graph="ros1", launch="/launch/nav.launch", topics=[MOVE], remap={"move_base": "/move_base"})
-    assert spec.entrypoint == ROS1_ENTRYPOINT
+    assert spec.entrypoint == GRAPH_ENTRYPOINTS["ros1"]
     assert ServiceSpec(graph="ros1", launch="a/b.launch", entrypoint="own").entrypoint == "own"
+
+
+def test_a_graph_of_ros_2_gets_numbers_as_its_nodes_declare_them():
+    number, words = {"type": "number"}, {"type": "string"}
+    planner = {"type": "object", "properties": {"speed": number, "name": words}}
+    schema = {"properties": {"rate": number, "count": {"type": "integer"}, "planner": planner, "xs": {"items": number}}}
+    spec = ServiceSpec(graph="ros2", launch="/nodes/guide.py", params=schema)
+    assert spec.entrypoint == GRAPH_ENTRYPOINTS["ros2"]
+    given = {"rate": 2, "count": 2, "planner": {"speed": 1, "name": "x"}, "xs": [1, 2.5, True], "more": 3}
+    typed = spec.typed(given)
+    assert typed == given
+    assert isinstance(typed["rate"], float)
+    assert isinstance(typed["planner"]["speed"], float)
+    assert [type(x) for x in typed["xs"]] == [float, float, bool]
+    assert {type(typed["count"]), type(typed["more"])} == {int}
+    assert spec.typed({"rate": 10**400}) == {"rate": 10**400}
+    assert isinstance(ServiceSpec(graph="ros1", launch="/a", params=schema).typed(given)["rate"], int)
 
 
 @pytest.mark.parametrize(
@@ -68,8 +85,9 @@ def test_a_service_with_a_graph_needs_only_its_launch_file():
         ({"entrypoint": "x", "launch": "/a.launch"}, "add graph: ros1"),
         ({"entrypoint": "x", "remap": {"a": "/b"}}, "add graph: ros1"),
         ({"graph": "ros1", "launch": "/a.launch", "remap": {"scan": "/x"}}, "the service has no topic 'scan'"),
-        ({"graph": "ros2", "launch": "/a.launch", "entrypoint": "x"}, "graph\n.*ROS 2 are not started here.*ros2: in"),
-        ({"graph": "yarp", "launch": "/a.launch", "entrypoint": "x"}, "graph"),
+        ({"graph": "ros2"}, "graph: ros2 needs launch"),
+        ({"graph": "ros2", "launch": "/a", "topics": [MOVE]}, "'move_base': kind: action is an action of ROS 1"),
+        ({"graph": "yarp", "launch": "/a.launch", "entrypoint": "x"}, "graph\n.*should be 'ros1' or 'ros2'"),
     ],
 )
 def test_what_does_not_fit_together_is_named(spec, says):

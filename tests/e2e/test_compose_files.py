@@ -49,12 +49,13 @@ def test_the_orchestrator_is_another_user_than_the_services() -> None:
     """On an engine without user namespaces, a service that got out of its container would be the orchestrator."""
     users = {
         name: re.findall(r"^USER (\d+:\d+)$", (ROOT / "images" / name / "Dockerfile").read_text(), re.MULTILINE)
-        for name in ("base", "ros1-base", "orchestrator")
+        for name in ("base", "ros1-base", "ros2-base", "orchestrator")
     }
-    assert users == {name: [f"{u}:{u}"] for name, u in (("base", USER), ("ros1-base", USER), ("orchestrator", 65531))}
-    ours = {SERVICES[name]["user"] for name in ("orchestrator", "passwords", "token")}
-    assert ours == set(users["orchestrator"])
-    others = [service["user"].split(":")[0] for service in SERVICES.values() if service["user"] not in ours]
+    ours = (("base", USER), ("ros1-base", USER), ("ros2-base", USER), ("orchestrator", 65531))
+    assert users == {name: [f"{u}:{u}"] for name, u in ours}
+    own = {SERVICES[name]["user"] for name in ("orchestrator", "passwords", "token")}
+    assert own == set(users["orchestrator"])
+    others = [service["user"].split(":")[0] for service in SERVICES.values() if service["user"] not in own]
     assert len(others) == len(set(others))
     assert str(USER) not in others
 

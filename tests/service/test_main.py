@@ -55,6 +55,12 @@ def test_a_wrong_grant_names_the_keys_and_never_the_secret(capsys, grant) -> Non
     assert secret not in text
 
 
+def test_a_graph_is_no_service_of_ours(capsys, grant) -> None:
+    text = refused(capsys, grant(graph="ros2", launch="/nodes/guide.py"))
+    assert "says graph: ros2, but its image or entry point starts a service without a graph" in text
+    assert "build the image on skytether/ros2-base" in text
+
+
 @pytest.mark.parametrize(("change", "field"), [({"session_key": "c2hvcnQ="}, "key"), ({"session_id": "12"}, "id")])
 def test_a_session_that_is_none(capsys, grant, change, field) -> None:
     text = refused(capsys, grant(**change))

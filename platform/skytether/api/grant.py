@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from .manifest import Strict, TopicSpec
+from .manifest import GraphKind, Strict, TopicSpec
 
 GRANT_VARIABLE = "SKYTETHER_GRANT"
 DEFAULT_GRANT_PATH = "/run/skytether/grant.json"
@@ -30,6 +30,8 @@ class Grant(Strict):
     topics: tuple[TopicSpec, ...]
     launch: str | None = None
     """Of a service with a ROS graph of its own: its launch file, see the manifest."""
+    graph: GraphKind = "ros1"
+    """Of such a service: the generation."""
     remap: dict[str, str] = {}
     """Of such a service: names in its graph."""
     bind_host: str = "127.0.0.1"
@@ -49,8 +51,10 @@ class Grant(Strict):
 
     @model_serializer(mode="wrap")
     def _as_earlier_images_take_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Services of images that were made before there were step times refuse a grant that speaks of them."""
+        """Services of earlier images refuse a grant that speaks of step times, or says that a graph is of ROS 1."""
         document: dict[str, Any] = handler(self)
         if not self.step_times:
             document.pop("step_times", None)
+        if self.graph == "ros1":
+            document.pop("graph", None)
         return document

@@ -24,7 +24,9 @@ Egress = Annotated[
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
-ROS1_ENTRYPOINT = "skytether.service.ros1"
+GraphKind = Literal["ros1", "ros2"]
+GRAPH_ENTRYPOINTS: dict[str, str] = {"ros1": "skytether.service.ros1", "ros2": "skytether.service.ros2"}
+"""What a service with a ROS graph of its own runs, by generation."""
 CALL_DEPTH = 64
 """Requests, and answers, that may be under way by default."""
 ACTION_NEWEST_LIFESPAN_MS = 1000
@@ -292,11 +294,13 @@ class ServiceSpec(Strict):
     """Container image; needed by container sites."""
     entrypoint: str | None = None
     """Python module with a ``__main__``; needed by process sites."""
-    graph: Literal["ros1"] | None = None
-    """``ros1``: a ROS 1 graph of its own, with unchanged nodes: ``launch`` says which. The entry point is then
-    ``skytether.service.ros1`` unless another is named, and the image one made on ``skytether/ros1-base``."""
+    graph: GraphKind | None = None
+    """``ros1`` or ``ros2``: a ROS graph of its own, with unchanged nodes: ``launch`` says which. The entry point is
+    then ``skytether.service.ros1`` (or ``ros2``) unless another is named, and the image one made on
+    ``skytether/ros1-base`` (or ``ros2-base``)."""
     launch: Annotated[str, Field(min_length=1, max_length=1024)] | None = None
-    """Launch file of the graph: an absolute path where the service runs, or ``package/file.launch``."""
+    """Launch file of the graph: an absolute path where the service runs, or ``package/file.launch``. Of ROS 2 also a
+    program that is no launch file: a path, or ``package/program``."""
     remap: dict[str, str] = {}
     """Names in the graph of the service's topics, calls and actions, where they are not those of its namespaces."""
     params: dict[str, Any] = {}
@@ -318,29 +322,25 @@ class ServiceSpec(Strict):
                 raise ValueError(f"limits.{key} is {limit:g}, less than needs.scaling.{key}.max, {range_.max:g}")
         return self
 
-    @field_validator("graph", mode="before")
-    @classmethod
-    def _graphs_of_ros2_are_joined(cls, graph: Any) -> Any:
-        if graph == "ros2":
-            raise ValueError(
-                "graphs of ROS 2 are not started here, only those of ros1; start the nodes yourself, and join "
-                "them with ros2: in the configuration of `skytether bridge`"
-            )
-        return graph
-
     @model_validator(mode="before")
     @classmethod
     def _graphs_have_an_entry_point(cls, spec: Any) -> Any:
-        if isinstance(spec, dict) and spec.get("graph") == "ros1" and not spec.get("entrypoint"):
-            return {**spec, "entrypoint": ROS1_ENTRYPOINT}
-        return spec
+        if not isinstance(spec, dict) or spec.get("entrypoint"):
+            return spec
+        entrypoint = GRAPH_ENTRYPOINTS.get(str(spec.get("graph")))
+        return {**spec, "entrypoint": entrypoint} if entrypoint else spec
 
     @model_validator(mode="after")
     def _graph_is_whole(self) -> ServiceSpec:
         if self.graph is not None and self.launch is None:
             raise ValueError(f"graph: {self.graph} needs launch: the launch file with the service's nodes")
         if self.graph is None and (self.launch is not None or self.remap):
-            raise ValueError("launch and remap are for a service with a graph of its own; add graph: ros1")
+            raise ValueError("launch and remap are for a service with a graph of its own; add graph: ros1 or ros2")
+        for topic in self.topics:
+            if self.graph == "ros2" and topic.kind == "action":
+                raise ValueError(
+                    f"'{topic.name}': kind: action is an action of ROS 1; one of graph: ros2 is ros2_action"
+                )
         known = {t.name for t in self.topics}
         for name in self.remap:
             if name not in known and ANY_TOPIC not in known:
@@ -372,6 +372,10 @@ class ServiceSpec(Strict):
         }
         return self.model_copy(update={"needs": needs, "limits": self.limits.model_copy(update=raised)})
 
+    def typed(self, params: dict[str, Any]) -> dict[str, Any]:
+        """The parameters as the service's graph takes them: for ROS 2, 2 is no number with a fraction, but 2.0 is."""
+        return _typed(self.params, params) if self.graph == "ros2" else params
+
     @property
     def robot_topics(self) -> Topics:
         """Those between the service and its robot's graph."""
@@ -380,6 +384,19 @@ class ServiceSpec(Strict):
     def shared(self, direction: Literal["in", "out"]) -> str | None:
         """The topic of this direction that is shared between robots; None: there is none."""
         return next((t.name for t in self.topics if t.shared and t.direction == direction), None)
+
+
+def _typed(schema: Any, value: Any) -> Any:
+    """A value, with whole numbers made floats wherever its schema says ``number``."""
+    schema = schema if isinstance(schema, dict) else {}
+    if isinstance(value, dict):
+        properties = schema.get("properties")
+        known = properties if isinstance(properties, dict) else {}
+        return {name: _typed(known.get(name), inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_typed(schema.get("items"), inner) for inner in value]
+    whole = type(value) is int and abs(value) < 2**63  # what is larger is no value of ROS 2
+    return float(value) if whole and schema.get("type") == "number" else value
 
 
 class Manifest(Strict):

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from pydantic import ValidationError
 
 from skytether.api.grant import DEFAULT_GRANT_PATH, GRANT_VARIABLE, Grant
+from skytether.api.manifest import GraphKind
 from skytether.api.service_report import FILE_NAME
 from skytether.messages import warm
 from skytether.wire.topic import Role
@@ -47,7 +48,9 @@ def run(cls: type[Service[Any]]) -> NoReturn:
 def serve(cls: type[Service[Any]], environ: Mapping[str, str]) -> int:
     """Run one service until SIGTERM, SIGINT or idle; returns the exit status. Needs the main thread."""
     try:
-        return _serve(cls, read_grant(environ))
+        grant = read_grant(environ)
+        check_graph(grant, None)
+        return _serve(cls, grant)
     except ServiceError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return error.status
@@ -70,6 +73,21 @@ def read_grant(environ: Mapping[str, str]) -> Grant:
         problems = error.errors(include_url=False, include_input=False, include_context=False)
         text = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'document'}: {p['msg']}" for p in problems)
         raise ConfigError(f"the grant {path} is wrong: {text}") from None
+
+
+def check_graph(grant: Grant, kind: GraphKind | None) -> None:
+    """See that the manifest asks for what runs here: a graph of this kind, or none.
+
+    Raises:
+        ConfigError: It asks for another.
+    """
+    asked = grant.graph if grant.launch is not None else None
+    if asked != kind and asked is not None:
+        here = f"a graph of {kind}" if kind is not None else "a service without a graph"
+        raise ConfigError(
+            f"the manifest of {grant.service} says graph: {asked}, but its image or entry point starts {here}: "
+            f"build the image on skytether/{asked}-base, and name no entrypoint"
+        )
 
 
 def check_topics(cls: type[Service[Any]], grant: Grant) -> None:

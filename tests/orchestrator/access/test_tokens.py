@@ -342,6 +342,7 @@ def test_scope_catalog_has_only_run_what_the_operator_allows(served_with: Any, m
         ({"entrypoint": "http.server"}, "may not have the module 'http.server'"),
         ({"entrypoint": "ours.walk.more"}, "may not have the module"),
         ({"graph": "ros1", "launch": "/tmp/any.launch"}, "may not have the module 'skytether.service.ros1'"),
+        ({"graph": "ros2", "launch": "/tmp/any.py"}, "may not have the module 'skytether.service.ros2'"),
         ({"entrypoint": None, "image": "evil:1"}, "may not have the image 'evil:1'"),
     ):
         document = manifest("mine", **spec)

@@ -30,7 +30,8 @@ from skytether.messages import (
 )
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener
-from skytether.service.ros1 import launch_arguments, ros_environment
+from skytether.service.ros1 import launch_arguments
+from skytether.service.ros_graph import ros_environment
 
 LAUNCH = """
 <launch>
@@ -320,7 +321,7 @@ def test_nodes_get_a_master_of_their_own_and_nothing_of_ours(tmp_path):
         "ROS_MASTER_URI": "http://other:1",
         "HOME": "/root",
     }
-    found = ros_environment(environ, 4711, tmp_path)
+    found = ros_environment(environ, tmp_path, {"ROS_MASTER_URI": "http://127.0.0.1:4711"})
     assert found["PATH"] == "/usr/bin"
     assert found["ROS_MASTER_URI"] == "http://127.0.0.1:4711"
     assert not {"PYTHONPATH", "SKYTETHER_GRANT"} & set(found)

@@ -171,7 +171,7 @@ class CatalogScope(Group):
 
     modules: tuple[str, ...] = ()
     """Python modules beside those of installed services and of `catalog_dir`. At a site of processes they run on the
-    orchestrator's machine; `skytether.service.ros1` starts whatever a launch file says."""
+    orchestrator's machine; `skytether.service.ros1` and `skytether.service.ros2` start whatever `launch` says."""
     images: tuple[str, ...] = ("*",)
     """Patterns of images, such as `registry.example/*`; each site may narrow them (its `images`)."""
 

@@ -328,11 +328,12 @@ class Reconciler:
             service=record.service,
             robot=record.robot or "standby",
             idle_exit_s=_SPARE_IDLE if record.standby else Grant.model_fields["idle_exit_s"].default,
-            params=record.params,
+            params=spec.typed(record.params),
             session_id=record.session_id,
             session_key=base64.b64encode(self._secrets.session_key(record.session_id, record.key_id)).decode(),
             topics=spec.topics,
             launch=spec.launch,
+            graph=spec.graph or "ros1",
             remap=spec.remap,
             step_times=spec.needs.scaling is not None and spec.needs.scaling.step_ms is not None,
         )

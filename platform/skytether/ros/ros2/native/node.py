@@ -13,7 +13,7 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
@@ -45,6 +45,7 @@ class RclpyNode(NodeBase):
         name: Who we are.
         python: That has rclpy; None: it is found.
         domain: ``ROS_DOMAIN_ID``; None: as in the environment.
+        environment: Of the program; None: this process's.
         arguments: For rclpy, as they follow ``--ros-args``: remappings, enclave, log level.
         say: Told each trouble once, and its end; by default it is logged.
 
@@ -58,12 +59,15 @@ class RclpyNode(NodeBase):
         *,
         python: str | None = None,
         domain: int | None = None,
+        environment: Mapping[str, str] | None = None,
         arguments: Sequence[str] = (),
         say: Callable[[str], object] | None = None,
     ) -> None:
         super().__init__(name, say)
-        self._python = find_python(python)
-        self._environment = dict(os.environ) if domain is None else {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        given = os.environ if environment is None else environment
+        self.python = find_python(python, given)
+        """That has rclpy."""
+        self._environment = dict(given) if domain is None else {**given, "ROS_DOMAIN_ID": str(domain)}
         self._arguments = list(arguments)
         self._lock = threading.RLock()
         self._handles: dict[int, Handle] = {}
@@ -157,7 +161,7 @@ class RclpyNode(NodeBase):
             with ours:
                 with its:
                     program = subprocess.Popen(
-                        [self._python, str(_SIDE), str(its.fileno())],
+                        [self.python, str(_SIDE), str(its.fileno())],
                         pass_fds=[its.fileno()],
                         stdin=subprocess.DEVNULL,
                         env=self._environment,
