@@ -39,6 +39,8 @@ def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         ("localhost/app", "localhost"),
         ("registry.example/a/b", "registry.example"),
         ("walker:5000/app", "walker:5000"),
+        ("LOCALHOST/app", "LOCALHOST"),
+        ("Walker/app", "Walker"),
     ],
 )
 def test_the_registry_is_the_one_that_an_engine_asks(image: str, registry: str) -> None:
@@ -60,6 +62,13 @@ def test_its_addresses_in_networks_are_this_machine_too(names: dict[str, list[st
             assert "is this machine" in str(refusal("evil.example/x"))
 
 
+def test_this_machine_is_not_asked_by_its_name_in_capitals(names: dict[str, list[str]]) -> None:
+    """With a hub that is elsewhere, and that may be all that was named."""
+    names["docker.io"], names["LOCALHOST"] = ["192.0.2.8"], ["127.0.0.1"]
+    assert "is this machine" in str(refusal("LOCALHOST/app"))
+    assert "nobody named the registry" in str(refusal("LOCALHOST/app", ("docker.io",)))
+
+
 def test_elsewhere_is_good_and_what_is_not_found_is_the_engine_s_to_say(names: dict[str, list[str]]) -> None:
     names["docker.io"] = ["192.0.2.8"]
     assert refusal("debian") is None
@@ -71,7 +80,7 @@ def test_what_is_named_is_all(names: dict[str, list[str]]) -> None:
     names["localhost"] = ["127.0.0.1"]
     assert refusal("localhost:5000/app", named) is None
     assert refusal("registry.example/app", named) is None
-    for image in ("debian", "localhost/app", "localhost:5001/app", "registry.example:444/app"):
+    for image in ("debian", "localhost/app", "localhost:5001/app", "registry.example:444/app", "Walker/app"):
         assert "nobody named the registry" in str(refusal(image, named))
 
 

@@ -20,7 +20,10 @@ DOCKER_HUB = "docker.io"
 def registry_of(image: str) -> str:
     """``HOST[:PORT]`` from which an engine pulls an image of this name."""
     first, rest = image.partition("/")[::2]
-    return first if rest and ("." in first or ":" in first or first == "localhost") else DOCKER_HUB
+    # Repositories are lower case, so newer engines (distribution's reference, splitDockerDomain) take anything else for
+    # a host: LOCALHOST is this machine.
+    is_host = "." in first or ":" in first or first == "localhost" or first != first.lower()
+    return first if rest and is_host else DOCKER_HUB
 
 
 class Registries:
