@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from ros2_nodes import ros2_nodes, until
+from ros2_nodes import far_nodes, ros2_nodes, until
 
 from skytether.messages import Twist, TwistStamped, encode, hash_of
 from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
@@ -16,7 +16,7 @@ from skytether.ros.ros2.native.node import RclpyNode
 from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.sim_time import GraphClock
 
-__all__ = ["ros2_nodes"]
+__all__ = ["far_nodes", "ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2]
 
 WHEELS = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(depth=1))
@@ -208,6 +208,22 @@ threading.Thread(target=work, daemon=True).start()
         until(lambda: flood.dropped, "the loss to be counted")
         until(lambda: wheels.put(encode(Twist())) and peer.all(), "the wheels, in the flood")
     assert min(taken) > 100_000
+
+
+def test_a_graph_without_anybody_is_named_until_somebody_comes(ros2_nodes, far_nodes, monkeypatch):
+    """Another domain looks like another RMW: as if nobody were there."""
+    monkeypatch.setattr(native, "ALONE_S", 1.0)
+    said = []
+    far_nodes.start("")
+    with RclpyNode(say=said.append) as node:
+        until(lambda: node.troubles, "a word on that")
+        assert said == [
+            f"ROS 2 graph (rmw_fastrtps_cpp, domain {ros2_nodes.domain}): no other node is seen: do they have the same "
+            "ROS_DOMAIN_ID and RMW_IMPLEMENTATION, and may they be discovered (ROS_AUTOMATIC_DISCOVERY_RANGE, "
+            "ROS_STATIC_PEERS)?"
+        ]
+        ros2_nodes.start("")
+        until(lambda: not node.troubles, "the trouble to be over")
 
 
 def test_a_node_that_is_discovered_late_is_joined_all_the_same(ros2_nodes):

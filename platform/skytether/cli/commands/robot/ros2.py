@@ -17,7 +17,7 @@ from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.lifecycle import ACTIVE, states
-from skytether.ros.ros2.native.node import RclpyNode, clashes
+from skytether.ros.ros2.native.node import NOBODY, RclpyNode, clashes
 from skytether.ros.ros2.qos import Qos, history_missed, row_settings
 from skytether.ros.ros2.seam import GraphNode
 
@@ -136,14 +136,10 @@ def _graph(ros2: Ros2Config, node: RclpyNode) -> Finding:
         says = "; ".join(node.troubles) or f"our node was not there within {_JOIN_S:g} s"
         return Finding("ROS 2 graph", ros2.node, "", says, good=False)
     where = f"{node.middleware}, domain {node.domain}"
+    if not node.nodes:
+        return Finding("ROS 2 graph", where, "", NOBODY, good=False)
     if node.troubles:
         return Finding("ROS 2 graph", where, "", "; ".join(node.troubles), good=False)
-    if not node.nodes:
-        says = (
-            "no other node is seen: do they have the same ROS_DOMAIN_ID and RMW_IMPLEMENTATION, and may they be "
-            "discovered (ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS)?"
-        )
-        return Finding("ROS 2 graph", where, "", says, good=False)
     return Finding("ROS 2 graph", where, "", f"{node.nodes} other nodes are seen")
 
 

@@ -30,6 +30,12 @@ from .side.outbox import Sender
 
 SILENT_S = 5.0
 """Without a sign of life of the program, which gives one each half second: then it hangs, and is ended."""
+ALONE_S = 10.0
+"""Without any other node in the graph: then that is said."""
+NOBODY = (
+    "no other node is seen: do they have the same ROS_DOMAIN_ID and RMW_IMPLEMENTATION, and may they be "
+    "discovered (ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS)?"
+)
 LEAVE_S = 3.0
 """For the program to end by itself."""
 _SIDE = Path(__file__).parent / "side" / "__main__.py"
@@ -190,11 +196,19 @@ class RclpyNode(NodeBase):
         return f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
 
     def _see_that_it_answers(self) -> None:
-        """Thread that ends a program which hangs; counts its own turns, for this process may stand still, too."""
-        turn_s, heard, silent = SILENT_S / 10, 0, 0
+        """Thread that ends a program which hangs, and says if there is no other node.
+
+        It counts its own turns, for this process may stand still, too.
+        """
+        turn_s, heard, silent, alone = SILENT_S / 10, 0, 0, 0
         while not self._closing.wait(turn_s):
             silent = silent + 1 if self._heard == heard and self.middleware and self.pid else 0
             heard = self._heard
+            alone = alone + 1 if self._joined.is_set() and not self.nodes else 0
+            if alone * turn_s >= ALONE_S:
+                self.report("alone", f"ROS 2 graph ({self.middleware}, domain {self.domain}): {NOBODY}")
+            elif self.nodes:
+                self.settle("alone")
             if silent >= 10:
                 silent, self._hung = 0, True
                 with self._lock:
