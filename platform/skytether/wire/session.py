@@ -15,13 +15,13 @@ from .codec.negotiation import index_topics
 from .codec.plaintext import INNER
 from .config import Config
 from .connect.handshake import HandshakeResponder
-from .connect.handshake_driver import HandshakeDriver, Times
-from .connect.paths import Choice, Paths
+from .connect.handshake_driver import HandshakeDriver, HandshakeMessage
+from .connect.paths import Paths
 from .connect.reconnect import Reconnector
 from .events import Connected, Disconnected, Event, MessageReceived
 from .path.path import Path, Transmit
 from .receive.delivery import Delivery
-from .receive.receiver import Receiver
+from .receive.receiver import AuthenticMessage, Receiver
 from .send.sender import Sender
 from .state.epoch import Epoch
 from .state.reliable_topics import ReliableTopics
@@ -74,29 +74,25 @@ class Session:
         self._table = index_topics(topics)
         self._config = config or Config()
         self._events: deque[Event] = deque()
-        self._paths = Paths(
-            self._config, self._send_ping, self._on_choice, self._on_moved, self._events.append, entropy, now
-        )
+        first = Path(0, self._config, now)
+        self._sender = Sender(self._config, first)
+        self._paths = Paths(self._config, first, self._sender, self._events, entropy, now)
         self._peer: Hashable | None = None
-        self._sender = Sender(self._config, self._paths.choice.active)
         self._rejected: Counter[str] = Counter()
         self._delivery = Delivery(self._config.max_message, self._events, self._rejected)
         service = role is Role.SERVICE
         hello_tags, welcome_tags = HandshakeTags(key, b"hello"), HandshakeTags(key, b"welcome")
         self._receiver = Receiver(
             session_id if service else None, hello_tags if service else welcome_tags, self._config, self._paths.get,
-            self._find_epoch, self._on_message, self._on_handshake,
-            self._delivery.expired, self._rejected,
+            self._find_epoch, self._delivery.expired, self._rejected,
         )  # fmt: skip
         self._counters = TopicCounters(role)
-        self._reliable = ReliableTopics(
-            role, topics, self._config.queue_limit, self._counters, self._sender.queue_reliable
-        )
+        self._reliable = ReliableTopics(role, topics, self._config.queue_limit, self._counters)
         self._responder = HandshakeResponder(key, self._table, entropy) if service else None
         self._reconnector = Reconnector(session_id, key, topics, self._config, entropy)
         self._driver = HandshakeDriver(
             self._responder, self._reconnector, self._paths, self._sender, self._counters,
-            welcome_tags if service else hello_tags, self._events, self._rejected, self._on_welcomed,
+            welcome_tags if service else hello_tags, self._events, self._rejected,
         )  # fmt: skip
 
         self._epoch: Epoch | None = None
@@ -148,7 +144,9 @@ class Session:
         if row is not None and row.topic.compression and not isinstance(payload, Compressed):
             payload = compress(payload)
         if reliable is not None:
-            return self._reliable.put(reliable, payload, now)
+            accepted = self._reliable.put(reliable, payload, now)
+            self._queue_woken()
+            return accepted
         if sender is not None:
             sender.counters.offered += 1
             self._sender.queue_message(sender, payload, now)
@@ -269,7 +267,11 @@ class Session:
         it lay in this machine before: they are not the path's.
         """
         if not self._closed:
-            self._receiver.receive(memoryview(data), address, path, now, segment, waited)
+            for received in self._receiver.receive(memoryview(data), address, path, now, segment, waited):
+                if isinstance(received, AuthenticMessage):
+                    self._on_message(received)
+                else:
+                    self._on_handshake(received)
             if self._connected:
                 self._paths.report_arrivals(now)
 
@@ -327,6 +329,7 @@ class Session:
         if now >= self._reliable.due:
             for message in self._reliable.handle_timer(now):
                 self._sender.queue_frame(message, now)
+            self._queue_woken()
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
@@ -335,13 +338,14 @@ class Session:
 
     # --- keys
 
-    def _on_handshake(self, kind: int, common: bytes, message: bytes, path: int, address: Hashable, now: float) -> None:
-        self._driver.handle_handshake(kind, common, message, path, address, self._epoch, self._previous, now)
-
-    def _on_welcomed(self, epoch: Epoch, times: Times | None, now: float) -> None:
-        self._start_epoch(epoch, now)
-        if times is not None:
-            self._delivery.clock.exchange(*times, now)
+    def _on_handshake(self, received: HandshakeMessage) -> None:
+        welcomed = self._driver.handle_handshake(received, self._epoch, self._previous)
+        if welcomed is not None:
+            self._start_epoch(welcomed.epoch, received.now)
+            times = welcomed.times
+            if times is not None:
+                self._delivery.clock.exchange(*times, received.now)
+            self._paths.welcomed(received.path, times[2] if times is not None else None, received.now)
 
     def _find_epoch(self, packet_id: int) -> Epoch | None:
         epoch = self._epoch
@@ -374,6 +378,7 @@ class Session:
         self._sender.start_epoch(epoch)
         self._counters.start_epoch(epoch)
         restarted = self._reliable.start_epoch(epoch, now)
+        self._queue_woken()
         self._delivery.start_epoch(epoch)
         self._paths.start_epoch(now)
         self._sweep_at = now + self._config.keepalive
@@ -408,6 +413,7 @@ class Session:
         self._check_at = now + self._config.silence
         self._events.append(Connected(topics, restarted))
         self._reliable.resume(now)
+        self._queue_woken()
 
     def _disconnect(self, reason: str) -> None:
         self._connected = False
@@ -431,10 +437,8 @@ class Session:
 
     # --- messages
 
-    def _on_message(
-        self, epoch: Epoch, index: int, plaintext: bytes, number: int, path: int, address: Hashable, now: float
-    ) -> None:
-        """One authentic message, the first time that it is complete."""
+    def _on_message(self, received: AuthenticMessage) -> None:
+        epoch, index, plaintext, number, path, address, now = received
         asked_from: Hashable | None = None
         if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
             if self._responder is not None:
@@ -458,12 +462,6 @@ class Session:
             self._on_frame(epoch, plaintext[INNER.size :], stamp, came_by, address, now)
             return
         self._delivery.deliver_message(epoch, epoch.receive[index], plaintext, sequence, stamp, now)
-
-    def _on_choice(self, choice: Choice, now: float) -> None:
-        self._sender.use(self._paths, *choice, now)
-
-    def _on_moved(self, path: Path, since: float, now: float) -> None:
-        self._sender.repeat(path, since, now)
 
     def _on_frame(
         self, epoch: Epoch, data: bytes, micros: int, path: Path | None, address: Hashable, now: float
@@ -490,6 +488,7 @@ class Session:
             self._delivery.forward(message, epoch, now)
         else:
             self._reliable.on_frame(message, epoch, now)
+            self._queue_woken()
 
     # --- sending of our own accord
 
@@ -499,8 +498,8 @@ class Session:
         for message in frames.push_reports(*self._counters.rows(self._epoch, now)):
             self._sender.queue_frame(message, now)
 
-    def _send_ping(self, path: Path, message: bytes, address: Hashable | None, now: float) -> None:
-        if address is None:
-            self._sender.send_frame(path, message, now)
-        else:
-            path.validation.sent(address, self._sender.send_frame_to(address, path, message, now))
+    def _queue_woken(self) -> None:
+        """Queue the reliable topics that have something to send."""
+        woken = self._reliable.woken
+        while woken:
+            self._sender.queue_reliable(woken.popleft())

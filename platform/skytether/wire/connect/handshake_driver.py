@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
+from typing import NamedTuple
 
 from ..codec.ciphers import HandshakeTags
 from ..codec.packet import HELLO, SHARD_AT, WELCOME
@@ -31,6 +32,29 @@ Times = tuple[float, float, float]
 """t1, t2, t3 in seconds, the first by the robot's clock."""
 
 
+class HandshakeMessage(NamedTuple):
+    """A complete, not yet authenticated handshake message."""
+
+    kind: int
+    """Type of its packets."""
+    common: bytes
+    """Common part of their header."""
+    message: bytes
+    path: int
+    """By which it came."""
+    address: Hashable
+    now: float
+
+
+class Welcomed(NamedTuple):
+    """The service's end has answered."""
+
+    epoch: Epoch
+    """That the handshake made."""
+    times: Times | None
+    """Of that round trip; None: nobody knows which HELLO was answered."""
+
+
 class HandshakeDriver:
     """Handshakes of one end, on its paths.
 
@@ -43,8 +67,6 @@ class HandshakeDriver:
         tags: Of handshake packets that this end sends.
         events: Where refusals go.
         rejected: Counters of what is refused.
-        welcomed: Called at the robot's end with the epoch that a handshake made, time stamps of that round trip (None
-            if nobody knows which HELLO was answered), and the time.
     """
 
     def __init__(
@@ -57,7 +79,6 @@ class HandshakeDriver:
         tags: HandshakeTags,
         events: deque[Event],
         rejected: Counter[str],
-        welcomed: Callable[[Epoch, Times | None, float], None],
     ) -> None:
         self._responder = responder
         self._reconnector = reconnector
@@ -67,7 +88,6 @@ class HandshakeDriver:
         self._tags = tags
         self._events = events
         self._rejected = rejected
-        self._welcomed = welcomed
         self._refusal = ""
         """Latest reason told, so that it is told once."""
         self.waiting: deque[Transmit] = deque()
@@ -85,87 +105,62 @@ class HandshakeDriver:
                     self._paths.ping(path, now)
 
     def handle_handshake(
-        self,
-        kind: int,
-        common: bytes,
-        message: bytes,
-        path: int,
-        address: Hashable,
-        epoch: Epoch | None,
-        previous: Epoch | None,
-        now: float,
-    ) -> None:
+        self, received: HandshakeMessage, epoch: Epoch | None, previous: Epoch | None
+    ) -> Welcomed | None:
         """Take a complete, not yet authenticated handshake message.
 
         Args:
-            kind: Type of its packets.
-            common: Common part of their header.
-            message: The message.
-            path: By which path it came.
-            address: From where.
+            received: It, and where it came from.
             epoch: Keys in use, if any.
             previous: Those before, if still kept.
-            now: Time.
+
+        Returns:
+            At the robot's end: that the service has answered, and with which keys.
         """
-        if kind == HELLO and self._responder is not None:
-            self._on_hello(self._responder, common, message, path, address, epoch, previous, now)
-        elif kind == WELCOME and self._reconnector.hello is not None:
-            self._on_welcome(self._reconnector.hello, common, message, path, now)
+        if received.kind == HELLO and self._responder is not None:
+            self._on_hello(self._responder, received, epoch, previous)
+        elif received.kind == WELCOME and self._reconnector.hello is not None:
+            return self._on_welcome(self._reconnector.hello, received)
         else:
             self._rejected["unasked"] += 1
+        return None
 
     def done(self) -> None:
         """New keys are in use."""
         self._refusal = ""
 
     def _on_hello(
-        self,
-        responder: HandshakeResponder,
-        common: bytes,
-        message: bytes,
-        path: int,
-        address: Hashable,
-        epoch: Epoch | None,
-        previous: Epoch | None,
-        now: float,
+        self, responder: HandshakeResponder, asked: HandshakeMessage, epoch: Epoch | None, previous: Epoch | None
     ) -> None:
         held = NO_KEYS if epoch is None or epoch.spent else epoch.ciphers.resume
         taken = {e.id for e in (epoch, previous) if e is not None}
-        answer = responder.answer(common, message, held, taken, now)
+        answer = responder.answer(asked.common, asked.message, held, taken, asked.now)
         if isinstance(answer, str):
             self._rejected[answer] += 1
         elif isinstance(answer, Resume):
             for each in self._paths:
-                self._paths.ping_soon(each, now)
-            self._resume(path, address, now)
+                self._paths.ping_soon(each, asked.now)
+            self._resume(asked.path, asked.address, asked.now)
         else:
             if answer.outcome is not None and answer.epoch is None:
                 answer.epoch = self._make_epoch(answer.outcome)
             if answer.reason:
                 self._refuse(answer.reason)
-            answer.asked(address)
-            most = AMPLIFICATION * len(message)
-            self._send(answer.common, answer.message, self._paths.choice.active, address, most)
+            answer.asked(asked.address)
+            most = AMPLIFICATION * len(asked.message)
+            self._send(answer.common, answer.message, self._paths.choice.active, asked.address, most)
 
-    def _on_welcome(self, hello: Hello, common: bytes, message: bytes, path: int, now: float) -> None:
-        welcome = hello.open(common, message)
+    def _on_welcome(self, hello: Hello, received: HandshakeMessage) -> Welcomed | None:
+        welcome = hello.open(received.common, received.message)
         if welcome is None:
             self._rejected["welcome_forged"] += 1
-            return
+            return None
         if welcome.outcome is None:
             self._refuse(welcome.reason)
-            self._reconnector.refused(now)
-            return
+            self._reconnector.refused(received.now)
+            return None
         sole = hello.sent == 1  # else nobody knows which one was answered, and the first ping will tell more
-        self._welcomed(self._make_epoch(welcome.outcome), welcome.times if sole else None, now)
-        came_by = self._paths.get(path)
-        if came_by is not None:
-            if came_by.peer is not None:  # it answers what was sent there, wherever the answer comes from
-                came_by.address = came_by.peer
-            if sole:
-                came_by.echo = welcome.times[2], now
-        for each in self._paths:
-            self._paths.ping(each, now)
+        return Welcomed(self._make_epoch(welcome.outcome), welcome.times if sole else None)
 
     def _resume(self, path: int, address: Hashable, now: float) -> None:
         """Tell a robot that holds the keys, where it asks for them: that need not be where it was last heard."""

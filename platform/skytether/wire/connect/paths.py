@@ -8,6 +8,7 @@ active one: make before break. Duplicates end at the receiver's replay window.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from ..events import Event, PathSwitched, PeerMoved
 from ..path.liveness import HURRY, Health
 from ..path.mtu import SMALL
 from ..path.path import Path
+from ..send.sender import Sender
 from ..stats import PathStats
 from .reconnect import patience
 
@@ -61,11 +63,10 @@ class Paths:
 
     Args:
         config: Settings.
-        send_ping: Sends a ping by a path, at once, to some address or (None) to the path's.
-        changed: Called with the choice whenever it is another one, and when paths came or went.
-        moved: Called when the peer of a path has another address, with the time since when what was sent to the one
-            before may not have arrived.
-        emit: Takes events: the peer moved, another path became the active one.
+        first: The path that is there from the beginning.
+        sender: Sends pings at once, goes by the choice whenever it is another one, and sends again what went where the
+            peer is not any more.
+        events: Where it goes that the peer moved, and that another path became the active one.
         entropy: Source of random bytes.
         now: Time.
     """
@@ -73,23 +74,22 @@ class Paths:
     def __init__(
         self,
         config: Config,
-        send_ping: Callable[[Path, bytes, Hashable | None, float], None],
-        changed: Callable[[Choice, float], None],
-        moved: Callable[[Path, float, float], None],
-        emit: Callable[[Event], None],
+        first: Path,
+        sender: Sender,
+        events: deque[Event],
         entropy: Callable[[int], bytes],
         now: float,
     ) -> None:
         self._config = config
-        self._send_ping = send_ping
-        self._changed = changed
-        self._moved = moved
-        self._emit = emit
+        self._sender = sender
+        self._events = events
         self._entropy = entropy
-        self._paths: dict[int, Path] = {0: Path(0, config, now)}
+        self._paths: dict[int, Path] = {first.id: first}
+        self.get: Callable[[int], Path | None] = self._paths.get
+        """The path of an id; asked twice for every packet."""
         self._numbers: dict[int, int] = {}
         """Next packet numbers of paths that are closed: none is used twice with the same keys."""
-        self.choice = Choice(self._paths[0], None, False)
+        self.choice = Choice(first, None, False)
         self._overlap_until = -math.inf
         self._previous: Path | None = None
         """The active path before, while the overlap lasts."""
@@ -102,10 +102,6 @@ class Paths:
 
     def __len__(self) -> int:
         return len(self._paths)
-
-    def get(self, path_id: int) -> Path | None:
-        """The path of that id."""
-        return self._paths.get(path_id)
 
     # --- which there are
 
@@ -120,7 +116,7 @@ class Paths:
             path.next_number = self._numbers.pop(path_id, 0)
             if self._up:
                 path.start_epoch(now)
-            self._changed(self.choice, now)
+            self._sender.use(self, *self.choice, now)
         path.cost = cost
         return path
 
@@ -148,9 +144,26 @@ class Paths:
         if path is self.choice.active:
             self._switch(self._best(self, now), "closed", now)
         self.choose(now)
-        self._changed(self.choice, now)
+        self._sender.use(self, *self.choice, now)
         if len(self._paths) == 1:  # nobody asks any more, so no answer can be missing
             self.choice.active.liveness.calm()
+
+    def welcomed(self, path_id: int, answered_at: float | None, now: float) -> None:
+        """The robot's end: the service has answered, and gets a ping under its keys by every path.
+
+        Args:
+            path_id: By which path the answer came.
+            answered_at: When the service sent it, by its clock; None: nobody knows what it answered.
+            now: Time.
+        """
+        came_by = self.get(path_id)
+        if came_by is not None:
+            if came_by.peer is not None:  # it answers what was sent there, wherever the answer comes from
+                came_by.address = came_by.peer
+            if answered_at is not None:
+                came_by.echo = answered_at, now
+        for path in self:
+            self.ping(path, now)
 
     def start_epoch(self, now: float) -> None:
         """New keys: all begins anew."""
@@ -178,16 +191,20 @@ class Paths:
         said = _ping(path, ask, size, now)
         if not size:  # a probe has the size that it has
             said = said._replace(astray=path.astray(now))
-        self._send_ping(path, push_ping(said, max(0, size - PADDING)), None, now)
+        self._sender.send_frame(path, push_ping(said, max(0, size - PADDING)), now)
 
     def ping_to(self, address: Hashable, path: Path, now: float) -> None:
         """Tell somebody who seems to be the peer that we are here."""
-        self._send_ping(path, push_ping(_ping(path, False, 0, now)), address, now)
+        self._send_to(address, path, _ping(path, False, 0, now), now)
 
     def ping_soon(self, path: Path, now: float) -> None:
         """Ping, unless one was sent just now."""
         if now >= path.pinged_at + PING_SPACING:
             self.ping(path, now)
+
+    def _send_to(self, address: Hashable, path: Path, ping: Ping, now: float) -> None:
+        """Ping an address at which the peer is not known to be: no more than came from there."""
+        path.validation.sent(address, self._sender.send_frame_to(address, path, push_ping(ping), now))
 
     def report_arrivals(self, now: float) -> None:
         """Tell the peer what arrived, by the paths on which that is much."""
@@ -209,7 +226,10 @@ class Paths:
         if ping.ask:
             echo = round(sent_at * 1e6)
             answer = Ping(path.id, path.cost, False, ping.size, echo, ping.challenge, 0, path.feedback(now))
-            self._send_ping(path, push_ping(answer), None if address == path.address else address, now)
+            if address == path.address:
+                self._sender.send_frame(path, push_ping(answer), now)
+            else:
+                self._send_to(address, path, answer, now)
         elif first:
             self.ping_soon(path, now)  # so that the peer need not wait for its first exchange of time stamps
         if ping.echo is None:
@@ -248,7 +268,7 @@ class Paths:
                 elif path.validation.packet_came(address, size, path.heard_at, now):
                     challenge = int.from_bytes(self._entropy(CHALLENGE_SIZE)) or 1
                     path.validation.challenge(address, challenge, now)
-                    self._send_ping(path, push_ping(_ping(path, True, 0, now, challenge)), address, now)
+                    self._send_to(address, path, _ping(path, True, 0, now, challenge), now)
         path.heard_at = now
         if len(self._paths) > 1 and path.liveness.health(now) is Health.DEAD:
             self.ping_soon(path, now)
@@ -260,8 +280,8 @@ class Paths:
         path.validation.clear()
         if moved:
             path.mtu.restart(now)
-            self._emit(PeerMoved(address))
-            self._moved(path, since - (path.rtt if path.rtt == path.rtt else 0.0), now)
+            self._events.append(PeerMoved(address))
+            self._sender.repeat(path, since - (path.rtt if path.rtt == path.rtt else 0.0), now)
         self.choose(now)
 
     # --- time
@@ -406,9 +426,9 @@ class Paths:
     def _set(self, choice: Choice, reason: str, now: float) -> None:
         if choice != self.choice:
             self.choice = choice
-            self._changed(choice, now)
+            self._sender.use(self, *choice, now)
             if reason and self._up:
-                self._emit(PathSwitched(choice.active.id, reason))
+                self._events.append(PathSwitched(choice.active.id, reason))
 
 
 def _ping(path: Path, ask: bool, size: int, now: float, challenge: int = 0) -> Ping:

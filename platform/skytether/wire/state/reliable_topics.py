@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 
 from ..codec.frames import MISSING_ROWS, Ack, Forward, Missing, push_ack, push_forward, push_missing
 from ..codec.packet import pull_number
@@ -26,7 +27,9 @@ class ReliableTopics:
         topics: Its table: messages of its reliable topics are kept even before a peer was ever there.
         limit: Most payload bytes kept until they are acknowledged.
         counters: Of all topics.
-        wake: Called with a sender that has something to send and is not queued.
+
+    Attributes:
+        woken: Senders that have something to send and are to be queued; whoever calls a method takes them.
     """
 
     def __init__(
@@ -35,10 +38,9 @@ class ReliableTopics:
         topics: Iterable[Topic],
         limit: int,
         counters: TopicCounters,
-        wake: Callable[[ReliableSender], None],
     ) -> None:
         self._limit = limit
-        self._wake = wake
+        self.woken: deque[ReliableSender] = deque()
         self.rtt = RttEstimator()
         self._ours = {t.name for t in topics if t.reliable and t.direction.sender is role}
         self._senders = {
@@ -142,7 +144,8 @@ class ReliableTopics:
     def _stir(self, sender: ReliableSender) -> None:
         """Keep watch of a sender as long as it has something to do."""
         if sender.ready and not sender.queued:
-            self._wake(sender)
+            sender.queued = True
+            self.woken.append(sender)
         if sender.idle:
             self._busy.discard(sender)
         else:
