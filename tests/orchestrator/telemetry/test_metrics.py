@@ -229,7 +229,7 @@ def test_other_topics_with_each_renewal_make_no_series_without_end(new_record: N
         report(wild, Report(topics=tuple(topic(f"t{n}_{i}", **measured) for i in range(64))))
         series |= {line.rpartition(" ")[0] for line in metrics.text().decode().splitlines() if 'topic="' in line}
     assert len({name for one in series for name in re.findall(r'topic="(\w+)"', one)}) == 256
-    assert len(series) == 256 * (9 + 1 + 3)
+    assert len(series) == 256 * (11 + 1 + 3)
 
 
 def test_numbers_that_nobody_can_have_measured_are_not_there(new_record: NewRecord, manifest: Any) -> None:
