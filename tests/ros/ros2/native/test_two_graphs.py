@@ -2,7 +2,7 @@
 
 import pytest
 from networks import Program
-from ros2_nodes import far_nodes, first, ros2_nodes
+from ros2_nodes import far_nodes, first, ros2_nodes, until
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.lab.tun import ROBOT, SERVICE, TunEmulator
@@ -109,47 +109,112 @@ rclpy.spin = spin
 """
 
 
-def test_topics_calls_and_actions_cross_a_bad_link(ros2_nodes, far_nodes, tmp_path):
+@pytest.fixture
+def link():
+    bad = LinkConditions(delay=0.05, loss=0.01)
+    with TunEmulator(up=bad, down=bad) as link:
+        yield link
+
+
+@pytest.fixture
+def bridge(link, ros2_nodes, far_nodes, tmp_path):
+    """Starts ``skytether bridge`` at either end."""
     key = tmp_path / "bridge.key"
     key.touch(0o600)
     key.write_text("MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE=")
-    bad = LinkConditions(delay=0.05, loss=0.01)
-    common = COMMON | {"key_file": str(key)}
-    service = common | {"role": "service", "bind": {"host": SERVICE, "port": 4600}}
-    service |= {"ros2": {"domain": far_nodes.domain, "namespace": "/cloud"}}
-    robot = common | {"role": "robot", "peer": {"host": SERVICE, "port": 4600}, "bind": {"host": ROBOT}}
-    robot |= {"ros2": {"domain": ros2_nodes.domain, "namespace": "/bot"}}
-    with TunEmulator(up=bad, down=bad) as link:
-        programs = [
-            Program(link.service, "bridge", tmp_path, service),
-            Program(link.robot, "bridge", tmp_path, robot),
-        ]
-        try:
-            cloud = far_nodes.start(CLOUD, "cloud", "/cloud", where=link.service)
-            walker = ros2_nodes.start(WALKER, "walker", "/bot", where=link.robot)
-            assert first(cloud, "map") == ["map", "the map"]
-            assert first(walker, "plan") == ["plan", "the plan"]
-            assert first(walker, "cmd_vel") == ["cmd_vel", 0.25]
-            first(walker, "server")
-            walker.tell("[count.publish(String(data=str(i))) for i in range(500)]")
-            assert [first(cloud, "count")[1] for _ in range(500)] == list(range(500))
-            walker.tell("thing.publish(BasicTypes(uint64_value=2**63))")
-            assert first(cloud, "thing") == ["thing", 2**63]
-            cloud.tell("dock")
-            assert first(cloud, "dock") == ["dock", "docked"]
-            walker.tell("goal(6)")
-            assert first(walker, "accepted") == ["accepted", True]
-            assert first(walker, "result") == ["result", 4, [0, 1, 1, 2, 3, 5], True]  # STATUS_SUCCEEDED
-            walker.tell("goal(500, cancel=True)")
-            assert first(walker, "accepted") == ["accepted", True]
-            assert first(walker, "result")[1] == 5  # STATUS_CANCELED
-            late = far_nodes.start(
-                "from std_msgs.msg import String\n"
-                'node.create_subscription(String, "/cloud/map", lambda m: say(m.data), qos(latched=True))\n',
-                "late",
-                where=link.service,
-            )
-            assert late.next() == "the map"
-        finally:
-            for program in programs:
-                program.kill()
+    there = {"host": SERVICE, "port": 4600}
+    ends = {
+        "service": {"bind": there, "ros2": {"domain": far_nodes.domain, "namespace": "/cloud"}},
+        "robot": {
+            "peer": there,
+            "bind": {"host": ROBOT},
+            "ros2": {"domain": ros2_nodes.domain, "namespace": "/bot"},
+        },
+    }
+    started = []
+
+    def start(role):
+        where = link.service if role == "service" else link.robot
+        document = COMMON | {"key_file": str(key), "role": role} | ends[role]
+        started.append(Program(where, "bridge", tmp_path, document))
+        return started[-1]
+
+    yield start
+    for program in started:
+        program.kill()
+
+
+def test_topics_calls_and_actions_cross_a_bad_link(ros2_nodes, far_nodes, bridge, link):
+    bridge("service")
+    bridge("robot")
+    cloud = far_nodes.start(CLOUD, "cloud", "/cloud", where=link.service)
+    walker = ros2_nodes.start(WALKER, "walker", "/bot", where=link.robot)
+    assert first(cloud, "map") == ["map", "the map"]
+    assert first(walker, "plan") == ["plan", "the plan"]
+    assert first(walker, "cmd_vel") == ["cmd_vel", 0.25]
+    first(walker, "server")
+    walker.tell("[count.publish(String(data=str(i))) for i in range(500)]")
+    assert [first(cloud, "count")[1] for _ in range(500)] == list(range(500))
+    walker.tell("thing.publish(BasicTypes(uint64_value=2**63))")
+    assert first(cloud, "thing") == ["thing", 2**63]
+    cloud.tell("dock")
+    assert first(cloud, "dock") == ["dock", "docked"]
+    walker.tell("goal(6)")
+    assert first(walker, "accepted") == ["accepted", True]
+    assert first(walker, "result") == ["result", 4, [0, 1, 1, 2, 3, 5], True]  # STATUS_SUCCEEDED
+    walker.tell("goal(500, cancel=True)")
+    assert first(walker, "accepted") == ["accepted", True]
+    assert first(walker, "result")[1] == 5  # STATUS_CANCELED
+    late = far_nodes.start(
+        "from std_msgs.msg import String\n"
+        'node.create_subscription(String, "/cloud/map", lambda m: say(m.data), qos(latched=True))\n',
+        "late",
+        where=link.service,
+    )
+    assert late.next() == "the map"
+
+
+def test_each_end_and_each_node_is_killed_and_comes_back(ros2_nodes, far_nodes, bridge, link):
+    """Latched topics come anew, everything goes on, and nothing that both ends were there for is lost."""
+    nodes = {}
+
+    def start(which):
+        if which == "cloud":
+            nodes[which] = far_nodes.start(CLOUD, "cloud", "/cloud", where=link.service)
+        elif which == "walker":
+            nodes[which] = ros2_nodes.start(WALKER, "walker", "/bot", where=link.robot)
+        else:
+            nodes[which] = bridge(which)
+
+    def all_passes():
+        cloud, walker = nodes["cloud"], nodes["walker"]
+        for node in (cloud, walker):  # what was said before
+            node.all()
+            node.heard.clear()
+        assert first(walker, "cmd_vel") == ["cmd_vel", 0.25]
+        # The last end that joins may not know the others yet; what is told it from then on comes whole.
+        until(lambda: (walker.tell("thing.publish(BasicTypes(uint64_value=7))"), said(cloud, "thing"))[1], "a thing")
+        walker.tell("[count.publish(String(data=str(i))) for i in range(100)]")
+        assert [first(cloud, "count")[1] for _ in range(100)] == list(range(100))
+        cloud.tell("dock")
+        assert first(cloud, "dock") == ["dock", "docked"]
+
+    for which in ("service", "robot", "cloud", "walker"):
+        start(which)
+    assert first(nodes["cloud"], "map") == ["map", "the map"]
+    assert first(nodes["walker"], "plan") == ["plan", "the plan"]
+    all_passes()
+    for which, anew in (("service", "map"), ("robot", "plan"), ("cloud", "map"), ("walker", "plan")):
+        end = nodes[which]
+        end.kill() if which in ("service", "robot") else end.close()
+        start(which)
+        assert first(nodes["cloud" if anew == "map" else "walker"], anew) == [anew, f"the {anew}"], which
+        all_passes()
+
+
+def said(node, what):
+    """Whether it has said something of this; all of that is taken."""
+    node.heard.extend(node.all())
+    found = [one for one in node.heard if one[0] == what]
+    node.heard[:] = [one for one in node.heard if one[0] != what]
+    return found
