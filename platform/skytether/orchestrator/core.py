@@ -90,10 +90,15 @@ class Orchestrator:
         self._told_why = ""
         secrets = self._secrets = Secrets(settings.secrets_dir or settings.state_dir)
         database = settings.database_url or f"sqlite:///{settings.state_dir / 'state.db'}"
-        self.store = Store(database, settings.quotas.robot_names)
+        self.broker = Broker()
+        self.store = Store(
+            database,
+            settings.quotas.robot_names,
+            key_id=lambda: secrets.fingerprint,
+            on_change=self.broker.publish,
+        )
         self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
         clock = self.clock = clock or self._shared_clock or time.time
-        self.store.key_id = lambda: secrets.fingerprint
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
         self.disk_usage = DiskUsage(lambda: self.sites.stored(), settings.quotas, lambda site: self.sites.hosted(site))
@@ -102,8 +107,6 @@ class Orchestrator:
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.shared_topics = SharedTopics(self.store, clock)
         self.heartbeat = Heartbeat(self.store, settings.advertise, clock)
-        self.broker = Broker()
-        self.store.on_change = self.broker.publish
         self.metrics = Metrics(
             self._running,
             settings.limits.reported_topics,

@@ -81,19 +81,26 @@ class KeyReusedError(Exception):
 class Store(GroupStore):
     """The database with its instances. Safe from any thread."""
 
-    def __init__(self, url: str, robot_names: int = MOST_NAMES) -> None:
+    def __init__(
+        self,
+        url: str,
+        robot_names: int = MOST_NAMES,
+        *,
+        key_id: Callable[[], str] = lambda: "",
+        on_change: Callable[[str], None] = lambda _: None,
+    ) -> None:
         """Open it.
 
         Args:
             url: SQLAlchemy's.
             robot_names: Names that one robot may make up in all that it reports.
+            key_id: Fingerprint of the secret key with which sessions begin now.
+            on_change: Called with an instance's id after each of its events is stored; must return at once.
         """
         super().__init__(url)
         self._robot_names = robot_names
-        self.on_change: Callable[[str], None] = lambda _: None
-        """Called with an instance's id after each of its events is stored; must return at once."""
-        self.key_id: Callable[[], str] = lambda: ""
-        """Fingerprint of the secret key with which sessions begin now."""
+        self.on_change = on_change
+        self.key_id = key_id
         self._seen: dict[str, Record] = {}
 
     # Instances
