@@ -18,7 +18,8 @@ RosWords = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[FROM:=TO]...",
-        help="As ROS 1 and roslaunch give them: remappings, _PARAMETER:=VALUE, __name:=, __ns:=, __master:=, __ip:=.",
+        help="As roslaunch and our package for ros2 launch give them: remappings, _PARAMETER:=VALUE, __name:=, __ns:=; "
+        "of ROS 1 __master:=, __ip:=, too.",
         show_default=False,
     ),
 ]

@@ -12,6 +12,7 @@ from skytether.api.rest import Placement
 from skytether.cli.app import app
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
+from skytether.robot.agent.diagnostics import Level, diagnostics
 from skytether.robot.agent.status import StatusServer, document, metrics
 from skytether.robot.offload.site_prober import TaskConfig
 from skytether.robot.offload.task_manager import Option
@@ -78,6 +79,20 @@ def test_topics_stand_beside_what_became_of_their_messages(busy, monkeypatch):
     assert "/map: nobody publishes it yet" in shown.output
     assert "not carried: another type hash" in shown.output
     assert "published = refused + dropped + sent" in shown.output
+
+
+def test_the_diagnostics_tell_control_service_and_session_apart(busy):
+    found = diagnostics("walker", "guide", "/walker/skytether", busy.status(), 60.5)
+    assert found["header"]["stamp"] == {"sec": 60, "nanosec": 500_000_000}
+    assert [(s["name"], s["level"], s["message"]) for s in found["status"]] == [
+        ("walker/skytether: control", Level.WARN, "driven by fallback: no command has come yet"),
+        ("walker/skytether: service", Level.OK, "running"),
+        ("walker/skytether: session", Level.WARN, "not connected"),
+    ]
+    values = {value["key"]: value["value"] for value in found["status"][1]["values"]}
+    assert values == {"asked for": "guide", "instance": "i1", "site": "edge"}
+    asking = diagnostics("walker", "guide", "/s", replace(busy.status(), instance=None), 0.0)["status"][1]
+    assert (asking["level"], asking["message"]) == (Level.WARN, "no instance")
 
 
 def test_metrics_are_those_of_the_report_and_the_robots_own(busy):

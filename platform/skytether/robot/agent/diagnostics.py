@@ -11,8 +11,11 @@ from enum import IntEnum
 from math import isfinite
 from typing import Any
 
-from skytether.messages import encode_plain, hash_of
+from skytether.messages import Encoding, encode_plain, hash_of
 from skytether.ros.ros1.node import Node
+from skytether.ros.ros2.dialect import Endpoint, Kind
+from skytether.ros.ros2.qos import Qos
+from skytether.ros.ros2.seam import GraphNode
 
 from ..control.command import Source
 from .snapshot import AgentStatus
@@ -42,7 +45,7 @@ def diagnostics(robot: str, service: str, node: str, status: AgentStatus, now: f
         now: Unix time in seconds.
     """
     seconds, rest = divmod(now, 1)
-    found = (_control(status), _service(service, status), _gate(status))
+    found = (_control(status), _service(service, status), _session(status), _gate(status))
     return {
         "header": {"stamp": {"sec": int(seconds), "nanosec": int(rest * 1e9)}},
         "status": [
@@ -79,17 +82,23 @@ def _control(status: AgentStatus) -> _Status:
 
 def _service(service: str, status: AgentStatus) -> _Status:
     instance = status.instance
-    values: dict[str, object] = {
-        "asked for": service,
-        "round trip [ms]": f"{status.rtt * 1000:.1f}" if isfinite(status.rtt) else "-",
-        "lost": f"{status.loss:.1%}" if isfinite(status.loss) else "-",
-    }
+    values: dict[str, object] = {"asked for": service}
     if instance is not None:
-        values["instance"] = f"{instance.id} {instance.state}"
+        values["instance"] = instance.id
         values["site"] = instance.placement.site if instance.placement else "-"
     if status.trouble:
         return "service", Level.WARN, status.trouble, values
-    return "service", *_CONNECTED[status.connected], values
+    if instance is None:
+        return "service", Level.WARN, "no instance", values
+    return "service", Level.OK, instance.state, values
+
+
+def _session(status: AgentStatus) -> _Status:
+    values: dict[str, object] = {
+        "round trip [ms]": f"{status.rtt * 1000:.1f}" if isfinite(status.rtt) else "-",
+        "lost": f"{status.loss:.1%}" if isfinite(status.loss) else "-",
+    }
+    return "session", *_CONNECTED[status.connected], values
 
 
 _CONNECTED = {True: (Level.OK, "connected"), False: (Level.WARN, "not connected")}
@@ -107,8 +116,28 @@ def _gate(status: AgentStatus) -> _Status | None:
     return "gate", Level.WARN if gate.troubles else Level.OK, "has the wheels", values
 
 
-class Ros1Diagnostics:
-    """How the agent is, on /diagnostics.
+class _Diagnostics:
+    """Tells it as often as REP 107 wants it, however often it is called."""
+
+    def __init__(self, robot: str, service: str, node: str, encoding: Encoding) -> None:
+        self._who = robot, service, node
+        self._encoding = encoding
+        self._due = 0.0
+
+    def publish(self, status: AgentStatus) -> None:
+        """Tell how the agent is, if it was not told a moment ago."""
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = now + 0.9 * PERIOD_S
+        self._send(encode_plain(TYPE, diagnostics(*self._who, status, time.time()), self._encoding))
+
+    def _send(self, message: bytes) -> None:
+        raise NotImplementedError
+
+
+class Ros1Diagnostics(_Diagnostics):
+    """How the agent is, on /diagnostics of a ROS 1 graph.
 
     Args:
         robot: Its name.
@@ -117,15 +146,28 @@ class Ros1Diagnostics:
     """
 
     def __init__(self, robot: str, service: str, node: Node) -> None:
-        self._who = robot, service, node.name
-        self._due = 0.0
+        super().__init__(robot, service, node.name, "ros1")
         self._publication = node.advertise(TOPIC, TYPE, hash_of(TYPE, "ros1"))
 
-    def publish(self, status: AgentStatus) -> None:
-        """Tell it, if it was not told a moment ago."""
-        now = time.monotonic()
-        if now < self._due:
-            return
-        self._due = now + 0.9 * PERIOD_S
-        values = diagnostics(*self._who, status, time.time())
-        self._publication.publish(encode_plain(TYPE, values, "ros1"))
+    def _send(self, message: bytes) -> None:
+        self._publication.publish(message)
+
+
+class Ros2Diagnostics(_Diagnostics):
+    """How the agent is, on /diagnostics of a ROS 2 graph.
+
+    Args:
+        robot: Its name.
+        service: What it asks for.
+        name: Of the node, with its namespace.
+        node: Started.
+        topic: What the graph calls /diagnostics.
+    """
+
+    def __init__(self, robot: str, service: str, name: str, node: GraphNode, topic: str = TOPIC) -> None:
+        super().__init__(robot, service, name, "cdr")
+        endpoint = Endpoint(Kind.PUBLISHER, topic, TYPE, hash_of(TYPE, "cdr"), Qos(reliable=True, depth=1))
+        self._publication = node.publish(endpoint)
+
+    def _send(self, message: bytes) -> None:
+        self._publication.put(message)

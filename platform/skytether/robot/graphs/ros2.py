@@ -169,7 +169,7 @@ class Ros2Robot:
         names = self._config.names(specs)
         may = self._config.permissions()
         permissions.check(may, specs, names, command_topic)
-        for unused in names.unused((*self._config.readings, self._config.cmd_vel or "")):
+        for unused in names.unused((*self._config.readings, self._config.cmd_vel or "", "/diagnostics")):
             _log.warning("remap.%s has no effect: the service has no such topic", unused)
         topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
         if self._port is not None:

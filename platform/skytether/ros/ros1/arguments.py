@@ -2,7 +2,8 @@
 
 ``__name:=``, ``__ns:=`` (and ROS_NAMESPACE), ``__master:=``, ``__ip:=``, ``__hostname:=``, remappings ``from:=to`` and
 private parameters ``_name:=value`` (wiki.ros.org/Remapping%20Arguments). Roslaunch gives all of them that way but the
-private parameters, which it sets at the master.
+private parameters, which it sets at the master. For a robot of ROS 2 its package (``ros2/skytether``) hands on what
+``ros2 launch`` gives it in the same words.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from skytether.api.yaml import YamlError, parse_yaml
 from skytether.ros.names import namespace_of, resolve
 
 PRIVATE = ("service", "params", "status_port", "topics")
-"""Keys of robot.yaml (``topics`` of its section ``ros1``) that private parameters give: whoever reaches the master can
-set these, so nothing that safety, permissions or the token rely on is among them."""
+"""Keys of robot.yaml (``topics`` of its section ``ros1`` or ``ros2``) that private parameters give: whoever reaches the
+master can set these, so nothing that safety, permissions or the token rely on is among them."""
 _GIVEN = {"__name": "name", "__ns": "namespace", "__master": "master", "__ip": "host", "__hostname": "host"}
 
 
@@ -31,7 +32,8 @@ class RosArguments:
 
     Attributes:
         name: Of the node.
-        namespace: That the node is in, and the robot's topics if the file does not say where they are.
+        namespace: That the node is in, and the robot's topics; of ROS 1 only if the file does not say where they are.
+        ros1_namespace: ROS_NAMESPACE, which only ROS 1 has; what the command line says is stronger.
         master: Address of the master.
         host: Address of this machine.
         remap: Names of the graph, by name.
@@ -41,6 +43,7 @@ class RosArguments:
 
     name: str = ""
     namespace: str = ""
+    ros1_namespace: str = ""
     master: str = ""
     host: str = ""
     remap: Mapping[str, str] = field(default_factory=dict)
@@ -59,26 +62,39 @@ class RosArguments:
 
     def over(self, document: Any) -> Any:
         """A robot's file as it is with them; anything else as it is."""
-        if not isinstance(document, dict) or not isinstance(document.get("ros1"), dict):
+        if not isinstance(document, dict):
             return document
-        ros1 = dict(document["ros1"])
-        if self.name or self.namespace:
-            name = self.name or str(ros1.get("node", "skytether"))
-            ros1["node"] = resolve(name, self.namespace) if self.namespace else name
-        if self.namespace and ros1.get("namespace") is None:
-            ros1["namespace"] = self.namespace
-        ros1.update({key: value for key, value in (("master", self.master), ("host", self.host)) if value})
-        home = resolve(str(ros1.get("namespace") or namespace_of(str(document.get("robot", "")))), "/")
-        wheels = resolve(str(ros1.get("cmd_vel", "cmd_vel")), home)
+        if isinstance(document.get("ros1"), dict):
+            section, graph = "ros1", self._over_ros1(document["ros1"])
+        elif isinstance(document.get("ros2"), dict):
+            section, graph = "ros2", self._over_ros2(document["ros2"])
+        else:
+            return document
+        home = resolve(str(graph.get("namespace") or namespace_of(str(document.get("robot", "")))), "/")
+        wheels = resolve(str(graph.get("cmd_vel", "cmd_vel")), home)
         for old, new in self.remap.items():
             if resolve(old, home) == wheels:
-                ros1["cmd_vel"] = new
-            elif isinstance(ros1.get("remap", {}), dict):
-                ros1["remap"] = {**ros1.get("remap", {}), old: new}
+                graph["cmd_vel"] = new
+            elif isinstance(graph.get("remap", {}), dict):
+                graph["remap"] = {**graph.get("remap", {}), old: new}
         private = {name: self.params[name] for name in PRIVATE if name in self.params}
         if "topics" in private:
-            ros1["topics"] = private.pop("topics")
-        return {**document, **private, "ros1": ros1}
+            graph["topics"] = private.pop("topics")
+        return {**document, **private, section: graph}
+
+    def _over_ros1(self, section: dict[str, Any]) -> dict[str, Any]:
+        graph, namespace = dict(section), self.namespace or self.ros1_namespace
+        if self.name or namespace:
+            name = self.name or str(graph.get("node", "skytether"))
+            graph["node"] = resolve(name, namespace) if namespace else name
+        if namespace and graph.get("namespace") is None:
+            graph["namespace"] = namespace
+        graph.update({key: value for key, value in (("master", self.master), ("host", self.host)) if value})
+        return graph
+
+    def _over_ros2(self, section: dict[str, Any]) -> dict[str, Any]:
+        given = {"node": self.name, "namespace": self.namespace}
+        return section | {key: value for key, value in given.items() if value}
 
 
 def parse(words: Iterable[str], environ: Mapping[str, str]) -> RosArguments:
@@ -89,7 +105,7 @@ def parse(words: Iterable[str], environ: Mapping[str, str]) -> RosArguments:
     """
     given: dict[str, str] = {}
     if environ.get("ROS_NAMESPACE"):
-        given["namespace"] = resolve(environ["ROS_NAMESPACE"], "/")
+        given["ros1_namespace"] = resolve(environ["ROS_NAMESPACE"], "/")
     remap: dict[str, str] = {}
     params: dict[str, Any] = {}
     for word in words:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.messages import hash_of
+from skytether.robot.agent.diagnostics import TOPIC as DIAGNOSTICS
+from skytether.robot.agent.diagnostics import Ros2Diagnostics
 from skytether.robot.config.robot_config import RobotConfig, Ros2Config
 from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
 from skytether.robot.session.topic_table import spoken
-from skytether.ros.names import Names
+from skytether.ros.names import Names, resolve
 from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
@@ -62,8 +64,8 @@ def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
 
 
 @contextmanager
-def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator[Ros2Robot]:
-    """The robot as a graph, for as long as the context lasts.
+def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator[tuple[Ros2Robot, Ros2Diagnostics]]:
+    """The robot as a graph, and its diagnostics there, for as long as the context lasts.
 
     Raises:
         ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
@@ -71,8 +73,10 @@ def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator
     config = ros2_config(settings, ros2)
     with join_graph(ros2, folder, config.home) as node:
         robot = Ros2Robot(config, node)
+        name = resolve(ros2.node, config.home)
+        topic = config.names(()).own(DIAGNOSTICS)
         try:
-            yield robot
+            yield robot, Ros2Diagnostics(settings.robot, settings.service, name, node, topic)
         finally:
             robot.close()
 

@@ -138,11 +138,13 @@ def _run_ros2(
         raise typer.Exit(0 if check_ros2(settings, ros2, folder, token) else 1)
     with (
         gate(path, settings.safety, assumed=settings.gate_is_assumed, ros=ros) as own,
-        join_ros2(settings, ros2, folder) as robot,
+        join_ros2(settings, ros2, folder) as (robot, diagnostics),
     ):
+        for name in ros.unused:
+            _log.warning("the parameter %s is none of %s", name, ", ".join(PRIVATE))
         try:
             with Agent(agent_config(settings, folder, token), _base(settings, robot.base), graph=robot) as agent:
-                _watch(agent.status, threading.Event(), seconds, own)
+                _watch(agent.status, threading.Event(), seconds, own, diagnostics.publish)
         except FallbackError as error:
             fail(str(error), 2)
 
