@@ -11,10 +11,11 @@ from typer.testing import CliRunner
 from skytether.cli import main as entry
 from skytether.cli.app import app
 from skytether.cli.commands.demo import _told
-from skytether.cli.commands.robot.check import Finding, show
+from skytether.cli.commands.robot.check import show
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import Transition
+from skytether.robot.graphs.finding import Finding
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -11,7 +11,7 @@ from ros1_graph import Ros1Graph, wait_for
 from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.spec import topics_from_api
-from skytether.robot.graphs.ros1 import Ros1Robot, Ros1RobotConfig
+from skytether.robot.graphs.ros1.robot import Ros1Robot, Ros1RobotConfig
 from skytether.ros import notes
 from skytether.ros.names import Names, namespace_of
 from skytether.ros.ros1.node import Node

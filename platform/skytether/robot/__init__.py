@@ -6,8 +6,8 @@ here. Rooms import from those below only (contract "Rooms of the robot")::
     config | replay               robot.yaml | recordings sent as a robot would
     agent | diagnosis             the program on the robot | what the doctor looks at
     safety                        the gate: the last thing before the wheels
-    graphs                        ROS 1, ROS 2
+    graphs                        the kinds of robot graph: ROS 1, ROS 2, and others
     control | offload             who drives, how fast | whether and where the service runs
     session                       one bridge session
-    log_throttle
+    config_base | log_throttle
 """

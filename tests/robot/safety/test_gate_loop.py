@@ -18,11 +18,11 @@ from skytether.guard.estop import FIRST_ACT, EstopFile, boot_id
 from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, LaserScan, Message, encode
+from skytether.robot.graphs.inbox import Topics
 from skytether.robot.safety.client import GateError, GateLink, ask
 from skytether.robot.safety.config import SafetyConfig
 from skytether.robot.safety.gate import GateLoop
 from skytether.robot.safety.hardware import SocketSensors
-from skytether.robot.safety.inbox import Topics
 from skytether.robot.safety.protocol import GateState, pack_state, unpack_state
 
 SCAN = LaserScan(

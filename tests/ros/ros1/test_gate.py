@@ -12,9 +12,9 @@ from ros1_graph import wait_for
 
 from skytether.guard.velocity import Velocity
 from skytether.messages import Bool, Joy, LaserScan, Twist, decode, encode, type_hash
+from skytether.robot.graphs.ros1.gate_io import Ros1Wheels
+from skytether.robot.graphs.ros1.kind import Ros1Way
 from skytether.robot.safety.client import GateError, ask
-from skytether.robot.safety.config import Ros1Way
-from skytether.robot.safety.ros1 import Ros1Wheels
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]

@@ -13,7 +13,7 @@ from ros1_graph import wait_for
 import skytether_services.navigation as package
 from skytether.api.manifest import Manifest
 from skytether.lab.world.plan import building
-from skytether.robot.graphs.ros1 import Ros1Robot, Ros1RobotConfig
+from skytether.robot.graphs.ros1.robot import Ros1Robot, Ros1RobotConfig
 from skytether.ros.permissions import Allowed
 from skytether.ros.ros1.node import Node
 from skytether.testing.drive import Drive

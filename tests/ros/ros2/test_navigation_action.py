@@ -26,7 +26,7 @@ from skytether.messages import (
     encode,
     hash_of,
 )
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.testing.service import Harness
 from skytether_services.navigation.service import Navigation
 

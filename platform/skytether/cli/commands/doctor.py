@@ -15,14 +15,10 @@ from skytether.api.config_file import ConfigError
 from skytether.robot.config.robot_config import load_config, load_token
 from skytether.robot.diagnosis import examine
 from skytether.robot.diagnosis.doctor import Finding
-from skytether.ros.ros1.master import MasterError, call
-from skytether.ros.ros1.node import Node, NodeError
 
 from ..connection import Json, transport
 from ..output import console, fail, print_json
 from .robot.check import look
-from .robot.ros2 import look_ros2
-from .robot.run import ros1_config
 
 if TYPE_CHECKING:
     from skytether.robot.config.robot_config import RobotConfig
@@ -76,7 +72,7 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     if settings is not None:
         ca_file = ca_file or settings.ca_file
     address = url or (settings.orchestrator if settings else None)
-    yield examine.extras(["ros2"] if settings and settings.ros2 and settings.ros2.dialect != "rclpy" else [])
+    yield examine.extras(settings.kind.extras(settings.graph) if settings else [])
     if settings is not None:
         yield examine.own_controller(settings.fallback.name, settings.fallback.options)
     if address is not None:
@@ -98,66 +94,29 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
     echoes += settings.task.addresses.values() if settings and not echo else ()
     for where in echoes:
         yield from examine.network(*where)
-    if settings is not None and settings.ros1 is not None:
-        yield from _ros1(
-            settings, os.environ.get("SKYTETHER_TOKEN", "") if config is None else _token(settings, config)
-        )
-    if settings is not None and config is not None and settings.ros2 is not None:
-        yield from _ros2(settings, config.parent, _token(settings, config))
+    if settings is not None and config is not None:
+        yield from _graph(settings, config.parent, _token(settings, config))
 
 
-def _ros1(settings: RobotConfig, token: str) -> Iterator[Finding]:
-    """The ROS 1 graph: its master, and the types of what the service takes and gives."""
-    ros1 = settings.ros1
-    if ros1 is None:
-        return
+def _graph(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
+    """The robot's graph: whether it is there, and the types of what the service takes and gives."""
     try:
-        call(ros1.master, "getPid", "/skytether_doctor")
-    except MasterError as error:
-        todo = (
-            "start roscore, or correct ros1.master in robot.yaml (ROS_MASTER_URI); both machines must know each other"
-        )
-        yield Finding("ros master", "trouble", str(error), todo)
-        return
-    yield Finding("ros master", "ok", f"answers at {ros1.master}")
-    node = Node(settings.node("doctor"), ros1.master, host=ros1.host, on_end=lambda _: None)
-    try:
-        node.start()
-    except NodeError as error:
-        yield _trouble("ros graph", str(error), "correct ros1.host or ros1.node in robot.yaml")
-        return
-    try:
-        found = [f for f in look(settings, ros1_config(settings, ros1), node, token) if f.where.startswith("/")]
-    finally:
-        node.close()
-    wrong = [f for f in found if not f.good]
-    for f in wrong:
-        todo = f"give {f.where} the type {f.kind}, or name another topic in remap of robot.yaml"
-        yield Finding("types", "trouble", f"{f.what} ({f.where}): {f.says}", todo)
-    if found and not wrong:
-        yield Finding("types", "ok", f"{len(found)} topics of the graph go with the service's")
-
-
-def _ros2(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
-    """The ROS 2 graph: its router, and the types of what the service takes and gives."""
-    if settings.ros2 is None:
-        return
-    try:
-        found = [f for f in look_ros2(settings, settings.ros2, folder, token) if f.what != "orchestrator"]
+        found = [f for f in look(settings, folder, token, "doctor") if f.what != "orchestrator"]
     except ConfigError as error:
-        yield _trouble("ros graph", str(error), "correct ros2 in robot.yaml, or install the extra")
+        yield _trouble("ros graph", str(error), settings.kind.todo)
         return
-    for f in (f for f in found if not f.good):
-        todo = (
-            "start the robot's nodes, or correct ros2 in robot.yaml"
-            if f.what == "ROS 2 graph"
-            else "start the graph's Zenoh router, or correct ros2.router in robot.yaml"
-            if f.what == "ROS 2 router"
-            else f"give {f.where} the type {f.kind}, or name another topic in remap of robot.yaml"
-        )
+    for f in (f for f in found if f.check):
+        yield Finding(f.check, "ok" if f.good else "trouble", f.says, "" if f.good else f.todo)
+    rest = [f for f in found if not f.check]
+    for f in (f for f in rest if not f.good):
+        todo = f.todo or f"give {f.where} the type {f.kind}, or name another topic in remap of robot.yaml"
         yield Finding("types" if f.kind else "ros graph", "trouble", f"{f.what} ({f.where}): {f.says}", todo)
-    if all(f.good for f in found):
+    if not all(f.good for f in found):
+        return
+    if len(rest) == len(found):
         yield Finding("ros graph", "ok", f"{found[0].says}; what goes with the service was looked at")
+    elif typed := [f for f in rest if f.kind]:
+        yield Finding("types", "ok", f"{len(typed)} topics of the graph go with the service's")
 
 
 def _trouble(check: str, says: str, todo: str) -> Finding:

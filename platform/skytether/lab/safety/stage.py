@@ -51,8 +51,7 @@ class Promised:
         limits = config.limits or Limits()
         period = 1 / config.rate_hz
         brakes = max(limits.linear_max / limits.linear_braking, limits.angular_max / limits.angular_braking)
-        on_graph = config.ros1 is not None or config.ros2 is not None
-        turns = _TURNS + 1 if on_graph else _TURNS  # the writer's
+        turns = _TURNS if config.graph is None else _TURNS + 1  # the writer's
         rest = turns * period + brakes + period
         return cls(
             agent=limits.max_gap_s + rest,
@@ -62,7 +61,7 @@ class Promised:
             joystick=(config.joystick.max_age_s if config.joystick else 0.0) + rest,
             still=((config.joystick and config.joystick.max_still_s) or 0.0) + rest,
             stop=rest,
-            silence=config.guard_s + (rest if on_graph else _TURNS * period),
+            silence=config.guard_s + (_TURNS * period if config.graph is None else rest),
             jitter=period,
         )
 
@@ -72,7 +71,7 @@ def wheels_of(config: SafetyConfig) -> Wheels:
 
     On a graph two periods of tolerance: the time is that of the receipt, and the writer has turns of its own.
     """
-    periods = 1 if config.ros1 is None and config.ros2 is None else 2
+    periods = 1 if config.graph is None else 2
     return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=periods / config.rate_hz)
 
 

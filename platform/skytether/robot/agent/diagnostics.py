@@ -11,13 +11,8 @@ from enum import IntEnum
 from math import isfinite
 from typing import Any
 
-from skytether.messages import Encoding, encode_plain, hash_of
-from skytether.ros.ros1.node import Node
-from skytether.ros.ros2.dialect import Endpoint, Kind
-from skytether.ros.ros2.qos import Qos
-from skytether.ros.ros2.seam import GraphNode
-
 from ..control.command import Source
+from ..graphs.graph_base import PublishesDiagnostics
 from .snapshot import AgentStatus
 
 TOPIC = "/diagnostics"
@@ -116,58 +111,24 @@ def _gate(status: AgentStatus) -> _Status | None:
     return "gate", Level.WARN if gate.troubles else Level.OK, "has the wheels", values
 
 
-class _Diagnostics:
-    """Tells it as often as REP 107 wants it, however often it is called."""
+class Diagnostics:
+    """How the agent is, on /diagnostics of a graph that has such.
 
-    def __init__(self, robot: str, service: str, node: str, encoding: Encoding) -> None:
-        self._who = robot, service, node
-        self._encoding = encoding
+    Args:
+        robot: Its name.
+        service: What it asks for.
+        graph: Where it is published.
+    """
+
+    def __init__(self, robot: str, service: str, graph: PublishesDiagnostics) -> None:
+        self._who = robot, service, graph.name
+        self._graph = graph
         self._due = 0.0
 
     def publish(self, status: AgentStatus) -> None:
-        """Tell how the agent is, if it was not told a moment ago."""
+        """Tell it, if it was not told a moment ago."""
         now = time.monotonic()
         if now < self._due:
             return
         self._due = now + 0.9 * PERIOD_S
-        self._send(encode_plain(TYPE, diagnostics(*self._who, status, time.time()), self._encoding))
-
-    def _send(self, message: bytes) -> None:
-        raise NotImplementedError
-
-
-class Ros1Diagnostics(_Diagnostics):
-    """How the agent is, on /diagnostics of a ROS 1 graph.
-
-    Args:
-        robot: Its name.
-        service: What it asks for.
-        node: Started.
-    """
-
-    def __init__(self, robot: str, service: str, node: Node) -> None:
-        super().__init__(robot, service, node.name, "ros1")
-        self._publication = node.advertise(TOPIC, TYPE, hash_of(TYPE, "ros1"))
-
-    def _send(self, message: bytes) -> None:
-        self._publication.publish(message)
-
-
-class Ros2Diagnostics(_Diagnostics):
-    """How the agent is, on /diagnostics of a ROS 2 graph.
-
-    Args:
-        robot: Its name.
-        service: What it asks for.
-        name: Of the node, with its namespace.
-        node: Started.
-        topic: What the graph calls /diagnostics.
-    """
-
-    def __init__(self, robot: str, service: str, name: str, node: GraphNode, topic: str = TOPIC) -> None:
-        super().__init__(robot, service, name, "cdr")
-        endpoint = Endpoint(Kind.PUBLISHER, topic, TYPE, hash_of(TYPE, "cdr"), Qos(reliable=True, depth=1))
-        self._publication = node.publish(endpoint)
-
-    def _send(self, message: bytes) -> None:
-        self._publication.put(message)
+        self._graph.publish_diagnostics(TYPE, TOPIC, diagnostics(*self._who, status, time.time()))

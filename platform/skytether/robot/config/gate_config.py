@@ -8,10 +8,10 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
 from skytether.api.config_file import read_config
-from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
+from skytether.robot.graphs.registry import GRAPHS, keys
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, SafetyConfig
 from skytether.ros.names import namespace_of
 from skytether.ros.ros1.arguments import RosArguments
-from skytether.ros.ros2.config import need_extra
 
 
 class _GateFile(BaseModel):
@@ -28,12 +28,10 @@ class _GateFile(BaseModel):
     @field_validator("safety")
     @classmethod
     def _has_a_graph_for_its_topics(cls, safety: SafetyConfig) -> SafetyConfig:
-        if safety.display is not None and not (safety.ros1 or safety.ros2):
-            raise ValueError(
-                "display needs ros1 or ros2; without a graph there is `skytether robot gate-status --json`"
-            )
-        if safety.enable is not None and safety.enable.topic and not (safety.ros1 or safety.ros2):
-            raise ValueError("enable.topic needs ros1 or ros2; without a graph give enable.file, chip or socket")
+        if safety.display is not None and safety.graph is None:
+            raise ValueError(f"display needs {keys()}; without a graph there is `skytether robot gate-status --json`")
+        if safety.enable is not None and safety.enable.topic and safety.graph is None:
+            raise ValueError(f"enable.topic needs {keys()}; without a graph give enable.file, chip or socket")
         return safety
 
     @model_validator(mode="before")
@@ -45,13 +43,13 @@ class _GateFile(BaseModel):
 def inherit(document: Any) -> Any:
     """The file with what its section ``safety`` takes from its other parts, where it says nothing itself.
 
-    These are ``limits`` with their reasons in ``beyond``, and of ``ros1`` or ``ros2``, unless the wheels are behind
+    These are ``limits`` with their reasons in ``beyond``, and of the robot's graph, unless the wheels are behind
     ``sockets``, where the graph and its wheels are. A robot that is a graph and has no such section gets
     `WITHOUT_SECTION`.
     """
     if not isinstance(document, dict):
         return document
-    if "safety" not in document and any(isinstance(document.get(way), dict) for way in ("ros1", "ros2")):
+    if "safety" not in document and any(isinstance(document.get(way), dict) for way in GRAPHS):
         document = document | {"safety": WITHOUT_SECTION}
     if not isinstance(document.get("safety"), dict):
         return document
@@ -61,10 +59,10 @@ def inherit(document: Any) -> Any:
         reasons, own = document.get("beyond"), safety.get("beyond", {})
         if isinstance(reasons, dict) and isinstance(own, dict):
             safety["beyond"] = reasons | own
-    for way, model in (("ros1", Ros1Way), ("ros2", Ros2Way)):
+    for way, kind in GRAPHS.items():
         graph, own = document.get(way), safety.get(way) or {}
         if isinstance(graph, dict) and isinstance(own, dict) and safety.get("sockets") is None:
-            robot = {key: graph[key] for key in model.model_fields if graph.get(key) is not None}
+            robot = {key: graph[key] for key in kind.gate_section.model_fields if graph.get(key) is not None}
             if "namespace" not in robot and isinstance(document.get("robot"), str):
                 robot["namespace"] = namespace_of(document["robot"])
             safety[way] = robot | own
@@ -82,11 +80,7 @@ def load_safety(path: Path, ros: RosArguments | None = None) -> SafetyConfig:
         ConfigError: It cannot be read, is no YAML, or a key of the section is wrong or missing.
     """
     safety = read_config(path, _GateFile, (ros or RosArguments()).over).safety
-    if safety.ros2 is None:
+    if safety.graph is None:
         return safety
-    if safety.ros2.dialect != "rclpy":
-        need_extra()
-    if safety.ros2.zenoh_config is None:
-        return safety
-    there = safety.ros2.model_copy(update={"zenoh_config": path.absolute().parent / safety.ros2.zenoh_config})
-    return safety.model_copy(update={"ros2": there})
+    kind, way = safety.graph
+    return safety.model_copy(update={kind.key: kind.prepared(way, path.parent)})

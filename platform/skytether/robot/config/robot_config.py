@@ -15,21 +15,21 @@ from skytether.api.document_checks import oddity
 from skytether.api.manifest import Name, Strict
 from skytether.api.plain_http import is_readable_on_the_way
 from skytether.bridge.local_network import LocalNetwork
-from skytether.messages import type_of
 from skytether.robot.agent.status import DEFAULT_PORT
+from skytether.robot.config_base import no_switches
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.graphs.graph_base import protected_names as graph_names
+from skytether.robot.graphs.graph_config import RobotGraphConfig
+from skytether.robot.graphs.kind import GateSection, GraphKind, RobotSection
+from skytether.robot.graphs.registry import GRAPHS, sections_of, with_sections
 from skytether.robot.offload.task_manager import Mode, Policy
 from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
-from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, Ros1Way, Ros2Way, SafetyConfig
-from skytether.robot.safety.config_base import no_switches
+from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, SafetyConfig
 from skytether.robot.safety.protected import protected_names as safety_names
-from skytether.ros.names import Generation, Names, check_name, namespace_of, resolve
+from skytether.ros.names import Names, check_name, namespace_of, resolve
 from skytether.ros.permissions import Access, Allowed, Permissions
 from skytether.ros.ros1.arguments import RosArguments
-from skytether.ros.ros1.config import Ros1Link
-from skytether.ros.ros2.config import Ros2Graph, Ros2Velocity
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
@@ -50,83 +50,6 @@ class FallbackConfig(Strict):
     name: Annotated[str, Field(min_length=1)] = "stop"
     """Entry point of the group ``skytether.fallbacks``."""
     options: PlainValues = {}
-
-
-class GraphConfig(Strict):
-    """What a robot's graph has in either generation of ROS. Names: absolute, or in ``namespace``."""
-
-    namespace: str | None = None
-    """Where the robot's topics are; null: under the robot's name."""
-    remap: dict[str, str] = {}
-    """The graph's names of the service's topics, calls and actions, of ``cmd_vel`` and of the readings."""
-    cmd_vel: Annotated[str, Field(min_length=1)] = "cmd_vel"
-    """What the wheels listen to."""
-    idle_s: Annotated[float, Field(gt=0)] | None = 1.0
-    """Seconds that a standstill is told before ``cmd_vel`` is left to others; null: for ever."""
-    readings: dict[str, str] = {}
-    """What the robot's own control reads, name to type: ``{force: geometry_msgs/msg/WrenchStamped}``."""
-    topics: tuple[str, ...] = ()
-    """What is sent to a service that takes any topic, such as the recorder."""
-
-    @field_validator("readings")
-    @classmethod
-    def _known_types(cls, readings: dict[str, str]) -> dict[str, str]:
-        for name, kind in readings.items():
-            try:
-                type_of(kind)
-            except KeyError as error:
-                raise ValueError(f"{name}: {error.args[0]}") from None
-        return readings
-
-    def check_names(self, ros: Generation) -> None:
-        """Refuse what this generation refuses.
-
-        Raises:
-            ValueError: The text names the key.
-        """
-        named = {"namespace": self.namespace, "cmd_vel": self.cmd_vel}
-        named.update({f"remap.{key}": value for key, value in self.remap.items()})
-        named.update({f"topics.{i}": value for i, value in enumerate(self.topics)})
-        for key, value in named.items():
-            try:
-                if value is not None:
-                    check_name(value, ros)
-            except ValueError as error:
-                raise ValueError(f"{key}: {error}") from None
-
-
-class Ros1Config(GraphConfig, Ros1Link):
-    """A ROS 1 graph."""
-
-    node: Annotated[str, Field(min_length=1)] = "skytether"
-    """Name of the node; below the robot's namespace unless it is absolute."""
-    params: tuple[str, ...] = ()
-    """Parameters that the service's graph gets, by name or namespace: ``/robot_description``."""
-    use_sim_time: bool | None = None
-    """Whether /clock tells the time; null: as the master's parameter /use_sim_time says."""
-
-    @model_validator(mode="after")
-    def _names_are_legal(self) -> Ros1Config:
-        self.check_names(1)
-        try:
-            check_name(self.node)
-        except ValueError as error:
-            raise ValueError(f"node: {error}") from None
-        for i, name in enumerate(self.params):
-            try:
-                check_name(name)
-            except ValueError as error:
-                raise ValueError(f"params.{i}: {error}") from None
-        return self
-
-
-class Ros2Config(GraphConfig, Ros2Graph, Ros2Velocity):
-    """A ROS 2 graph."""
-
-    @model_validator(mode="after")
-    def _names_are_legal(self) -> Ros2Config:
-        self.check_names(2)
-        return self
 
 
 class LinkNeeds(Strict):
@@ -191,8 +114,9 @@ class TaskConfig(Strict):
         return Policy(**{**self.model_dump(exclude={"echoes", "probe_s"}), "mode": Mode(self.mode)})
 
 
+@with_sections(lambda kind: kind.section)
 class RobotConfig(Strict):
-    """The whole file."""
+    """The whole file. `with_sections` adds a key for each kind of graph: the robot is one of them."""
 
     robot: Name
     """As it is registered: ``skytether robot add NAME``."""
@@ -227,11 +151,8 @@ class RobotConfig(Strict):
     """The gate's part (``skytether robot gate``): velocities go to the gate and not to the wheels.
 
     Without the key, a gate that knows limits and silence only; ``none``: no gate."""
-    ros1: Ros1Config | None = None
-    ros2: Ros2Config | None = None
-    """The robot's graph: one of the two."""
     cloud: CloudConfig = CloudConfig()
-    """What the service may publish, call and offer in it."""
+    """What the service may publish, call and offer in the robot's graph."""
 
     @field_validator("fallback", mode="before")
     @classmethod
@@ -291,16 +212,20 @@ class RobotConfig(Strict):
 
     @model_validator(mode="after")
     def _has_a_graph(self) -> RobotConfig:
-        if (self.ros1 is None) == (self.ros2 is None):
-            found = "is missing" if self.ros1 is None else "stands beside ros2"
+        found = sections_of(self)
+        if len(found) != 1:
+            first, *others = found or GRAPHS
+            fault = f"stands beside {' and '.join(others)}" if found else "is missing"
+            others = [key for key in GRAPHS if key != first]
             raise ValueError(
-                f"ros1: {found}; it, or ros2, says which graph the robot is (an empty one is written: ros1: {{}})"
+                f"{first}: {fault}; it, or {' or '.join(others)}, says which graph the robot is (an empty one is "
+                f"written: {first}: {{}})"
             )
         return self
 
     @model_validator(mode="after")
     def _the_cloud_has_no_way_past_safety(self) -> RobotConfig:
-        ros: Generation = 1 if self.ros1 is not None else 2
+        ros = self.kind.generation
         permissions = Permissions(self.home, namespace_of(self.service), Allowed(), self.protected)
         for access in Access:
             for i, given in enumerate(getattr(self.cloud, access)):
@@ -315,44 +240,71 @@ class RobotConfig(Strict):
         return self
 
     @property
+    def kind(self) -> GraphKind[Any, Any]:
+        """Of the robot's graph."""
+        return next(GRAPHS[key] for key in sections_of(self))
+
+    @property
+    def graph(self) -> RobotSection:
+        """The robot's graph: the section of its kind."""
+        section: RobotSection = next(iter(sections_of(self).values()))
+        return section
+
+    @property
+    def graph_config(self) -> RobotGraphConfig:
+        """What a graph of any kind needs of the file."""
+        graph = self.graph
+        return RobotGraphConfig(
+            robot=self.robot,
+            service=self.service,
+            namespace=graph.namespace,
+            remap=graph.remap,
+            cmd_vel=graph.cmd_vel if self.safety is None else None,
+            idle_s=graph.idle_s,
+            fresh_s=Limits(**self.limits).watchdog_s,
+            readings=graph.readings,
+            topics=graph.topics,
+            allowed=self.allowed,
+            protected=self.protected,
+            wheels=self.wheels,
+            drivers=self.drivers,
+        )
+
+    @property
     def home(self) -> str:
         """The namespace of the robot's topics."""
-        graph = self.ros1 or self.ros2
-        given = graph.namespace if graph is not None else None
+        given = self.graph.namespace
         return namespace_of(self.robot) if given is None else resolve(given, "/")
 
     @property
     def wheels(self) -> str | None:
         """Absolute name of what the wheels listen to; None: it is no topic of the robot's graph."""
-        graph, way = self.ros1 or self.ros2, self._way
-        if graph is None or (self.safety is not None and self.safety.sockets is not None):
+        if self.safety is not None and self.safety.sockets is not None:
             return None
+        if self.safety is None:
+            return self.kind.wheels(self._names, self.home, self.graph.cmd_vel)
+        way = self._way
         namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
-        own = way.cmd_vel if way is not None and "cmd_vel" in way.model_fields_set else graph.cmd_vel
-        if self.safety is None and self.ros2 is not None:
-            return Names((), self.home, "/", graph.remap, ros=2).own(own)
+        own = way.cmd_vel if way is not None and "cmd_vel" in way.model_fields_set else self.graph.cmd_vel
         return resolve(own, namespace)
 
     @property
     def drivers(self) -> tuple[str, ...]:
         """Names of the gate's nodes that publish it; empty: there is no gate."""
-        graph, way = self.ros1 or self.ros2, self._way
-        if graph is None or self.safety is None:
+        way = self._way
+        if self.safety is None:
             return ()
-        node = way.node if way is not None and "node" in way.model_fields_set else graph.node
+        node = way.node if way is not None and "node" in way.model_fields_set else self.graph.node
         namespace = way.namespace if way is not None and "namespace" in way.model_fields_set else self.home
         return tuple(resolve(f"{node}_{role}", namespace) for role in ("guard", "gate"))
 
-    def node(self, what: str = "") -> str:
-        """Absolute name of the agent's node in a ROS 1 graph, or of one that looks for it."""
-        name = self.ros1.node if self.ros1 is not None else ""
-        return resolve(f"{name}_{what}" if what else name, self.home)
+    @property
+    def _way(self) -> GateSection | None:
+        return None if self.safety is None else getattr(self.safety, self.kind.key)
 
     @property
-    def _way(self) -> Ros1Way | Ros2Way | None:
-        if self.safety is None:
-            return None
-        return self.safety.ros1 if self.ros1 is not None else self.safety.ros2
+    def _names(self) -> Names:
+        return Names((), self.home, "/", self.graph.remap, ros=self.kind.generation)
 
     @property
     def allowed(self) -> Allowed:
@@ -363,15 +315,10 @@ class RobotConfig(Strict):
     @property
     def protected(self) -> dict[str, str]:
         """What is never the service's: why, by absolute name."""
-        graph = self.ros1 or self.ros2
-        if graph is None:
-            return {}
-        names = Names((), self.home, "/", graph.remap, ros=1 if self.ros1 is not None else 2)
-        found = graph_names(names, self.home, [graph.cmd_vel], graph.readings)
+        found = graph_names(self._names, self.home, [self.graph.cmd_vel], self.graph.readings)
         if self.safety is None:
             return found
-        prefix = self.ros2.bridge_namespace if self.ros2 is not None and self.ros2.dialect == "ros2dds" else "/"
-        return found | safety_names(self.safety, self.home, prefix)
+        return found | safety_names(self.safety, self.home, self.kind.prefix(self.graph))
 
 
 def load_config(path: Path, ros: RosArguments | None = None) -> RobotConfig:

@@ -1,4 +1,4 @@
-"""A robot that is a graph of ROS: its readings come from topics, its wheels listen to one. Common to ROS 1 and ROS 2.
+"""A robot that is a graph: its readings come from topics, its wheels listen to one. Common to all kinds of graph.
 
 Two ways lead through such a robot. What the service takes in and gives out goes between graph and bridge as bytes
 (`Graph`). What the robot's own control needs goes through `GraphBase`: the newest reading of each topic, decoded once a
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from skytether.api.manifest import TopicSpec
 from skytether.bridge.port import Port
@@ -18,6 +18,8 @@ from skytether.messages import DecodeError, Encoding, Message, Twist, decode, en
 from skytether.ros.followed import Followed
 from skytether.ros.names import Names, resolve
 from skytether.wire.topic import Topic
+
+from ..control.control_loop import RobotHardware
 
 _log = logging.getLogger(__name__)
 
@@ -53,6 +55,29 @@ class TellsTopics(Protocol):
 
     def topics(self) -> list[Followed]:
         """Each topic of the service and of the robot's own control; from any thread, never waits."""
+        ...
+
+
+class RobotGraph(Graph, Protocol):
+    """A graph that has the robot's own readings and wheels, too."""
+
+    @property
+    def base(self) -> RobotHardware:
+        """Readings and wheels, for the agent; a `GraphBase` does."""
+        ...
+
+
+@runtime_checkable
+class PublishesDiagnostics(Protocol):
+    """A graph in which people look for how the agent is (REP 107)."""
+
+    @property
+    def name(self) -> str:
+        """The agent's in the graph."""
+        ...
+
+    def publish_diagnostics(self, type_name: str, topic: str, values: Mapping[str, Any]) -> None:
+        """Publish a message, given as `skytether.messages.encode_plain` takes it. Returns at once."""
         ...
 
 

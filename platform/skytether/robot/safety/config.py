@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
-from skytether.messages import Bool, Message, String
+from skytether.messages import Bool, Encoding, Message, String
 from skytether.robot.control.supervisor import Limits
 from skytether.ros.names import check_name, resolve
-from skytether.ros.ros1.config import Ros1Link
-from skytether.ros.ros2.config import Ros2Link, Ros2Velocity
 
+from ..config_base import Numbers, Topic, no_switches
+from ..graphs.gate_io import WheelsTiming
+from ..graphs.inbox import IsStop, Topics
+from ..graphs.kind import GateSection, GraphKind
+from ..graphs.registry import GRAPHS, sections_of, with_sections
 from .address import address, numeric
 from .bounds import LONGEST_REASON, check_plausible
-from .config_base import Numbers, Topic, no_switches
 from .contact import ContactParams, feels
 from .display_config import DisplayConfig
 from .enable_config import ON_DISK, EnableConfig
-from .inbox import IsStop, Topics
 from .mode_config import Modes, ModeSource, mode_rules
 from .modes import Envelope
 from .odometry_config import OdometryConfig, odometry_kind
@@ -55,36 +55,16 @@ class SocketsConfig(Numbers):
         return text
 
 
-class Ros1Way(Numbers, Ros1Link):
-    """A robot that is a ROS 1 graph: names are absolute, or in ``namespace``."""
+class GateGraph(NamedTuple):
+    """The graph that sensors and wheels are topics of."""
 
-    namespace: str = "/"
-    node: Topic = "skytether"
-    """The nodes are called so, in ``namespace``, with ``_guard``, ``_gate`` and ``_sensors`` after it."""
-    cmd_vel: Topic = "cmd_vel"
-    """What the wheels listen to; nobody else may publish it."""
-
-    @field_validator("namespace", "node", "cmd_vel")
-    @classmethod
-    def _a_name(cls, name: str) -> str:
-        return check_name(name)
+    kind: GraphKind[Any, Any]
+    way: GateSection
 
 
-class Ros2Way(Numbers, Ros2Link, Ros2Velocity):
-    """A robot that is a ROS 2 graph. Its nodes are called ``node`` with ``_guard``, ``_gate``, ``_sensors`` after."""
-
-    namespace: str = "/"
-    cmd_vel: Topic = "cmd_vel"
-    """What the wheels listen to; nobody else may publish it."""
-
-    @field_validator("namespace", "cmd_vel")
-    @classmethod
-    def _a_name(cls, name: str) -> str:
-        return check_name(name, 2)
-
-
+@with_sections(lambda kind: kind.gate_section)
 class SafetyConfig(SourcesConfig):
-    """The whole section."""
+    """The whole section. `with_sections` adds a key for each kind of graph: then sensors and wheels are its topics."""
 
     footprint: OutlineConfig
     limits: Limits | None = None
@@ -119,11 +99,7 @@ class SafetyConfig(SourcesConfig):
     """Of the event record; null: ``record`` in a ``folder`` that is given, else ``/var/lib/skytether/safety-record``
     for root, and the user's state folder for others."""
     sockets: SocketsConfig | None = None
-    """Drivers that are no ROS nodes; the way to the hardware unless ``ros1`` or ``ros2`` is given."""
-    ros1: Ros1Way | None = None
-    """Sensors and wheels are topics."""
-    ros2: Ros2Way | None = None
-    """Sensors and wheels are topics."""
+    """Drivers that are no nodes of a graph; the way to the hardware unless a graph is given."""
 
     beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
     """Numbers that are meant to be beyond what is plausible: key below ``safety`` to reason."""
@@ -142,11 +118,12 @@ class SafetyConfig(SourcesConfig):
 
     @model_validator(mode="after")
     def _fits_together(self) -> SafetyConfig:
-        ways = [name for name in ("sockets", "ros1", "ros2") if getattr(self, name) is not None]
+        ways = [*(["sockets"] if self.sockets is not None else []), *sections_of(self)]
         if len(ways) > 1:
             raise ValueError(f"there are {' and '.join(ways)}, and the wheels can have only one of them")
-        for name in self.kinds() if self.ros1 or self.ros2 else ():
-            check_name(name, 1 if self.ros1 else 2)
+        if self.graph is not None:
+            for name in self.kinds():
+                check_name(name, self.graph.kind.generation)
         topics = [*self.sensors, *(topic for topic, _ in self._other_kinds())]
         for topic in topics:
             if topics.count(topic) > 1:
@@ -161,10 +138,10 @@ class SafetyConfig(SourcesConfig):
 
     def _check_display(self) -> None:
         """Nobody listens to it but people."""
-        way = self.ros1 or self.ros2
-        if self.display is None or way is None:
+        if self.display is None or self.graph is None:
             return
-        check_name(self.display.topic, 1 if self.ros1 else 2)
+        kind, way = self.graph
+        check_name(self.display.topic, kind.generation)
         others = [*self.kinds(), way.cmd_vel, (self.enable.topic if self.enable is not None else None) or way.cmd_vel]
         if resolve(self.display.topic, way.namespace) in {resolve(name, way.namespace) for name in others}:
             raise ValueError(f"display.topic: '{self.display.topic}' is another topic of the gate")
@@ -193,6 +170,16 @@ class SafetyConfig(SourcesConfig):
             if wrong:
                 raise ValueError(f"{where}limits.linear_max, sensors.{name}.range_max: {wrong}")
 
+    @property
+    def graph(self) -> GateGraph | None:
+        """The robot's graph; None: its drivers speak to the gate's sockets."""
+        return next((GateGraph(GRAPHS[key], way) for key, way in sections_of(self).items()), None)
+
+    @property
+    def encoding(self) -> Encoding:
+        """Of readings and velocities."""
+        return "cdr" if self.graph is None else self.graph.kind.encoding
+
     def rules(self) -> Rules:
         """The rules that follow."""
         stages = self.stages()
@@ -220,7 +207,7 @@ class SafetyConfig(SourcesConfig):
         found = []
         if self.enable is not None and self.enable.file is not None and reasons.get(ON_DISK, "").strip():
             found.append(f"{ON_DISK} may be a regular file, whose disk the guard waits for: {reasons.pop(ON_DISK)}")
-        numbers = self.model_dump(exclude={"beyond", "ros1", "ros2", "sockets"})
+        numbers = self.model_dump(exclude={"beyond", "sockets", *GRAPHS})
         return (*check_plausible(numbers, reasons), *found, *self._cut())
 
     def _cut(self) -> list[str]:
@@ -251,36 +238,27 @@ class SafetyConfig(SourcesConfig):
     def stages(self) -> Stages:
         """The latencies from the light to the brakes."""
         period = 1 / self.rate_hz
-        writer = 0.0 if self.ros1 is None and self.ros2 is None else period
+        writer = 0.0 if self.graph is None else period
         return Stages(self.zones.sensing_s, period, self.guard_s, writer, self.zones.reaction_s)
 
-    def fresh_s(self) -> float:
-        """How old a velocity may get that another process sends for whoever tells the wheels [s].
+    def wheels_timing(self) -> WheelsTiming:
+        """How long the wheels may be told nothing by one, until another does.
 
-        By then the other one is to speak: it claims the wheels 1.5 periods later, and speaks 0.75 after that, or a turn
-        more, which is within `guard_s`.
+        Whoever goes on for another claims the wheels 1.5 periods after a velocity that has become too old, and speaks
+        0.75 after that, or a turn more, which is within `guard_s`.
         """
-        period = 1 / self.rate_hz
-        return max(1.5 * period, self.guard_s - 3.25 * period)
-
-    def brakes_s(self) -> float:
-        """Within this time the gate has stopped wheels that nobody else tells anything [s]."""
-        bounds = self.bounds()
+        period, bounds = 1 / self.rate_hz, self.bounds()
         fastest = max(bounds.linear_max, -bounds.linear_min)
         braking = max(fastest / bounds.linear_braking, bounds.angular_max / bounds.angular_braking)
-        return self.guard_s + 3 / self.rate_hz + braking
+        fresh_s = max(1.5 * period, self.guard_s - 3.25 * period)
+        return WheelsTiming(self.guard_s, fresh_s, self.guard_s + 3 * period + braking)
 
     def wheels_at(self) -> str:
         """Where the wheels are, in words that tell one robot's from another's."""
-        if self.ros1 is not None:
-            master = re.sub(r"//(127\.0\.0\.1|\[::1\])", "//localhost", self.ros1.master).rstrip("/")
-            return f"{resolve(self.ros1.cmd_vel, self.ros1.namespace)} at the ROS master {master}"
-        if self.ros2 is not None:
-            where = self.ros2.router or self.ros2.zenoh_config or "the usual router"
-            topic = resolve(self.ros2.cmd_vel, self.ros2.namespace)
-            return f"{topic} of the ROS 2 domain {self.ros2.domain} by {where}"
-        given = self.sockets.wheels if self.sockets is not None else None
-        return given or str(self.place() / WHEELS_SOCKET)
+        if self.graph is not None:
+            return self.graph.kind.wheels_at(self.graph.way)
+        sockets = self.sockets.wheels if self.sockets is not None else None
+        return sockets or str(self.place() / WHEELS_SOCKET)
 
     def place(self) -> Path:
         """The gate's folder."""
@@ -299,8 +277,8 @@ class SafetyConfig(SourcesConfig):
         """
         changes: dict[str, object] = {"folder": self.place().absolute(), "record": self.record_file().absolute()}
         if self.sockets is not None:
-            given = {name: text for name, text in self.sockets.model_dump().items() if text is not None}
-            numbers = {name: _text(numeric(address(text))) for name, text in given.items()}
+            named = {name: text for name, text in self.sockets.model_dump().items() if text is not None}
+            numbers = {name: _text(numeric(address(text))) for name, text in named.items()}
             changes["sockets"] = self.sockets.model_copy(update=numbers)
         return self.model_copy(update=changes)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from .config_base import Numbers, Topic
+from ..config_base import Numbers, Topic
 
 
 class DisplayConfig(Numbers):

@@ -9,8 +9,8 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.enable import waits_for_a_disk
 
+from ..config_base import Numbers, Topic
 from .address import address, numeric
-from .config_base import Numbers, Topic
 
 ON_DISK = "enable.file"
 """The key of ``beyond`` for a regular file."""

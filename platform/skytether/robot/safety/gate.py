@@ -36,11 +36,12 @@ from skytether.robot.graphs.wheels_watch import sentence as sentence_of_others
 from skytether.robot.log_throttle import LogThrottle
 
 from ..control.command import Hand
+from ..graphs.gate_io import Sensors, Wheels
 from .config import SafetyConfig
 from .control import Control
 from .display.feed import Feed
 from .display.snapshot import snapshot
-from .hardware import Sensors, Wheels, receive_known
+from .hardware import receive_known
 from .heartbeat import Heartbeat
 from .io_factory import open_sensors, open_wheels
 from .process import SWITCH_S, log_without_waiting
@@ -266,7 +267,7 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm([*config.kinds().values(), Twist], "cdr" if config.ros1 is None else "ros1")
+    warm([*config.kinds().values(), Twist], config.encoding)
     refused = privileges.take(privileges.GATE)
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None

@@ -1,22 +1,21 @@
-"""The gate's way to the robot's own hardware: readings in, velocities out. Nothing here waits.
+"""The gate's way to drivers that are no nodes of a graph: datagrams in and out. Nothing here waits.
 
-Whoever has another way (a field bus, a graph) implements `Sensors` and `Wheels`. These speak datagrams, on sockets of
-this machine that only those may open whom the file system lets, or over UDP to a controller board.
+They come and go on sockets of this machine that only those may open whom the file system lets, or over UDP to a
+controller board. Another way (a graph, a field bus) is a kind in `skytether.robot.graphs`.
 """
 
 from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterable
-from typing import Protocol
 
-from skytether.guard import teller, wheels
+from skytether.guard import wheels
 from skytether.guard.descriptors import receive as receive_one
 from skytether.guard.folder import ROOM, Known, sender
 from skytether.guard.mailbox import bind
 from skytether.messages import Message, PointCloud2
 
-from .inbox import Inbox, Topics
+from ..graphs.inbox import Inbox, Topics
 
 _LARGEST = 256 * 1024
 """Bytes of one reading; more is cut off and then no message."""
@@ -28,53 +27,6 @@ _STOPS_EACH_TURN = 1024
 """More than the kernel keeps: after a stall all that waits is taken at once."""
 
 Address = str | tuple[str, int]
-
-
-class Wheels(teller.Wheels, Protocol):
-    """Where velocities go, and the enable signal where that is a topic."""
-
-    def enable(self, level: bool) -> None:
-        """Publish a level of the enable signal.
-
-        Raises:
-            OSError: It did not get there.
-        """
-        ...
-
-    def close(self) -> None:
-        """Let go of it."""
-        ...
-
-
-class Sensors(Protocol):
-    """Where readings come from."""
-
-    def stops(self) -> Iterable[tuple[str, Message]]:
-        """What buttons, bumpers and cliff sensors said since the last call: the last press of each, and the last word.
-
-        Taken first at each turn. Returns at once and never raises.
-        """
-        ...
-
-    def read(self) -> Iterable[tuple[str, Message]]:
-        """What else came since the last call, by topic, oldest first. Returns at once and never raises."""
-        ...
-
-    def close(self) -> None:
-        """Let go of it."""
-        ...
-
-
-class Graph(Protocol):
-    """Where something is published for people."""
-
-    def publish(self, message: Message) -> None:
-        """Publish it. Returns at once."""
-        ...
-
-    def close(self) -> None:
-        """Let go of it."""
-        ...
 
 
 class SocketWheels(wheels.SocketWheels):

@@ -17,7 +17,7 @@ from skytether.guard.teller import Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 
-from .hardware import Wheels
+from ..graphs.gate_io import Wheels
 
 _ROUNDING = 1e-9
 _PACKETS = 64

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from typing import Literal
 
+from ..graphs.gate_io import Display, Sensors, Wheels
+from ..graphs.kind import Role
 from .address import address
 from .config import SafetyConfig, SocketsConfig
-from .hardware import Address, Graph, Sensors, SocketSensors, SocketWheels, Wheels
+from .hardware import Address, SocketSensors, SocketWheels
 from .protocol import ESTOP_SOCKET, SENSORS_SOCKET, WHEELS_SOCKET
 
 
@@ -25,20 +26,15 @@ def open_sensors(
     Raises:
         OSError: It cannot be had.
     """
-    if config.ros1 is not None:
-        from .ros1 import Ros1Sensors
-
-        return Ros1Sensors(config.ros1, config.topics(), trouble)
-    if config.ros2 is not None:
-        from .ros2 import Ros2Sensors
-
-        return Ros2Sensors(config.ros2, config.topics(), trouble)
+    if config.graph is not None:
+        kind, way = config.graph
+        return kind.open_sensors(way, config.topics(), trouble)
     sockets = config.sockets or SocketsConfig()
     readings = _address(config, sockets.sensors, SENSORS_SOCKET)
     return SocketSensors(readings, estop or estop_address(config), config.topics(), trouble)
 
 
-def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
+def open_wheels(config: SafetyConfig, role: Role) -> Wheels:
     """Where velocities go.
 
     Args:
@@ -48,34 +44,23 @@ def open_wheels(config: SafetyConfig, role: Literal["guard", "gate"]) -> Wheels:
     Raises:
         OSError: It cannot be had.
     """
-    enable = config.enable.topic if config.enable is not None and role == "guard" else None
-    if config.ros1 is not None:
-        from .ros1 import Ros1Wheels
-
-        return Ros1Wheels(config.ros1, role, config.guard_s, enable or "")
-    if config.ros2 is not None:
-        from .ros2 import Ros2Wheels
-
-        return Ros2Wheels(config.ros2, role, config.fresh_s(), config.brakes_s(), enable or "")
+    if config.graph is not None:
+        kind, way = config.graph
+        enable = config.enable.topic if config.enable is not None and role == "guard" else None
+        return kind.open_wheels(way, role, config.wheels_timing(), enable or "")
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 
 
-def open_display(config: SafetyConfig) -> Graph:
+def open_display(config: SafetyConfig) -> Display:
     """Where what the gate knows is published.
 
     Raises:
         OSError: It cannot be had.
     """
-    topic = config.display.topic if config.display is not None else ""
-    if config.ros1 is not None:
-        from .ros1 import Ros1Display
-
-        return Ros1Display(config.ros1, topic)
-    if config.ros2 is not None:
-        from .ros2 import Ros2Display
-
-        return Ros2Display(config.ros2, topic)
+    if config.graph is not None:
+        kind, way = config.graph
+        return kind.open_display(way, config.display.topic if config.display is not None else "")
     raise OSError("there is no graph to publish it on")
 
 

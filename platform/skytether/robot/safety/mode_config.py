@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from .config_base import Numbers, Topic
+from ..config_base import Numbers, Topic
 from .modes import MOST_MODES, TIGHTENED, Envelope, ModeRules
 from .outline_config import OutlineConfig
 from .zones import ZoneParams

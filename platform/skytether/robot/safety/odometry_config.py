@@ -8,7 +8,7 @@ from pydantic import Field
 
 from skytether.messages import Message, Odometry, Twist, TwistStamped
 
-from .config_base import Numbers, Topic
+from ..config_base import Numbers, Topic
 from .coverage import Action
 from .motion import MotionParams
 from .real_motion import OdometryRules

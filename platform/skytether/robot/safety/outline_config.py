@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from .config_base import Metres, Numbers
+from ..config_base import Metres, Numbers
 from .footprint import Footprint, circle, polygon
 
 

@@ -12,27 +12,29 @@ from pydantic import BaseModel
 
 from skytether.ros.names import resolve
 
-from .config import Ros1Way, Ros2Way, SafetyConfig
+from .config import SafetyConfig
 
 _READ = "it is safety's"
 _WHEELS = "the wheels listen to it; a service drives by its command topic alone, past the supervisor"
 
 
-def protected_names(safety: SafetyConfig, home: str, bridge_namespace: str = "/") -> dict[str, str]:
+def protected_names(safety: SafetyConfig, home: str, prefix: str = "/") -> dict[str, str]:
     """Names that are never the cloud's: why, by absolute name.
 
     Args:
         safety: The section of robot.yaml.
         home: Namespace of the robot's topics, where the section names none.
-        bridge_namespace: What a bridge to DDS puts before every name of the agent's graph.
+        prefix: What stands before every name of the agent's graph, see `GraphKind.prefix`.
     """
     found: dict[str, str] = {}
-    ways = [way for way in (safety.ros1, safety.ros2) if way is not None]
-    for namespace in {home, *(way.namespace for way in ways if "namespace" in way.model_fields_set)}:
+    graph = safety.graph
+    written = graph is not None and "namespace" in graph.way.model_fields_set
+    for namespace in {home, *([graph.way.namespace] if graph is not None and written else [])}:
         found.update({resolve(name, namespace): _READ for name in {*safety.kinds(), *_topics(safety)}})
-        found.update({resolve(way.cmd_vel, namespace): _WHEELS for way in ways})
-    for way in ways:
-        found.update(_bridged(found, way, bridge_namespace))
+        if graph is not None:
+            found[resolve(graph.way.cmd_vel, namespace)] = _WHEELS
+    if graph is not None:
+        found.update(graph.kind.spellings(found, graph.way, prefix))
     return found
 
 
@@ -51,12 +53,3 @@ def _topics(part: object) -> Iterator[str]:
     elif isinstance(part, list | tuple):
         for value in part:
             yield from _topics(value)
-
-
-def _bridged(names: Mapping[str, str], way: Ros1Way | Ros2Way, bridge_namespace: str) -> dict[str, str]:
-    """The gate's keys of Zenoh as the agent's graph spells them, where its bridge to DDS has another namespace."""
-    if not isinstance(way, Ros2Way) or "bridge_namespace" not in way.model_fields_set:
-        return {}
-    theirs, ours = way.bridge_namespace.rstrip("/"), bridge_namespace.rstrip("/")
-    keys = {f"{theirs}{name}": why for name, why in names.items()}
-    return {key.removeprefix(ours): why for key, why in keys.items() if key.startswith(f"{ours}/")}

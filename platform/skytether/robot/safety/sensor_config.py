@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 
 from skytether.messages import LaserScan, Message, PointCloud2, Range
 
+from ..config_base import Metres, Numbers
 from .clouds import CloudMount
-from .config_base import Metres, Numbers
 from .contact import ContactKind, ContactParams
 from .coverage import Action, UnseenParams, sector
 from .ranges import Mount

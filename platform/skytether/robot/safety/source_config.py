@@ -9,8 +9,8 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 
+from ..config_base import Numbers, Topic
 from ..control.command import Hand
-from .config_base import Numbers, Topic
 from .estop import ButtonParams
 from .joystick import JoystickParams
 from .sources import LockParams, OnSilence, SourceParams, SourceRules

@@ -46,7 +46,7 @@ def guard_settings(config: SafetyConfig, file: int) -> Settings:
         config: Frozen, see `SafetyConfig.frozen`.
         file: Descriptor of the configuration of gate and writer.
     """
-    on_graph = config.ros1 is not None or config.ros2 is not None
+    on_graph = config.graph is not None
     sockets = config.sockets or SocketsConfig()
     wheels = str(config.place() / WHEELS_SOCKET) if sockets.wheels is None else address(sockets.wheels)
     say = [f"guards the wheels; its sockets are in {config.place()}"]

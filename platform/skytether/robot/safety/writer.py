@@ -29,8 +29,8 @@ from skytether.guard.watch import Watch
 from skytether.messages import Twist, warm
 from skytether.robot.log_throttle import LogThrottle
 
+from ..graphs.gate_io import Wheels
 from .config import SafetyConfig
-from .hardware import Wheels
 from .io_factory import open_wheels
 from .process import SWITCH_S, log_without_waiting
 
@@ -153,7 +153,7 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm([Twist], "cdr" if config.ros1 is None else "ros1")
+    warm([Twist], config.encoding)
     for sentence in privileges.take(privileges.WRITER):
         _log.info("%s", sentence)
     wheels = open_wheels(config, "guard")

@@ -8,7 +8,7 @@ import pytest
 from ros2_nodes import far_nodes, ros2_nodes, until
 
 from skytether.messages import Twist, TwistStamped, encode, hash_of
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.lifecycle import states
 from skytether.ros.ros2.native import node as native

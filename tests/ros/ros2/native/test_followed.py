@@ -3,7 +3,7 @@
 import pytest
 from ros2_nodes import ros2_nodes, until
 
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.ros.ros2.dialect import NodeName
 from skytether.ros.ros2.native.node import RclpyNode
 

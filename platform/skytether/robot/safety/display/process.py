@@ -135,7 +135,7 @@ def main() -> None:
     log_without_waiting()
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm([MarkerArray], "cdr" if config.ros1 is None else "ros1")
+    warm([MarkerArray], config.encoding)
     graph = open_display(config)
     try:
         Display(config, guard, graph.publish).run()

@@ -1,4 +1,4 @@
-"""What all parts of the section ``safety`` are made of."""
+"""What the sections of robot.yaml on gate and graph are made of."""
 
 from __future__ import annotations
 

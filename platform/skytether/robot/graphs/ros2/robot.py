@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
-from skytether.messages import Encoding, Header, Message, Time, Twist, TwistStamped, encode, hash_of, type_of
+from skytether.messages import (
+    Encoding,
+    Header,
+    Message,
+    Time,
+    Twist,
+    TwistStamped,
+    encode,
+    encode_plain,
+    hash_of,
+    type_of,
+)
 from skytether.ros import permissions
 from skytether.ros.followed import Followed
-from skytether.ros.names import Names, namespace_of, resolve
-from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
+from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.followed import followed
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
-from skytether.ros.ros2.seam import GraphNode, Handle
+from skytether.ros.ros2.seam import GraphNode, Handle, Publication
 from skytether.ros.ros2.sim_time import GraphClock
 from skytether.wire.topic import Role, Topic
 
-from ..session.topic_table import Offer, robot_table, spoken
-from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
-from .wheels_watch import NOBODY, Others, WheelsWatch
+from ...session.topic_table import Offer, robot_table, spoken
+from ..graph_base import GraphBase, nowhere
+from ..graph_config import RobotGraphConfig
+from ..wheels_watch import NOBODY, Others, WheelsWatch
 
 _log = logging.getLogger(__name__)
 
@@ -37,59 +49,18 @@ _FRESH_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Ros2RobotConfig:
+class Ros2RobotConfig(RobotGraphConfig):
     """Where in its graph the robot's things are.
 
     Attributes:
-        robot: Its name.
-        service: The service's: what it sends is found below that name.
-        namespace: Of the robot's topics; None: its name.
-        remap: Names in the graph, by topic, call, action or reading.
-        cmd_vel: What the wheels listen to; None: others have the wheels.
+        node: Name of the agent's node, in the robot's namespace.
         cmd_vel_type: One of `WHEELS`.
         frame: Coordinate frame of stamped velocities.
-        idle_s: See `skytether.robot.graphs.graph_base.IDLE_S`.
-        readings: Types of what the robot's own control reads, by name.
-        topics: Sent to a service that takes any.
-        allowed: What the service may publish, call and offer beyond its own namespace.
-        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
-        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
-        drivers: Names of the nodes that publish it for us; empty: this one.
     """
 
-    robot: str
-    service: str
-    namespace: str | None = None
-    remap: Mapping[str, str] = field(default_factory=dict)
-    cmd_vel: str | None = "cmd_vel"
+    node: str = "skytether"
     cmd_vel_type: str = Twist.TYPE
     frame: str = "base_link"
-    idle_s: float | None = IDLE_S
-    readings: Mapping[str, str] = field(default_factory=dict)
-    topics: Collection[str] = ()
-    allowed: Allowed = NOTHING_MORE
-    protected: Mapping[str, str] = field(default_factory=dict)
-    wheels: str | None = None
-    drivers: Collection[str] = ()
-
-    @property
-    def home(self) -> str:
-        """The namespace of the robot's topics."""
-        return namespace_of(self.robot) if self.namespace is None else resolve(self.namespace, "/")
-
-    def names(self, specs: Sequence[TopicSpec]) -> Names:
-        """Names in the robot's graph.
-
-        Raises:
-            GraphNameError: One is not allowed.
-        """
-        return Names(specs, self.home, namespace_of(self.service), self.remap, ros=2)
-
-    def permissions(self) -> Permissions:
-        """What the service may do in the robot's graph."""
-        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
-        kept = protected_names(self.names(()), self.home, wheels, self.readings)
-        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
 
 
 class Ros2Robot:
@@ -112,6 +83,7 @@ class Ros2Robot:
         self._clock = clock or GraphClock(node)
         self._port: Ros2Port | None = None
         self._handles: list[Handle] = []
+        self._diagnostics: Publication | None = None
         self._own: list[tuple[str, Handle]] = []
         """Readings and wheels, by the robot's names."""
         self._told = False
@@ -146,6 +118,22 @@ class Ros2Robot:
     def _publishers(self, topic: str) -> list[str]:
         """Names of the nodes of others that publish a topic; this one's is not among them."""
         return [endpoint.node for endpoint in self._node.endpoints(topic, Kind.PUBLISHER)]
+
+    @property
+    def name(self) -> str:
+        """PublishesDiagnostics: the node's."""
+        return resolve(self._config.node, self._config.home)
+
+    def publish_diagnostics(self, type_name: str, topic: str, values: Mapping[str, Any]) -> None:
+        """PublishesDiagnostics: from one thread."""
+        if self._diagnostics is None:
+            name = self._config.names(()).own(topic)
+            qos = Qos(reliable=True, depth=1)
+            self._diagnostics = self._node.publish(
+                Endpoint(Kind.PUBLISHER, name, type_name, hash_of(type_name, "cdr"), qos)
+            )
+            self._handles.append(self._diagnostics)
+        self._diagnostics.put(encode_plain(type_name, values, "cdr"))
 
     @property
     def others(self) -> Others:

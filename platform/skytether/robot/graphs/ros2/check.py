@@ -1,20 +1,14 @@
-"""``skytether robot run`` for a robot that is a ROS 2 graph: how it is joined, and what ``--check`` looks at."""
+"""What ``--check`` and the doctor look at in a robot's ROS 2 graph: is everything there that a run will need?"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
-from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
 from skytether.messages import hash_of
-from skytether.robot.agent.diagnostics import TOPIC as DIAGNOSTICS
-from skytether.robot.agent.diagnostics import Ros2Diagnostics
-from skytether.robot.config.robot_config import RobotConfig, Ros2Config
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
-from skytether.robot.session.topic_table import spoken
-from skytether.ros.names import Names, resolve
+from skytether.ros.names import Names
 from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
@@ -23,17 +17,12 @@ from skytether.ros.ros2.native.node import NOBODY, RclpyNode, clashes
 from skytether.ros.ros2.qos import Qos, history_missed, row_settings
 from skytether.ros.ros2.seam import GraphNode
 
-from .check import (
-    Finding,
-    forbidden,
-    look_at_gate,
-    look_at_orchestrator,
-    look_at_record,
-    other_publishers,
-    plausible,
-    show,
-    unknown,
-)
+from ...session.topic_table import spoken
+from ..finding import Finding, forbidden, other_publishers, unknown
+from ..graph_config import RobotGraphConfig
+from .join import robot_config
+from .robot import Ros2RobotConfig
+from .sections import Ros2Config
 
 _JOIN_S = 10.0
 """For the node to come up, or the router to answer and to tell of the graph."""
@@ -41,67 +30,21 @@ _LIFECYCLE_S = 3.0
 """For lifecycle nodes to tell their states."""
 _LOOK_S = 5.0
 """For nodes on DDS to be discovered: nobody says when all of them are."""
+_TODO = "start the robot's nodes, or correct ros2 in robot.yaml"
 
 
-def ros2_config(settings: RobotConfig, ros2: Ros2Config) -> Ros2RobotConfig:
-    """What the graph needs of the configuration."""
-    return Ros2RobotConfig(
-        robot=settings.robot,
-        service=settings.service,
-        namespace=ros2.namespace,
-        remap=ros2.remap,
-        cmd_vel=ros2.cmd_vel if settings.safety is None else None,
-        cmd_vel_type=ros2.cmd_vel_type,
-        frame=ros2.frame,
-        idle_s=ros2.idle_s,
-        readings=ros2.readings,
-        topics=ros2.topics,
-        allowed=settings.allowed,
-        protected=settings.protected,
-        wheels=settings.wheels,
-        drivers=settings.drivers,
-    )
-
-
-@contextmanager
-def join_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path) -> Iterator[tuple[Ros2Robot, Ros2Diagnostics]]:
-    """The robot as a graph, and its diagnostics there, for as long as the context lasts.
+def look(
+    ros2: Ros2Config, shared: RobotGraphConfig, folder: Path, manifest: Manifest | None, command_topic: str
+) -> list[Finding]:
+    """Everything that a run will need of the graph, one by one.
 
     Raises:
         ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
     """
-    config = ros2_config(settings, ros2)
-    with join_graph(ros2, folder, config.home) as node:
-        robot = Ros2Robot(config, node)
-        name = resolve(ros2.node, config.home)
-        topic = config.names(()).own(DIAGNOSTICS)
-        try:
-            yield robot, Ros2Diagnostics(settings.robot, settings.service, name, node, topic)
-        finally:
-            robot.close()
-
-
-def check_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str) -> bool:
-    """Look whether everything is there that a run will need, and print a table. True if nothing is wrong.
-
-    Raises:
-        ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
-    """
-    return show(look_ros2(settings, ros2, folder, token))
-
-
-def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str) -> list[Finding]:
-    """Everything that a run will need, one by one.
-
-    Raises:
-        ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
-    """
-    config = ros2_config(settings, ros2)
-    manifest, findings = look_at_orchestrator(settings, token)
+    config = robot_config(ros2, shared)
     with join_graph(ros2, folder, config.home) as node:
         joined = node.wait_until_joined(_JOIN_S)
-        graph = len(findings)
-        findings.append(_graph(ros2, node) if isinstance(node, RclpyNode) else _router(ros2, node, joined))
+        findings = [_graph(ros2, node) if isinstance(node, RclpyNode) else _router(ros2, node, joined)]
         if manifest is not None and joined:
             specs = spoken(manifest.spec.robot_topics, "ros2_action")
             names = config.names(specs)
@@ -114,22 +57,23 @@ def look_ros2(settings: RobotConfig, ros2: Ros2Config, folder: Path, token: str)
                 if config.cmd_vel is not None:
                     awaited.append((Kind.SUBSCRIPTION, config.names(()).own(config.cmd_vel)))
                 _wait(node, awaited)
-                findings[graph] = _graph(ros2, node)
+                findings[0] = _graph(ros2, node)
             idle = {name: label for name, label in states(node, _LIFECYCLE_S).items() if label != ACTIVE}
-            findings += [_row(settings, part, names, node, idle) for part in rows]
-            findings += forbidden(config.permissions(), specs, names, settings.command_topic)
+            findings += [_row(command_topic, part, names, node, idle) for part in rows]
+            findings += forbidden(config.permissions(), specs, names, command_topic)
             if config.cmd_vel is not None:
                 findings.append(_wheels(config, config.cmd_vel, node))
             found = [endpoint.node for endpoint in node.endpoints(config.wheels, Kind.PUBLISHER)]
             findings += other_publishers(config.wheels, found, config.drivers)
-    return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
+    return findings
 
 
 def _router(ros2: Ros2Config, node: GraphNode, joined: bool) -> Finding:
     router = ros2.router or "as configured"
     if not joined:
+        todo = "start the graph's Zenoh router, or correct ros2.router in robot.yaml"
         says = "does not answer; is it running? (ros2 run rmw_zenoh_cpp rmw_zenohd)"
-        return Finding("ROS 2 router", router, "", says, good=False)
+        return Finding("ROS 2 router", router, "", says, good=False, todo=todo)
     says = f"answers; {len(node.endpoints())} publishers, subscriptions, services and clients"
     return Finding("ROS 2 router", router, "", says)
 
@@ -138,12 +82,12 @@ def _graph(ros2: Ros2Config, node: RclpyNode) -> Finding:
     """The node that we are, and whether anybody else is seen."""
     if not node.middleware:
         says = "; ".join(node.troubles) or f"our node was not there within {_JOIN_S:g} s"
-        return Finding("ROS 2 graph", ros2.node, "", says, good=False)
+        return Finding("ROS 2 graph", ros2.node, "", says, good=False, todo=_TODO)
     where = f"{node.middleware}, domain {node.domain}"
     if not node.nodes:
-        return Finding("ROS 2 graph", where, "", NOBODY, good=False)
+        return Finding("ROS 2 graph", where, "", NOBODY, good=False, todo=_TODO)
     if node.troubles:
-        return Finding("ROS 2 graph", where, "", "; ".join(node.troubles), good=False)
+        return Finding("ROS 2 graph", where, "", "; ".join(node.troubles), good=False, todo=_TODO)
     return Finding("ROS 2 graph", where, "", f"{node.nodes} other nodes are seen")
 
 
@@ -154,9 +98,9 @@ def _wait(node: RclpyNode, awaited: list[tuple[Kind, str]]) -> None:
         time.sleep(0.05)
 
 
-def _row(settings: RobotConfig, row: TopicSpec, names: Names, node: GraphNode, idle: Mapping[str, str]) -> Finding:
+def _row(command_topic: str, row: TopicSpec, names: Names, node: GraphNode, idle: Mapping[str, str]) -> Finding:
     """One row of the service's topics; ``idle`` are the lifecycle nodes that are not active, with their states."""
-    if row.kind == "topic" and row.direction == "out" and row.name == settings.command_topic:
+    if row.kind == "topic" and row.direction == "out" and row.name == command_topic:
         return Finding(row.name, "", row.type, "drives, past the supervisor")
     if row.kind == "call":
         name = names.of(f"{row.name}/request").removesuffix("/request")

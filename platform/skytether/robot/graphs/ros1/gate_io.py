@@ -17,8 +17,8 @@ from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
 
-from .config import Ros1Way
-from .inbox import Inbox, Topics
+from ..inbox import Inbox, Topics
+from .sections import Ros1Way
 
 
 class Ros1Wheels:
@@ -131,7 +131,7 @@ class Ros1Display:
         self._publication = self._node.advertise(resolve(topic, way.namespace), kind, hash_of(kind, "ros1"), queue=1)
 
     def publish(self, message: Message) -> None:
-        """Graph: publish it."""
+        """Display: publish it."""
         self._publication.publish(encode(message, "ros1"))
 
     def close(self) -> None:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
+from typing import Any, ClassVar
 
 from skytether.api.manifest import ANY_TOPIC, TopicSpec
 from skytether.bridge.port import Port
 from skytether.guard.clock import now as boottime
-from skytether.messages import Encoding, Message, Twist, hash_of, type_of
+from skytether.messages import Encoding, Message, Twist, encode_plain, hash_of, type_of
 from skytether.ros import notes, permissions
 from skytether.ros.followed import Followed
-from skytether.ros.names import Names, bridge_type, namespace_of, resolve
-from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
+from skytether.ros.names import Generation, bridge_type, resolve
 from skytether.ros.ros1.followed import taken
 from skytether.ros.ros1.master import MasterError, RefusedError
 from skytether.ros.ros1.node import Node
@@ -23,75 +23,30 @@ from skytether.ros.ros1.publication import Publication
 from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import ANY, Role, Topic
 
-from ..control.supervisor import Limits
-from ..session.topic_table import Offer, robot_table, spoken
-from .graph_base import IDLE_S, GraphBase, nowhere, protected_names
-from .wheels_watch import NOBODY, Others, WheelsWatch
+from ...session.topic_table import Offer, robot_table, spoken
+from ..graph_base import GraphBase, nowhere
+from ..graph_config import RobotGraphConfig
+from ..wheels_watch import NOBODY, Others, WheelsWatch
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Ros1RobotConfig:
+class Ros1RobotConfig(RobotGraphConfig):
     """Where in its graph the robot's things are.
 
     Attributes:
-        robot: Its name.
-        service: The service's: what it sends is found below that name.
-        namespace: Of the robot's topics; None: its name.
-        remap: Names in the graph, by topic, call, action or reading.
-        cmd_vel: What the wheels listen to; None: others have the wheels.
-        idle_s: See `skytether.robot.graphs.graph_base.IDLE_S`.
-        fresh_s: The wheels get no velocity that is older [s]: the node's own thread sends it, and this process may
-            stand still meanwhile.
-        readings: Types of what the robot's own control reads, by name.
-        topics: Sent to a service that takes any.
         params: Handed to the service's graph.
         use_sim_time: Whether /clock tells the time; None: as the master says.
-        allowed: What the service may publish, call and offer beyond its own namespace.
-        protected: What it never may: why, by absolute name; the wheels and the readings are, without being named.
-        wheels: Absolute name of what the wheels listen to, to see who else publishes it; None: it is no topic.
-        drivers: Names of the nodes that publish it for us; empty: this one.
     """
 
-    robot: str
-    service: str
-    namespace: str | None = None
-    remap: Mapping[str, str] = field(default_factory=dict)
-    cmd_vel: str | None = "cmd_vel"
-    idle_s: float | None = IDLE_S
-    fresh_s: float = Limits().watchdog_s
-    readings: Mapping[str, str] = field(default_factory=dict)
-    topics: Collection[str] = ()
+    generation: ClassVar[Generation] = 1
     params: Collection[str] = ()
     use_sim_time: bool | None = None
-    allowed: Allowed = NOTHING_MORE
-    protected: Mapping[str, str] = field(default_factory=dict)
-    wheels: str | None = None
-    drivers: Collection[str] = ()
-
-    @property
-    def home(self) -> str:
-        """The namespace of the robot's topics."""
-        return namespace_of(self.robot) if self.namespace is None else resolve(self.namespace, "/")
-
-    def names(self, specs: Sequence[TopicSpec]) -> Names:
-        """Names in the robot's graph.
-
-        Raises:
-            GraphNameError: One is not allowed.
-        """
-        return Names(specs, self.home, namespace_of(self.service), self.remap)
-
-    def permissions(self) -> Permissions:
-        """What the service may do in the robot's graph."""
-        wheels = [] if self.cmd_vel is None else [self.cmd_vel]
-        kept = protected_names(self.names(()), self.home, wheels, self.readings)
-        return Permissions(self.home, namespace_of(self.service), self.allowed, {**kept, **self.protected})
 
 
 class Ros1Robot:
-    """Implements `skytether.robot.graphs.graph_base.Graph`.
+    """Implements `skytether.robot.graphs.graph_base.Graph`, and tells how the agent is.
 
     Attributes:
         base: For the agent: readings and wheels.
@@ -108,6 +63,7 @@ class Ros1Robot:
         self._node = node
         self._port: Ros1Port | None = None
         self._wheels: Publication | None = None
+        self._diagnostics: Publication | None = None
         send: Callable[[bytes], object] = nowhere
         if config.cmd_vel is not None:
             topic = resolve(config.cmd_vel, config.home)
@@ -130,6 +86,17 @@ class Ros1Robot:
 
     def _reader(self, name: str) -> Listener:
         return Listener(lambda data, _: self.base.put(name, data))
+
+    @property
+    def name(self) -> str:
+        """PublishesDiagnostics: the node's."""
+        return self._node.name
+
+    def publish_diagnostics(self, type_name: str, topic: str, values: Mapping[str, Any]) -> None:
+        """PublishesDiagnostics: from one thread."""
+        if self._diagnostics is None:
+            self._diagnostics = self._node.advertise(topic, type_name, hash_of(type_name, "ros1"))
+        self._diagnostics.publish(encode_plain(type_name, values, "ros1"))
 
     @property
     def others(self) -> Others:

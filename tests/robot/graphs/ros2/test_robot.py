@@ -6,7 +6,7 @@ from ros2_graph import shared_router, stage
 from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, GraphPort, LocalGraph, SessionSpec, topics_from_api
 from skytether.messages import Header, Time, Twist, TwistStamped, Vector3, WrenchStamped, decode, encode, hash_of
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.wire.topic import Role
 
 __all__ = ["shared_router", "stage"]

@@ -7,7 +7,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, GraphPort, LocalGraph, SessionSpec, topics_from_api
 from skytether.bridge.calls import CallError
 from skytether.messages import Joy, Twist
-from skytether.robot.graphs.ros2 import Ros2Robot, Ros2RobotConfig
+from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.ros import permissions
 from skytether.ros.permissions import Allowed
 from skytether.ros.ros2.dialect import RmwZenoh, Ros2Dds

@@ -6,7 +6,7 @@ import pytest
 
 from skytether.guard.clock import now
 from skytether.messages import Twist, Vector3, decode
-from skytether.robot.graphs.ros1 import Ros1Robot, Ros1RobotConfig
+from skytether.robot.graphs.ros1.robot import Ros1Robot, Ros1RobotConfig
 
 
 class Told:

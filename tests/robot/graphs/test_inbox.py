@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.messages import Bool, Joy, LaserScan, PointCloud2, Range, encode
-from skytether.robot.safety.inbox import Inbox, Topics
+from skytether.robot.graphs.inbox import Inbox, Topics
 
 TOPICS = Topics(
     {"scan": LaserScan, "cloud": PointCloud2, "joy": Joy, "estop": Bool, "bumper": Bool, "cliff": Range},

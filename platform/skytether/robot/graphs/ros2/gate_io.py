@@ -20,8 +20,8 @@ from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Ros2Error
 from skytether.ros.ros2.sim_time import GraphClock
 
-from .config import Ros2Way
-from .inbox import Inbox, Topics
+from ..inbox import Inbox, Topics
+from .sections import Ros2Way
 
 _STOPS = 10_000
 """Words of a button, bumper or cliff sensor that wait while the gate hangs: minutes of them."""
@@ -150,7 +150,7 @@ class Ros2Display:
         self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, name, MarkerArray.TYPE))
 
     def publish(self, message: Message) -> None:
-        """Graph: publish it."""
+        """Display: publish it."""
         self._publication.put(encode(message))
 
     def close(self) -> None:

@@ -1,0 +1,28 @@
+"""What robot.yaml says of a ROS 2 graph."""
+
+from __future__ import annotations
+
+from pydantic import field_validator, model_validator
+
+from skytether.ros.names import check_name
+from skytether.ros.ros2.config import Ros2Graph, Ros2Link, Ros2Velocity
+
+from ..kind import GateSection, RobotSection
+
+
+class Ros2Config(Ros2Graph, Ros2Velocity, RobotSection):
+    """A ROS 2 graph."""
+
+    @model_validator(mode="after")
+    def _names_are_legal(self) -> Ros2Config:
+        self.check_names(2)
+        return self
+
+
+class Ros2Way(Ros2Link, Ros2Velocity, GateSection):
+    """A robot that is a ROS 2 graph. Its nodes are called ``node`` with ``_guard``, ``_gate``, ``_sensors`` after."""
+
+    @field_validator("namespace", "cmd_vel")
+    @classmethod
+    def _a_name(cls, name: str) -> str:
+        return check_name(name, 2)
