@@ -49,8 +49,7 @@ class Sites:
         self._timing = timing
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
-        self.on_deleted: Callable[[str], object] = lambda _: None
-        """Called with the name of a site when nothing of it is left here."""
+        self._told_of_deletions: list[Callable[[str], object]] = []
 
     def start(self, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
         """Open every site of the store, and give them a moment to answer.
@@ -220,7 +219,12 @@ class Sites:
         except RuntimeFailure as error:
             log.warning("site %s was deleted, but what it left there stays: %s", name, error)
         site.runtime.close()
-        self.on_deleted(name)
+        for tell in self._told_of_deletions:
+            tell(name)
+
+    def tell_of_deletions(self, tell: Callable[[str], object]) -> None:
+        """Have ``tell`` called with the name of each site of which nothing is left here."""
+        self._told_of_deletions.append(tell)
 
     def drain(self, name: str) -> bool:
         """Let a site take no more instances, and delete it as soon as none is there; whether it is gone by now.
