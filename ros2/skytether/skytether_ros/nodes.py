@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
@@ -119,6 +120,8 @@ def _command(node: Node, role: Role, arguments: Sequence[str]) -> tuple[list[str
     given = [*remappings(arguments, node.get_name()), *words(values)]
     if node.get_namespace() != "/":  # which launch gives, too, where nobody has said anything
         given.insert(0, f"__ns:={node.get_namespace()}")
+    if node.get_parameter_or("use_sim_time").value is True:
+        given.append("_use_sim_time:=true")
     options = remove_ros_args(list(arguments))[1:]
     environment = {"SKYTETHER_ROS2_PYTHON": sys.executable, **os.environ}
     if enclave(arguments):
@@ -161,7 +164,11 @@ class _Child:
         executor = SingleThreadedExecutor()
         executor.add_node(self._node)
         self._publish(DiagnosticStatus.OK, "runs")
-        timer = self._node.create_timer(_DIAGNOSTICS_S, lambda: self._publish(DiagnosticStatus.OK, "runs"))
+        # Not by the node's clock: a simulation that stands still is no reason to be silent.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self._node.create_timer(
+            _DIAGNOSTICS_S, lambda: self._publish(DiagnosticStatus.OK, "runs"), clock=steady
+        )
         while process.poll() is None:
             executor.spin_once(timeout_sec=_LOOK_S)
         timer.cancel()
@@ -178,9 +185,13 @@ class _Child:
         if self._told and code in _ENDED:
             self._publish(DiagnosticStatus.STALE, "was told to end")
             return 0
-        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
-        self._node.get_logger().error(f"{name} ended {how}")
-        self._publish(DiagnosticStatus.ERROR, f"ended {how}")
+        if code == 0:  # as with `--check`
+            self._node.get_logger().info(f"{name} ended")
+            self._publish(DiagnosticStatus.STALE, "ended")
+        else:
+            how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+            self._node.get_logger().error(f"{name} ended {how}")
+            self._publish(DiagnosticStatus.ERROR, f"ended {how}")
         self._diagnostics.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
         return code if code >= 0 else 128 - code
 

@@ -16,8 +16,9 @@ from typing import Any
 from skytether.api.yaml import YamlError, parse_yaml
 from skytether.ros.names import namespace_of, resolve
 
-PRIVATE = ("service", "params", "status_port", "topics")
-"""Keys of robot.yaml (``topics`` of its section ``ros1`` or ``ros2``) that private parameters give: whoever reaches the
+_OF_GRAPH = ("topics", "use_sim_time")
+PRIVATE = ("service", "params", "status_port", *_OF_GRAPH)
+"""Keys of robot.yaml (`_OF_GRAPH` of its section ``ros1`` or ``ros2``) that private parameters give: who reaches the
 master can set these, so nothing that safety, permissions or the token rely on is among them."""
 _GIVEN = {"__name": "name", "__ns": "namespace", "__master": "master", "__ip": "host", "__hostname": "host"}
 
@@ -78,8 +79,7 @@ class RosArguments:
             elif isinstance(graph.get("remap", {}), dict):
                 graph["remap"] = {**graph.get("remap", {}), old: new}
         private = {name: self.params[name] for name in PRIVATE if name in self.params}
-        if "topics" in private:
-            graph["topics"] = private.pop("topics")
+        graph.update({name: private.pop(name) for name in _OF_GRAPH if name in private})
         return {**document, **private, section: graph}
 
     def _over_ros1(self, section: dict[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,6 +19,10 @@ import pytest
 import yaml
 from ros2_nodes import ros2_nodes, until
 
+from skytether.api.client import Client
+from skytether.api.manifest import Manifest
+from skytether.api.rest import RobotCreate
+from skytether.lab.embedded import EmbeddedOrchestrator
 from skytether.ros.ros1.arguments import parse
 
 __all__ = ["ros2_nodes"]
@@ -65,13 +70,12 @@ def work():
         if line == "nodes\\n":
             nodes()
             continue
-        names = ["config", "service", "topics", "status_port"]
-        asked = line.strip()
+        asked, *names = line.split()
         described = ask(DescribeParameters, asked + "/describe_parameters", DescribeParameters.Request(names=names))
         values = ask(GetParameters, asked + "/get_parameters", GetParameters.Request(names=names)).values
         for d, value in zip(described.descriptors, values):
             limits = [[r.from_value, r.to_value] for r in d.integer_range]
-            plain = [value.string_value, value.integer_value, list(value.string_array_value)]
+            plain = [value.string_value, value.integer_value, list(value.string_array_value), value.bool_value]
             say(["parameter", d.name, d.type, d.description, d.read_only, limits, plain])
 threading.Thread(target=work, daemon=True).start()
 """
@@ -106,9 +110,12 @@ class Launched:
         file = self.folder / f"launch_params_{len(self._started)}"
         file.write_text(yaml.dump({"/**": {"ros__parameters": {"config": str(self.config), **parameters}}}))
         given = ["--ros-args", "-r", f"__node:={name}", "-r", "__ns:=/fleet/one", "--params-file", str(file), *words]
+        return self.run(what, *given)
+
+    def run(self, what, *words, **environment):
         process = subprocess.Popen(
-            [self.prefix / "lib" / "skytether" / what, *given],
-            env=self._environment,
+            [self.prefix / "lib" / "skytether" / what, *words],
+            env={**self._environment, **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -171,9 +178,9 @@ class Listener:
         self._node.tell("nodes")
         return self._next("nodes")
 
-    def parameters(self, node):
-        self._node.tell(node)
-        return {found[0]: found[1:] for found in (self._next("parameter") for _ in range(4))}
+    def parameters(self, node, *names):
+        self._node.tell(" ".join([node, *names]))
+        return {found[0]: found[1:] for found in (self._next("parameter") for _ in names)}
 
     def _next(self, what):
         while True:
@@ -235,8 +242,8 @@ def test_a_robot_is_where_launch_says_and_ends_when_it_is_told_to(launched, ros2
     nodes, drivers = listener.nodes()
     assert {"/fleet/one/mine", "/fleet/one/skytether"} <= set(nodes)
     assert drivers == ["skytether"]
-    parameters = listener.parameters("/fleet/one/mine")
-    assert parameters["status_port"][2:] == [True, [[-1, 65535]], ["", 0, []]]
+    parameters = listener.parameters("/fleet/one/mine", "config", "service", "status_port")
+    assert parameters["status_port"][2:] == [True, [[-1, 65535]], ["", 0, [], False]]
     assert parameters["config"][1].startswith("robot.yaml of this robot")
     assert parameters["config"][-1][0] == str(launched.config)
     assert parameters["service"][-1][0] == "recorder"
@@ -279,13 +286,16 @@ def test_gate_and_agent_are_nodes_of_one_namespace(launched, ros2_nodes):
     launched.write(safety=GONE, ros2={"namespace": "/elsewhere"})
     listener = Listener(ros2_nodes.start(LISTENER, "listener"))
     wheels = "cmd_vel:=/base/cmd_vel"
-    gate = launched.start("robot_gate", "gate_launch", "-r", wheels)
+    gate = launched.start("robot_gate", "gate_launch", "-r", wheels, use_sim_time=True)
     listener.status("fleet/one/gate_launch: program", lambda status: status.level == 0)
     until(lambda: "skytether_gate" in listener.nodes()[1], "the gate to have the wheels")
-    agent = launched.start("robot_run", "robot_launch", "-r", wheels)
+    agent = launched.start("robot_run", "robot_launch", "-r", wheels, use_sim_time=True)
     listener.status("fleet/one/skytether: gate", lambda status: status.message != "does not answer")
     found = set(listener.nodes()[0])
-    assert {f"/fleet/one/skytether{role}" for role in ("", "_guard", "_gate")} <= found
+    ours = [f"/fleet/one/skytether{role}" for role in ("", "_guard", "_gate")]
+    assert set(ours) <= found
+    for node in ours:
+        assert listener.parameters(node, "use_sim_time")["use_sim_time"][-1][-1] is True, node
     assert all(name.startswith("/fleet/one/") for name in found - {"/listener"})
     for process in (agent, gate):
         process.send_signal(signal.SIGTERM)
@@ -324,8 +334,54 @@ def test_what_is_wrong_with_the_file_is_the_agents_own_word_and_status(launched)
     assert "skytether robot run ended with code 2" in said
 
 
+def documented(beginning):
+    """What a shell makes of the command line of docs/ros2.md that begins so, behind the program's name."""
+    page = (ROOT / "docs" / "ros2.md").read_text().replace("\\\n", "")
+    (line,) = [line for line in page.splitlines() if line.startswith(f"ros2 run skytether robot_run {beginning}")]
+    return shlex.split(line, comments=True)[4:]
+
+
+@pytest.mark.slow
+@pytest.mark.ros2
+def test_the_documented_command_line_gives_the_agent_what_it_says(launched, ros2_nodes):
+    listener = Listener(ros2_nodes.start(LISTENER, "listener"))
+    process = launched.run("robot_run", *documented("--ros-args"), SKYTETHER_ROBOT=str(launched.config))
+    runs = listener.status("walker/skytether_launch: program", lambda status: status.level == 0)
+    given = runs.values["command"].partition(" -- ")[2]
+    assert given == "__ns:=/walker scan:=/front/scan _service:=navigation _params:={max_speed: 0.4}"
+    service = listener.status("walker/skytether: service", lambda status: status.message)
+    assert service.values["asked for"] == "navigation"
+    process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, said
+
+
+@pytest.mark.slow
+@pytest.mark.ros2
+def test_a_check_that_finds_nothing_wrong_ends_without_an_error(launched, ros2_nodes, tmp_path):
+    listener = Listener(ros2_nodes.start(LISTENER, "listener"))
+    (tmp_path / "orchestrator").mkdir()
+    with (
+        EmbeddedOrchestrator(tmp_path / "orchestrator") as orchestrator,
+        Client(orchestrator.url, orchestrator.operator_token) as client,
+    ):
+        manifest = yaml.safe_load((ROOT / "docs" / "examples" / "wall_stop" / "service.yaml").read_text())
+        client.put_service("wall-stop", Manifest.model_validate(manifest))
+        (tmp_path / "walker.token").write_text(client.create_robot(RobotCreate(name="walker")).token)
+        launched.write(orchestrator=orchestrator.url, service="wall-stop")
+        process = launched.run("robot_run", *documented("--check"), SKYTETHER_ROBOT=str(launched.config))
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "nothing is to mend" in said
+    assert "[INFO]" in said.splitlines()[-1]
+    assert said.splitlines()[-1].endswith("skytether robot run ended")
+    ended = listener.status("skytether_launch: program", lambda status: status.message == "ended")
+    assert ended.level == 3
+
+
 def test_what_launch_gives_is_stronger_than_the_file():
-    given = parse(["__ns:=/fleet/one", "cmd_vel:=/base", "scan:=/front/scan", "_topics:=[/tf]"], {})
+    words = ["__ns:=/fleet/one", "cmd_vel:=/base", "scan:=/front/scan", "_topics:=[/tf]", "_use_sim_time:=true"]
+    given = parse(words, {})
     changed = given.over(ROBOT | {"ros2": {"namespace": "/", "domain": 7}})
     assert changed["ros2"] == {
         "namespace": "/fleet/one",
@@ -333,6 +389,7 @@ def test_what_launch_gives_is_stronger_than_the_file():
         "cmd_vel": "/base",
         "remap": {"scan": "/front/scan"},
         "topics": ["/tf"],
+        "use_sim_time": True,
     }
     assert parse([], {"ROS_NAMESPACE": "ros1"}).over(ROBOT) == ROBOT, "ROS 2 has no such variable"
 
