@@ -26,7 +26,7 @@ MAX_NOTES = 8 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class TypeNote:
-    """A type as its publisher tells it: name, MD5 and definition."""
+    """A type as its publisher tells it: name, MD5 (of ROS 2 the RIHS01) and definition."""
 
     type: str
     md5: str
@@ -67,21 +67,23 @@ class Notes:
         ).encode()
 
 
-def topics() -> tuple[Topic, Topic]:
+def topics() -> tuple[Topic, ...]:
     """The rows that both ends add to their tables."""
-    return tuple(  # type: ignore[return-value]
-        Topic(
-            NOTES[direction.sender],
-            TYPE,
-            direction,
-            priority=20,
-            lifespan=60.0,
-            depth=1,
-            reliable=True,
-            latched=True,
-            compression="zstd",
-        )
-        for direction in Direction
+    return tuple(row(direction.sender) for direction in Direction)
+
+
+def row(sender: Role) -> Topic:
+    """The row by which one end tells."""
+    return Topic(
+        NOTES[sender],
+        TYPE,
+        Direction.IN if sender is Role.ROBOT else Direction.OUT,
+        priority=20,
+        lifespan=60.0,
+        depth=1,
+        reliable=True,
+        latched=True,
+        compression="zstd",
     )
 
 

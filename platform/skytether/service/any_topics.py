@@ -13,7 +13,7 @@ from skytether.messages import Encoding, definition_of
 from skytether.ros import notes
 from skytether.ros.names import bridge_type
 from skytether.wire.events import MessageReceived
-from skytether.wire.topic import ANY, Direction, Role, Topic
+from skytether.wire.topic import ANY, Role, Topic
 
 from .mailbox import RawQueue
 
@@ -25,7 +25,7 @@ _EARLY, _EARLY_BYTES = 1000, 16 * 2**20
 
 def rows(topics: Iterable[str]) -> tuple[Topic, ...]:
     """What a service that takes any topic adds to its table."""
-    return tuple(row for row in notes.topics() if row.direction is Direction.IN) if ANY in topics else ()
+    return (notes.row(Role.ROBOT),) if ANY in topics else ()
 
 
 class AnyTopics:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.api.grant import Grant
+from skytether.ros import notes
 from skytether.ros.ros2.dialect import NodeName
 from skytether.ros.ros2.native.interpreter import NAMED
 from skytether.ros.ros2.native.node import RclpyNode
@@ -218,7 +219,7 @@ def _flat(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-GRAPH = GraphType("ros2", 2, "cdr", (), told=False, join=_join)
+GRAPH = GraphType("ros2", 2, "cdr", (notes.row(Role.ROBOT),), told=False, join=_join)
 
 if __name__ == "__main__":
     sys.exit(run(GRAPH))

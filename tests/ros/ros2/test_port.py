@@ -18,10 +18,11 @@ from skytether.messages import (
     encode,
     hash_of,
 )
+from skytether.ros import notes
 from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.translate import Translated
 from skytether.wire.events import Connected, MessageReceived
-from skytether.wire.topic import Direction, Role, Topic
+from skytether.wire.topic import ANY, Direction, Role, Topic
 
 pytestmark = pytest.mark.slow
 
@@ -168,6 +169,23 @@ def test_a_service_of_a_ros2_graph_takes_any_topic(stage, ends):
     stage.until(lambda: bridge.publish("odd", stage.cdr_string("x")) and heard.samples, "nothing came")
     assert heard.payloads[0] == stage.cdr_string("x")
     assert "'/bot/not a name' is no name of ROS 2" in port.refusals["not a name"]
+
+
+def test_a_service_of_a_ros2_graph_takes_a_topic_whose_type_comes_late(stage):
+    table = (*rows({"name": "*", "type": "*", "direction": "in"}), notes.row(Role.ROBOT))
+    port = Ros2Port(stage.ours(), table, Role.SERVICE, name_of=lambda name: f"/bot/{name}")
+    port.attach(FakeBridge())
+    heard = stage.rmw("recorder").subscribe("/bot/late", DDS_STRING, RIHS_STRING, depth=1)
+    row = Topic("late", ANY, Direction.IN, reliable=True, latched=True)
+    port.notify(Connected((row, notes.row(Role.ROBOT))))
+
+    def deliver(topic, payload):
+        port.deliver(MessageReceived(topic, payload, 0, 0.0, 0.0, 0.0))
+
+    deliver("late", stage.cdr_string("early"))
+    deliver(notes.NOTES[Role.ROBOT], notes.Notes({"late": notes.TypeNote(STRING, RIHS_STRING)}).pack())
+    stage.until(lambda: heard.payloads == [stage.cdr_string("early")], "what came early was lost")
+    assert port.refusals == {}
 
 
 class FakeBridge:

@@ -6,15 +6,20 @@ What a peer has in ROS 1 bytes is turned into CDR and back by a `skytether.ros.t
 from __future__ import annotations
 
 import itertools
+import threading
+from collections import deque
 from collections.abc import Callable, Container, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol, runtime_checkable
 
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
-from skytether.messages import Encoding, hash_of
+from skytether.messages import Encoding, definition_of, hash_of
+from skytether.ros import notes as graph_notes
 from skytether.ros.followed import Followed
+from skytether.ros.names import bridge_type
+from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
@@ -23,10 +28,15 @@ from skytether.wire.topic import ANY, Role, Topic
 
 from .dialect import Endpoint, Kind
 from .followed import followed
+from .graph import learned_hash
 from .names import check_type, full_name
 from .qos import SERVICE, qos_of
 from .seam import Client, GraphNode, Handle, Publication
 
+SURVEY_S = 0.5
+"""Between looks for topics whose type is not known yet."""
+_EARLY = 16
+"""Messages kept of a topic whose type the peer has not told yet."""
 _RIHS = "RIHS01_"
 
 
@@ -51,11 +61,13 @@ class _Way:
         handle: What we are on the graph for it.
         publication: The same, where we publish.
         refusal: Why nothing goes this way; empty if it does.
+        early: What came before the peer has told its type.
     """
 
     handle: Handle | None = None
     publication: Publication | None = None
     refusal: str = ""
+    early: deque[MessageReceived] = field(default_factory=lambda: deque(maxlen=_EARLY))
 
 
 class Ros2Port:
@@ -63,7 +75,8 @@ class Ros2Port:
 
     Args:
         node: Started or not.
-        topics: This end's table.
+        topics: This end's table. A topic of type `ANY` that this end sends is followed when somebody publishes it; with
+            a row of `skytether.ros.notes.topics` the peer is told its type, and each that not everybody knows.
         role: Which end this is.
         name_of: Name in the graph of a topic of the table (of a call its request); by default its own, in the root
             namespace.
@@ -97,12 +110,18 @@ class Ros2Port:
         rows = {t.name: t for t in topics if t.name not in skip}
         self._calls = call_names(rows.values())
         self._takes_any = ANY in rows
-        self._rows = {n: t for n, t in rows.items() if n != ANY}
+        self._tells = NOTES[role] in rows
+        self._rows = {n: t for n, t in rows.items() if n not in (ANY, *NOTES.values())}
         self._call_rows = {name: (rows[name + REQUEST], rows[name + RESPONSE]) for name in self._calls}
         self._ways = {name: _Way() for name in self._rows}
-        self._endpoints = {row.name: self._endpoint(row) for row in self._plain_rows()}
+        self._endpoints = {row.name: self._endpoint(row) for row in self._plain_rows() if row.type != ANY}
+        self._late = {row.name: row for row in self._plain_rows() if row.type == ANY}
+        """Topics of the table whose type nobody has told yet."""
+        self._learned: dict[str, TypeNote] = {}
         self._services = {name: self._service(name) for name in self._calls}
         self._skip = skip
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
 
     def attach(self, publisher: Publisher) -> None:
         """Port: join the graph.
@@ -112,7 +131,10 @@ class Ros2Port:
         """
         self._publisher = publisher
         for row in self._plain_rows():
-            self._join_topic(row)
+            if row.name not in self._late:
+                self._join_topic(row)
+        if self._late or self._tells:
+            threading.Thread(target=self._survey, args=(publisher,), name="ros2-survey", daemon=True).start()
         if not self._calls:
             return
         if not isinstance(publisher, Caller):
@@ -134,7 +156,12 @@ class Ros2Port:
 
     def deliver(self, message: MessageReceived) -> None:
         """Port: publish what came from the peer."""
+        if message.topic in NOTES.values():
+            self._take_notes(graph_notes.unpack(message.payload) or Notes())
+            return
         way = self._ways.get(message.topic)
+        if way is not None and message.topic in self._late:
+            way.early.append(message)
         if way is None or way.publication is None:
             return
         if self._may(Access.PUBLISH, message.topic, way.publication.endpoint.name):
@@ -150,6 +177,8 @@ class Ros2Port:
 
     def close(self) -> None:
         """Leave the graph; the node stays."""
+        with self._lock:
+            self._closed.set()
         for way in self._ways.values():
             if way.handle is not None:
                 way.handle.close()
@@ -207,9 +236,19 @@ class Ros2Port:
 
     def _agree(self, topic: Topic) -> None:
         """A topic that was agreed with the peer: a row for any takes what it names."""
-        if topic.name in self._skip or topic.name in self._rows or not self._takes_any:
+        known = topic.name in self._rows and topic.name not in self._late
+        if known or not self._takes_any or topic.name in self._skip or topic.name in NOTES.values():
             return
         self._rows[topic.name], self._ways[topic.name] = topic, _Way()
+        if topic.type == ANY:
+            self._late[topic.name] = topic
+        else:
+            self._late.pop(topic.name, None)
+            self._name(topic)
+
+    def _name(self, topic: Topic) -> None:
+        """Join a topic whose type was told only now."""
+        self._rows[topic.name] = topic
         try:
             self._endpoints[topic.name] = self._endpoint(topic)
         except ValueError as error:
@@ -217,6 +256,53 @@ class Ros2Port:
             self._node.report(f"name {topic.name}", str(error))
             return
         self._join_topic(topic)
+
+    # --- notes -------------------------------------------------------------------------------------------------------
+
+    def _take_notes(self, told: Notes) -> None:
+        """In the bridge's thread: the peer knows types that it did not know when the session began."""
+        for name, note in told.types.items():
+            row = self._late.pop(name, None)
+            if row is not None:
+                self._name(replace(row, type=bridge_type(note.type), type_hash=note.md5))
+                early = self._ways[name].early
+                while early:
+                    self.deliver(early.popleft())
+
+    def _survey(self, publisher: Publisher) -> None:
+        """Thread that looks for late topics, and tells the peer types that not everybody knows."""
+        sent: Notes | None = None
+        told = {row.name for row in self._plain_rows() if row.direction.sender is self._role and not _known(row)}
+        answers = [name for name, caller in self._calls.items() if caller is not self._role]
+        services = {name: TypeNote(self._services[name].type, "") for name in answers}
+        while not self._closed.is_set():
+            for row in list(self._late.values()):
+                self._find(row)
+            for name in told - set(self._late):
+                self._learn(name)
+            mine = Notes(dict(self._learned), services)
+            if self._tells and mine != sent and publisher.publish(NOTES[self._role], mine.pack()):
+                sent = mine
+            self._closed.wait(SURVEY_S)
+
+    def _find(self, row: Topic) -> None:
+        """Follow a topic of which no type was known, if somebody publishes it now."""
+        publishers = self._node.endpoints(self._named(row.name), Kind.PUBLISHER)
+        with self._lock:
+            if publishers and not self._closed.is_set():
+                del self._late[row.name]
+                self._name(replace(row, type=publishers[0].type))
+
+    def _learn(self, name: str) -> None:
+        """What the graph knows of a topic's type; ROS 2 Humble knows no hash."""
+        endpoint = self._endpoints.get(name)
+        known = self._learned.get(name)
+        if endpoint is None or (known is not None and known.md5):
+            return
+        publishers = self._node.endpoints(endpoint.name, Kind.PUBLISHER)
+        if publishers:
+            type_hash = endpoint.type_hash or learned_hash(endpoint, publishers)
+            self._learned[name] = TypeNote(endpoint.type, type_hash)
 
     # --- calls -------------------------------------------------------------------------------------------------------
 
@@ -265,6 +351,11 @@ class Ros2Port:
     @staticmethod
     def _hash(row: Topic) -> str:
         return row.type_hash if row.type_hash.startswith(_RIHS) else hash_of(row.type, "cdr")
+
+
+def _known(row: Topic) -> bool:
+    """Whether everybody knows the type."""
+    return bool(row.type_hash and definition_of(row.type, "cdr"))
 
 
 def _refuse(why: str, _: bytes) -> bytes:

@@ -7,7 +7,11 @@ from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, GraphPort, LocalGraph, SessionSpec, topics_from_api
 from skytether.messages import Header, Time, Twist, TwistStamped, Vector3, WrenchStamped, decode, encode, hash_of
 from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
-from skytether.wire.topic import Role
+from skytether.service.any_topics import AnyTopics
+from skytether.service.any_topics import rows as any_rows
+from skytether.service.mailbox import RawQueue
+from skytether.wire.events import Connected
+from skytether.wire.topic import ANY, Role
 
 __all__ = ["shared_router", "stage"]
 pytestmark = pytest.mark.slow
@@ -114,12 +118,64 @@ def test_the_table_of_a_session_and_what_goes_through(stage):
         service.stop()
 
 
-def test_a_service_that_takes_any_topic_gets_those_that_are_named(stage, caplog):
-    node = stage.ours()
-    rmw = stage.rmw("camera")
-    publisher(rmw, "/bot/odom", "nav_msgs/msg/Odometry")
+def test_a_service_that_takes_any_topic_gets_those_that_are_named_as_they_come(stage):
+    """A recorder in little: one topic is there, one comes late, one with a type that nobody knows."""
+    node, rmw = stage.ours(), stage.rmw("camera")
+    odom = publisher(rmw, "/bot/odom", "nav_msgs/msg/Odometry")
     stage.until(lambda: node.endpoints("/bot/odom"), "not seen")
-    robot = Ros2Robot(Ros2RobotConfig("bot", "recorder", topics=("odom", "/ghost")), node)
-    topics, _ = robot.open(specs({"name": "*", "type": "*", "direction": "in"}), "cmd_vel")
-    assert [(t.name, t.type, t.encoding) for t in topics] == [("/bot/odom", "nav_msgs/msg/Odometry", "cdr")]
-    assert "topic /ghost is not sent: nobody published it yet" in caplog.text
+    robot = Ros2Robot(Ros2RobotConfig("bot", "recorder", topics=("odom", "/late", "/odd")), node)
+    everything = specs({"name": "*", "type": "*", "direction": "in", "reliable": True, "depth": 100})
+    topics, port = robot.open(everything, "cmd_vel")
+    assert [(t.name, t.type) for t in topics[:-1]] == [
+        ("/bot/odom", "nav_msgs/msg/Odometry"),
+        ("/late", ANY),
+        ("/odd", ANY),
+    ]
+    queue = RawQueue(100, 2**20)
+    any_topics = AnyTopics(queue)
+    table = (*topics_from_api(everything), *any_rows([ANY]))
+    key = bytes(32)
+    recorder = Bridge(SessionSpec(8, key, Role.SERVICE, table), AnyPort(any_topics))
+    recorder.start()
+    bridge = Bridge(SessionSpec(8, key, Role.ROBOT, topics), port, peer=recorder.address)
+    bridge.start()
+    got = {}
+
+    def has(name):
+        while (message := queue.take()) is not None:
+            got.setdefault(message.topic, message)
+        return name in got
+
+    try:
+        stage.until(lambda: odom(b"\0\1\0\0odom") or has("/bot/odom"), "no odometry came")
+        assert ("/late", "any") in {(topic.graph, topic.type) for topic in robot.topics()}
+        rihs = "RIHS01_" + "5" * 64
+        late, odd = publisher(rmw, "/late", WRENCH), rmw.publisher("/odd", dds("acme_msgs/msg/Odd"), rihs)
+        stage.until(lambda: late(b"\0\1\0\0late") or odd(b"\0\1\0\0odd") or (has("/late") and has("/odd")), "nothing")
+        assert (got["/late"].type, got["/late"].hash) == (WRENCH, hash_of(WRENCH, "cdr"))
+        assert (got["/odd"].type, got["/odd"].hash, got["/odd"].payload) == ("acme_msgs/msg/Odd", rihs, b"\0\1\0\0odd")
+        assert ("/late", WRENCH, ("/camera",)) in {(topic.graph, topic.type, topic.nodes) for topic in robot.topics()}
+        robot.close()
+        stage.until(lambda: not rmw.sees("MS", "/late"), "still on the graph")
+    finally:
+        bridge.stop()
+        recorder.stop()
+
+
+class AnyPort:
+    """The end of a service that takes any topic."""
+
+    encoding = "cdr"
+
+    def __init__(self, topics):
+        self.topics = topics
+
+    def attach(self, publisher):
+        pass
+
+    def deliver(self, message):
+        self.topics.put(message, "cdr")
+
+    def notify(self, event):
+        if isinstance(event, Connected):
+            self.topics.agree(event.topics)

@@ -72,13 +72,15 @@ def _topics(
     graph: Ros1RobotConfig, command_topic: str, names: Names, node: Node, specs: Sequence[TopicSpec]
 ) -> list[Finding]:
     rows = [row for spec in specs if spec.kind != "call" for row in spec.rows() if row.name != ANY_TOPIC]
-    taken = [row for row in rows if row.direction == "in"]
-    for row in taken:
-        node.subscribe(names.of(row.name), row.type, hash_of(row.type, "ros1"), Listener(lambda *_: None))
+    own = graph.names(())
+    readings = [(TopicSpec(name=n, type=kind, direction="in"), own.own(n)) for n, kind in graph.readings.items()]
+    taken = [(row, names.of(row.name)) for row in rows if row.direction == "in"] + readings
+    for row, name in taken:
+        node.subscribe(name, row.type, hash_of(row.type, "ros1"), Listener(lambda *_: None))
     found = [unknown(name) for name in names.unused(graph.readings)]
     published = node.master.published()
     deadline = time.monotonic() + _LOOK_S
-    awaited = {names.of(row.name) for row in taken} & set(published)
+    awaited = {name for _, name in taken} & set(published)
     while time.monotonic() < deadline and any(not any(node.look()[name]) for name in awaited):
         time.sleep(0.05)
     for row in rows:
@@ -90,7 +92,7 @@ def _topics(
         else:
             found.append(Finding(row.name, name, row.type, "will be published"))
     found += [_call(spec, names.of(spec.name), node) for spec in specs if spec.kind == "call"]
-    return found
+    return found + [_incoming(row, name, node, name in published) for row, name in readings]
 
 
 def _any(graph: Ros1RobotConfig, node: Node) -> list[Finding]:

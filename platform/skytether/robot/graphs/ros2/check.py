@@ -8,7 +8,7 @@ from pathlib import Path
 
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
 from skytether.messages import hash_of
-from skytether.ros.names import Names
+from skytether.ros.names import Names, resolve
 from skytether.ros.ros2.config import join_graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
@@ -49,17 +49,26 @@ def look(
             specs = spoken(manifest.spec.robot_topics, "ros2_action")
             names = config.names(specs)
             findings += [unknown(name) for name in names.unused((*config.readings, ros2.cmd_vel))]
-            rows = [part for spec in specs for part in spec.parts() if part.name != ANY_TOPIC]
+            parts = [part for spec in specs for part in spec.parts()]
+            rows = [part for part in parts if part.name != ANY_TOPIC]
+            wanted = [resolve(name, config.home) for name in config.topics] if len(rows) < len(parts) else []
+            # What a publisher keeps for newcomers they get, without a word of any manifest.
+            kept = {"direction": "in", "reliable": True, "latched": True}
+            readings = [TopicSpec.model_validate({"name": n, "type": t, **kept}) for n, t in config.readings.items()]
             if isinstance(node, RclpyNode):
                 awaited = [
                     (Kind.PUBLISHER, names.of(r.name)) for r in rows if r.kind == "topic" and r.direction == "in"
                 ]
+                awaited += [(Kind.PUBLISHER, name) for name in wanted]
+                awaited += [(Kind.PUBLISHER, config.names(()).own(name)) for name in config.readings]
                 if config.cmd_vel is not None:
                     awaited.append((Kind.SUBSCRIPTION, config.names(()).own(config.cmd_vel)))
                 _wait(node, awaited)
                 findings[0] = _graph(ros2, node)
             idle = {name: label for name, label in states(node, _LIFECYCLE_S).items() if label != ACTIVE}
             findings += [_row(command_topic, part, names, node, idle) for part in rows]
+            findings += [_any(name, node) for name in wanted if name not in {names.of(row.name) for row in rows}]
+            findings += [_row("", row, config.names(()), node, idle) for row in readings]
             findings += forbidden(config.permissions(), specs, names, command_topic)
             if config.cmd_vel is not None:
                 findings.append(_wheels(config, config.cmd_vel, node))
@@ -139,6 +148,15 @@ def _row(command_topic: str, row: TopicSpec, names: Names, node: GraphNode, idle
         lost = ", ".join(sorted({o.node for o in others if not o.qos.transient_local}))
         says += f"; what {kept} keeps for newcomers (transient local) is missed, because {lost} offers volatile"
     return Finding(row.name, name, row.type, says, missing=bool(still) and all(o.node in idle for o in others))
+
+
+def _any(name: str, node: GraphNode) -> Finding:
+    """A topic for a service that takes any."""
+    others = node.endpoints(name, Kind.PUBLISHER)
+    if not others:
+        return Finding(name, name, "any", "nobody publishes it yet; it is followed as it comes", missing=True)
+    who = ", ".join(sorted({other.node for other in others if other.node}))
+    return Finding(name, name, others[0].type, f"from {who}".strip())
 
 
 def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: GraphNode) -> Finding:

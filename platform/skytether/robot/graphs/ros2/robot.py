@@ -22,7 +22,7 @@ from skytether.messages import (
     hash_of,
     type_of,
 )
-from skytether.ros import permissions
+from skytether.ros import notes, permissions
 from skytether.ros.followed import Followed
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Endpoint, Kind
@@ -31,7 +31,7 @@ from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Handle, Publication
 from skytether.ros.ros2.sim_time import GraphClock
-from skytether.wire.topic import Role, Topic
+from skytether.wire.topic import ANY, Role, Topic
 
 from ...session.topic_table import Offer, robot_table, spoken
 from ..graph_base import GraphBase, nowhere
@@ -160,6 +160,8 @@ class Ros2Robot:
         for unused in names.unused((*self._config.readings, self._config.cmd_vel or "", "/diagnostics")):
             _log.warning("remap.%s has no effect: the service has no such topic", unused)
         topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
+        if any(spec.name == ANY_TOPIC for spec in specs):
+            topics = (*topics, notes.row(Role.ROBOT))
         if self._port is not None:
             self._port.close()
         self._port = Ros2Port(self._node, topics, Role.ROBOT, name_of=names.of, skip=(command_topic,), permissions=may)
@@ -190,11 +192,9 @@ class Ros2Robot:
         """Topics for a service that takes any, by their names in the graph."""
         found = {}
         for name in (resolve(name, self._config.home) for name in self._config.topics):
-            publishers = self._node.endpoints(name, Kind.PUBLISHER)
-            if not publishers:
-                _log.error("topic %s is not sent: nobody published it yet, so its type is not known", name)
-            elif name not in named:
-                found[name] = publishers[0].type
+            if name not in named:
+                # One that nobody publishes yet is waited for: the port tells its type when it comes (`ros.notes`).
+                found[name] = next((other.type for other in self._node.endpoints(name, Kind.PUBLISHER)), ANY)
         if not self._config.topics:
             _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
         return found
