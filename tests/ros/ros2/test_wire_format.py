@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skytether.ros.ros2.attachment import Attachment, pull_attachment, push_attachment
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName, RmwZenoh, Ros2Dds
 from skytether.ros.ros2.names import check_type, dds_type, full_name, ros_type
-from skytether.ros.ros2.qos import MAX_DEPTH, Qos, pull_dds, pull_rmw, push_dds, push_rmw, qos_of, row_settings
+from skytether.ros.ros2.qos import MAX_DEPTH, Qos, pull_dds, pull_rmw, push_dds, push_rmw, qos_of
 from skytether.wire.topic import Direction, Topic
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -258,12 +258,3 @@ def test_rows_have_a_quality_in_ros2(row, published, subscribed):
     topic = Topic("t", "std_msgs/msg/String", Direction.IN, **row)
     assert qos_of(topic, publishes=True) == published
     assert qos_of(topic, publishes=False) == subscribed
-
-
-def test_qualities_of_ros2_make_rows():
-    assert row_settings(Qos(reliable=False, depth=5)) == {"reliable": False, "latched": False, "depth": 1}
-    assert row_settings(Qos(depth=5)) == {"reliable": True, "latched": False, "depth": 5}
-    assert row_settings(Qos(depth=10**6))["depth"] == MAX_DEPTH
-    assert row_settings(Qos(transient_local=True, depth=5)) == {"reliable": True, "latched": True, "depth": 1}
-    for settings in map(row_settings, (Qos(), Qos(False), Qos(True, True))):
-        Topic("t", "x/msg/Y", Direction.IN, **settings)  # a row can be made of each

@@ -50,18 +50,6 @@ def qos_of(row: Topic, *, publishes: bool) -> Qos:
     return Qos(reliable=publishes or row.reliable, depth=row.depth)
 
 
-def row_settings(qos: Qos) -> dict[str, bool | int]:
-    """What a row of the bridge's table should say for a publisher of this quality.
-
-    A best-effort topic of sensor data is a newest-value topic of the bridge, whatever its depth: who reads late wants
-    the newest. A reliable one keeps its depth; transient local is latched.
-    """
-    if not qos.reliable:
-        return {"reliable": False, "latched": False, "depth": 1}
-    depth = 1 if qos.transient_local else max(1, min(qos.depth, MAX_DEPTH))
-    return {"reliable": True, "latched": qos.transient_local, "depth": depth}
-
-
 # --- DDS: what is offered must be at least what is asked for, or nothing is delivered -------------------------------
 
 MIN_FOLLOWED, MAX_FOLLOWED = 10, 1000

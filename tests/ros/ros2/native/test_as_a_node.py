@@ -173,7 +173,7 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
     ]
 
 
-def test_a_publisher_that_overruns_us_is_named_and_harms_no_other_topic(ros2_nodes):
+def test_a_publisher_that_overruns_us_is_counted_and_harms_no_other_topic(ros2_nodes):
     """Messages come quicker than they are taken: the newest win, the loss is counted, the wheels go on."""
     peer = ros2_nodes.start(
         """

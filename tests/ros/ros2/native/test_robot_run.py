@@ -212,3 +212,14 @@ def test_the_check_looks_topic_by_topic(ros2_nodes, config, skytether):
     examined = skytether("doctor", str(config), "--json")
     findings = [f for f in json.loads(examined.communicate(timeout=60)[0]) if f["check"] in ("types", "ros graph")]
     assert {f["state"] for f in findings} == {"ok"}
+
+
+def test_the_check_names_wheels_that_get_nothing_because_of_their_quality(ros2_nodes, config, skytether):
+    change(config)
+    ros2_nodes.start(BASE.replace("say(m.twist.linear.x), 10", "0, qos(latched=True, depth=1)"), "base")
+    process = skytether("robot", "run", str(config), "--check")
+    found, said = process.communicate(timeout=60)
+    assert process.returncode == 1, found + said
+    assert "the subscription of /base gets nothing: transient local is asked for, volatile is offered" in " ".join(
+        found.split()
+    )

@@ -14,7 +14,7 @@ from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.graph import mismatches
 from skytether.ros.ros2.lifecycle import ACTIVE, states
 from skytether.ros.ros2.native.node import NOBODY, RclpyNode, clashes
-from skytether.ros.ros2.qos import Qos, history_missed, row_settings
+from skytether.ros.ros2.qos import Qos, history_missed
 from skytether.ros.ros2.seam import GraphNode
 
 from ...session.topic_table import spoken
@@ -28,8 +28,10 @@ _JOIN_S = 10.0
 """For the node to come up, or the router to answer and to tell of the graph."""
 _LIFECYCLE_S = 3.0
 """For lifecycle nodes to tell their states."""
-_LOOK_S = 5.0
-"""For nodes on DDS to be discovered: nobody says when all of them are."""
+_FIRST_S = 12.0
+"""For the first node on DDS to be discovered."""
+_NEXT_S = 5.0
+"""For the next: nobody says when all of them are."""
 _TODO = "start the robot's nodes, or correct ros2 in robot.yaml"
 
 
@@ -101,9 +103,14 @@ def _graph(ros2: Ros2Config, node: RclpyNode) -> Finding:
 
 
 def _wait(node: RclpyNode, awaited: list[tuple[Kind, str]]) -> None:
-    """Until all of these are seen, for a while."""
-    deadline = time.monotonic() + _LOOK_S
-    while time.monotonic() < deadline and not all(node.endpoints(name, kind) for kind, name in awaited):
+    """Until all of these are seen, or nothing more has come for a while."""
+    most, since = 0, time.monotonic()
+    while not node.nodes or not all(node.endpoints(name, kind) for kind, name in awaited):
+        seen = node.nodes + len(node.endpoints())
+        if seen > most:
+            most, since = seen, time.monotonic()
+        if time.monotonic() - since > (_NEXT_S if node.nodes else _FIRST_S):
+            return
         time.sleep(0.05)
 
 
@@ -141,7 +148,7 @@ def _row(command_topic: str, row: TopicSpec, names: Names, node: GraphNode, idle
     if still:
         sleeping = ", ".join(f"{node_name} is a lifecycle node and {idle[node_name]}" for node_name in still)
         says += f"; {sleeping}: it does nothing until it is activated (ros2 lifecycle set {still[0]} activate)"
-    if kind is Kind.SUBSCRIPTION and not row.latched and any(row_settings(o.qos)["latched"] for o in others):
+    if kind is Kind.SUBSCRIPTION and not row.latched and any(o.qos.reliable and o.qos.transient_local for o in others):
         says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
     if kind is Kind.SUBSCRIPTION and isinstance(node, RclpyNode) and history_missed([o.qos for o in others]):
         kept = ", ".join(sorted({o.node for o in others if o.qos.transient_local}))
@@ -164,6 +171,9 @@ def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: GraphNode) -> Finding:
     ours = Endpoint(Kind.PUBLISHER, name, config.cmd_vel_type, hash_of(config.cmd_vel_type, "cdr"))
     others = node.endpoints(name, Kind.SUBSCRIPTION)
     wrong = mismatches(ours, others)
+    unheard = clashes(ours, others) if isinstance(node, RclpyNode) else []
+    if unheard and not wrong:
+        return Finding("wheels", name, ours.type, unheard[0], good=False)
     if wrong:
         hint = "" if wrong[0].endpoint.type == ours.type else "; set ros2.cmd_vel_type"
         return Finding("wheels", name, ours.type, wrong[0].reason + hint, good=False)

@@ -5,6 +5,7 @@ What speaks to the graph is loaded when it is opened: a gate needs nothing of wh
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,7 +32,7 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
     """Nodes of our own, under the ROS 2 of this machine or by a Zenoh router."""
 
     key: ClassVar[str] = "ros2"
-    todo: ClassVar[str] = "correct ros2 in robot.yaml, or install the extra"
+    todo: ClassVar[str] = "source ROS 2 and start the robot's nodes, or correct ros2 in robot.yaml"
     section = Ros2Config
     gate_section = Ros2Way
 
@@ -82,8 +83,11 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
         return Ros2Display(way, topic)
 
     def wheels_at(self, way: Ros2Way) -> str:
-        where = way.router or way.zenoh_config or "the usual router"
-        return f"{resolve(way.cmd_vel, way.namespace)} of the ROS 2 domain {way.domain} by {where}"
+        name = resolve(way.cmd_vel, way.namespace)
+        domain = way.domain if way.domain is not None else os.environ.get("ROS_DOMAIN_ID") or 0
+        if way.dialect == "rclpy":
+            return f"{name} of the ROS 2 domain {domain}"
+        return f"{name} of the ROS 2 domain {domain} by {way.router or way.zenoh_config or 'the usual router'}"
 
     def prepared(self, way: Ros2Way, folder: Path) -> Ros2Way:
         if way.dialect != "rclpy":

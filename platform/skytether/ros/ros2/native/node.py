@@ -217,7 +217,7 @@ class RclpyNode(NodeBase):
 
     def _keep(self, link: socket.socket) -> None:
         """Tell a new program what to be, and take what it tells until it ends."""
-        sender = Sender(link, lambda: None)
+        sender = Sender(link)
         sender.put(control(node=self._name.name, namespace=self._name.namespace, arguments=self._arguments))
         with self._lock:
             if self._closing.is_set():

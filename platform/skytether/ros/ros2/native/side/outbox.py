@@ -9,7 +9,6 @@ from __future__ import annotations
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable
 
 from .frames import Frame, push_head
 
@@ -93,12 +92,10 @@ class Sender:
 
     Args:
         link: Connected; it stays the caller's.
-        lost: Called once, in the thread, when the link fails.
     """
 
-    def __init__(self, link: socket.socket, lost: Callable[[], object]) -> None:
+    def __init__(self, link: socket.socket) -> None:
         self._link = link
-        self._lost = lost
         self._outbox = Outbox()
         self._changed = threading.Condition()
         self._ended = False
@@ -148,7 +145,6 @@ class Sender:
                 self._send(frame)
             except OSError:
                 self.close()
-                self._lost()
                 return
 
     def _send(self, frame: Frame | None) -> None:

@@ -96,7 +96,7 @@ class Program:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         # The reader sees the end too, behind what was told before it: no velocity may follow the farewell.
-        self._sender = Sender(link, lambda: None)
+        self._sender = Sender(link)
         for channel in (GRAPH, ALIVE):
             self._sender.set(channel, FIRST, 1)
         self._lock = threading.Lock()
