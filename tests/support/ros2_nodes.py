@@ -61,7 +61,8 @@ class Node:
         self._said: queue.Queue[Any] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        assert self.next() == "ready"
+        while (said := self.next()) != "ready":
+            self.heard.append(said)
 
     def _read(self) -> None:
         assert self.process.stdout is not None

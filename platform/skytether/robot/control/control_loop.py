@@ -474,10 +474,11 @@ class ControlLoop:
             self._caught("write", error)
 
     def _caught(self, part: str, error: Exception) -> None:
-        """Count always; log the first of each part, with its trace."""
+        """Count always; log the first of each part, with its trace if its sentence may not say all."""
         self._errors[part] += 1
         if self._errors[part] == 1:
-            _log.error("%s failed, further ones are counted only: %s", part, error, exc_info=error)
+            trace = None if isinstance(error, ConnectionError) else error
+            _log.error("%s failed, further ones are counted only: %s", part, error, exc_info=trace)
 
 
 def _command(epoch: int, message: MessageReceived, encoding: Encoding) -> Command:
