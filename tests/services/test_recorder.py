@@ -165,7 +165,7 @@ def test_a_bag_that_nobody_closed_is_read_up_to_the_last_flush(tmp_path: Path, c
         assert reader.message_count == 40
 
 
-def test_a_type_that_nobody_knows_is_recorded_without_its_definition(tmp_path: Path) -> None:
+def test_a_type_of_which_nobody_tells_is_recorded_without_its_definition(tmp_path: Path) -> None:
     harness = recorder(tmp_path)
     offer(harness, odd="cdr acme_msgs/msg/Odd")
     harness.send("odd", b"\x00\x01\x02")
@@ -174,6 +174,17 @@ def test_a_type_that_nobody_knows_is_recorded_without_its_definition(tmp_path: P
     ((schema, _, message),) = read(only_file(tmp_path))
     assert (schema.name, schema.encoding, schema.data) == ("acme_msgs/msg/Odd", "", b"")
     assert message.data == b"\x00\x01\x02"
+
+
+def test_a_definition_that_the_robot_tells_is_recorded(tmp_path: Path) -> None:
+    harness = recorder(tmp_path)
+    message = MessageReceived("odd", b"\x00\x01\x00\x00\x05", 1, 3.0, 0.0, 100.0)
+    harness.service.everything.put(message, "acme_msgs/msg/Odd", "cdr", "RIHS01_5", "uint8 odd\n")
+    harness.step()
+    harness.stop()
+    ((schema, channel, _),) = read(only_file(tmp_path))
+    assert (schema.name, schema.encoding, schema.data) == ("acme_msgs/msg/Odd", "ros2msg", b"uint8 odd\n")
+    assert channel.metadata["topic_type_hash"] == "RIHS01_5"
 
 
 def test_a_robot_that_comes_back_with_another_type_gets_another_channel(tmp_path: Path) -> None:

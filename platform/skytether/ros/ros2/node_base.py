@@ -82,6 +82,10 @@ class NodeBase(ABC):
         """Something for each endpoint of a name and kind that is another after it was away."""
         return {key for key, e in self._known.items() if (e.name, e.kind) == (name, kind)}
 
+    def definition(self, type_name: str) -> str | None:  # noqa: ARG002 - nodes that can tell do
+        """Definition of a type, with all that it is made of: empty: nobody knows it; None: not yet."""
+        return ""
+
     @property
     def troubles(self) -> tuple[str, ...]:
         """What is wrong now, a sentence each."""

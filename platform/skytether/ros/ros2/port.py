@@ -300,9 +300,10 @@ class Ros2Port:
         if endpoint is None or (known is not None and known.md5):
             return
         publishers = self._node.endpoints(endpoint.name, Kind.PUBLISHER)
-        if publishers:
+        text = self._node.definition(endpoint.type) if publishers else None
+        if text is not None:
             type_hash = endpoint.type_hash or learned_hash(endpoint, publishers)
-            self._learned[name] = TypeNote(endpoint.type, type_hash)
+            self._learned[name] = TypeNote(endpoint.type, type_hash, text)
 
     # --- calls -------------------------------------------------------------------------------------------------------
 

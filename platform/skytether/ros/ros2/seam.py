@@ -115,6 +115,10 @@ class GraphNode(Protocol):
         """Something for each endpoint of a name and kind that is another after it was away."""
         ...
 
+    def definition(self, type_name: str) -> str | None:
+        """Text of a type's definition, with all that it is made of; empty: nobody knows it; None: not known yet."""
+        ...
+
     @property
     def troubles(self) -> tuple[str, ...]:
         """What is wrong now, a sentence each."""

@@ -8,16 +8,19 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from ros2_nodes import ros2_nodes, until
+from rosbags.highlevel import AnyReader
 
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
 from skytether.api.rest import RobotCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
+from skytether.messages import hash_of
 
 __all__ = ["ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2]
 
 RECORDER = Path(__file__).parents[4] / "services" / "skytether_services" / "recorder" / "service.yaml"
+STRING = "std_msgs/msg/String"
 NESTED = "test_msgs/msg/Nested"
 TALK = """
 from std_msgs.msg import String
@@ -68,11 +71,6 @@ def recording(ros2_nodes, tmp_path):
         yield [sys.executable, "-m", "skytether.cli", "robot", "run", str(path)], client, folder
 
 
-def recorded(path):
-    with path.open("rb") as stream:
-        return list(make_reader(stream).iter_messages())
-
-
 def test_late_topics_are_recorded_a_type_of_the_user_s_own_too(ros2_nodes, recording):
     command, client, folder = recording
     agent = subprocess.Popen(command)
@@ -86,11 +84,21 @@ def test_late_topics_are_recorded_a_type_of_the_user_s_own_too(ros2_nodes, recor
         agent.wait(30)
     until(lambda: all(one.state.final for one in client.instances()), "the recorder's end")
     (path,) = folder.rglob("*.mcap")
-    found = recorded(path)
-    types = {channel.topic: (schema.name, channel.metadata["topic_type_hash"]) for schema, channel, _ in found}
-    assert types["/nested"] == (NESTED, rihs)
-    assert types["/words"][0] == "std_msgs/msg/String"
-    assert set(types) == {"/words", "/nested"}, "and nothing of what the ends tell each other"
+    schemas = {}
+    with path.open("rb") as stream:
+        for schema, channel, _ in make_reader(stream).iter_messages():
+            schemas[channel.topic] = schema
+            assert channel.metadata["topic_type_hash"] == (
+                rihs if channel.topic == "/nested" else hash_of(STRING, "cdr")
+            )
+    assert {topic: schema.name for topic, schema in schemas.items()} == {"/words": STRING, "/nested": NESTED}
+    assert {schema.encoding for schema in schemas.values()} == {"ros2msg"}
+    assert "MSG: test_msgs/BasicTypes\nbool bool_value\n" in schemas["/nested"].data.decode()
+    with AnyReader([path]) as reader:
+        (nested,) = (connection for connection in reader.connections if connection.topic == "/nested")
+        found = [reader.deserialize(data, nested.msgtype) for _, _, data in reader.messages([nested])]
+    numbers = [one.basic_types_value.uint16_value for one in found]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 def test_the_check_has_a_row_for_each_topic_and_reading(ros2_nodes, recording):

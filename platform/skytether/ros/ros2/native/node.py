@@ -91,6 +91,8 @@ class RclpyNode(NodeBase):
         """Of the program; 0: there is none now."""
         self.sim_time = False
         """Whether our node's parameter ``use_sim_time`` is set now."""
+        self._definitions: dict[str, str | None] = {}
+        """By type; None: the program is asked."""
         self._heard = 0
         """Frames of the program."""
         self._hung = False
@@ -136,6 +138,14 @@ class RclpyNode(NodeBase):
     def client(self, endpoint: Endpoint) -> Client:
         """Be a client of a service."""
         return self._add(Client(self, next(self._channels), endpoint))
+
+    def definition(self, type_name: str) -> str | None:
+        """See `skytether.ros.ros2.seam.GraphNode`: the program looks for it."""
+        with self._lock:
+            if type_name not in self._definitions and self._sender is not None:
+                self._definitions[type_name] = None
+                self._sender.put(control(do="define", kind=type_name))
+            return self._definitions.get(type_name)
 
     # --- Host --------------------------------------------------------------------------------------------------------
 
@@ -236,6 +246,7 @@ class RclpyNode(NodeBase):
             with self._lock:
                 self._link = self._sender = None
                 self._known, self.middleware = {}, ""
+                self._definitions = {kind: text for kind, text in self._definitions.items() if text is not None}
                 for handle in self._handles.values():
                     handle.leave()
             sender.close()
@@ -256,6 +267,8 @@ class RclpyNode(NodeBase):
                 self.report("refused", f"ROS 2 does not let us be a node: {told['why']}; trying on")
             case "trouble":
                 self._trouble(told["channel"], told["why"])
+            case "definition":
+                self._definitions[told["kind"]] = told["text"]
             case "graph":
                 self._look(told)
                 self._joined.set()

@@ -27,7 +27,7 @@ try:
 except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
-from . import graph, types
+from . import definitions, graph, types
 from .frames import SHUT_DOWN, Frame, Kind, control, numbered, pull_frame, pull_fresh, pull_number, push_head
 from .outbox import FIRST, Sender
 
@@ -282,6 +282,17 @@ class Program:
             if thing is not None:
                 destroy(thing)
         self._sender.remove(channel)
+
+    def _do_define(self, kind: str) -> None:
+        """Tell a type's definition: from a thread, for reading files must hold no velocity up."""
+
+        def tell() -> None:
+            text = ""  # of a type that is not here; whoever subscribes says so
+            with contextlib.suppress(Exception):
+                text = definitions.definition(kind)
+            self._say(what="definition", kind=kind, text=text)
+
+        threading.Thread(target=tell, daemon=True).start()
 
     def _do_forget(self, channel: int, number: int) -> None:
         future = self._pending.pop((channel, number), None)

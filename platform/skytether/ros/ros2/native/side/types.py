@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import operator
 from typing import Any
 
 _PARTS = {
-    "_SendGoal": "SendGoalService",
-    "_GetResult": "GetResultService",
-    "_FeedbackMessage": "FeedbackMessage",
+    "_SendGoal": "Impl.SendGoalService",
+    "_GetResult": "Impl.GetResultService",
+    "_FeedbackMessage": "Impl.FeedbackMessage",
+    "_Goal": "Goal",
+    "_Result": "Result",
+    "_Feedback": "Feedback",
+    "_Request": "Request",
+    "_Response": "Response",
+    "_Event": "Event",
 }
-"""What an action is made of, by the ends of the types' names."""
+"""What actions and services are made of, by the ends of the types' names."""
 
 
 class NotInstalledError(Exception):
@@ -18,7 +26,7 @@ class NotInstalledError(Exception):
 
 
 def load(name: str) -> Any:
-    """The class of ``std_msgs/msg/String``, of a service, or of a part of an action.
+    """The class of ``std_msgs/msg/String``, of a service, an action, or a part of these.
 
     Raises:
         NotInstalledError: ROS 2's Python does not have it.
@@ -32,9 +40,9 @@ def load(name: str) -> Any:
         ) from None
     found = getattr(module, short, None)
     for end, part in _PARTS.items():
-        if found is None and kind == "action" and short.endswith(end):
-            action = getattr(module, short[: -len(end)], None)
-            found = getattr(getattr(action, "Impl", None), part, None)
+        if found is None and kind != "msg" and short.endswith(end):
+            with contextlib.suppress(AttributeError):
+                found = operator.attrgetter(f"{short[: -len(end)]}.{part}")(module)
     if found is None:
         raise NotInstalledError(f"type {name} is not known to ROS 2 here: its package {package} has another version")
     return found
