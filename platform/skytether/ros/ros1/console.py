@@ -13,6 +13,7 @@ from types import TracebackType
 
 from skytether.messages import encode_plain, hash_of
 
+from ..log_tap import LogTap
 from .node import Node
 from .services import ServiceServer, ServiceType
 
@@ -38,28 +39,21 @@ class Console:
 
     Args:
         node: Started; its name is the message's.
-        root: Name of the logger that all others are below. It says from ``info`` on what it said from ``warn`` on;
-            what other handlers print stays the same.
+        root: See `LogTap`.
         clock: Unix time in seconds.
     """
 
     def __init__(self, node: Node, root: str = "skytether", clock: Callable[[], float] = time.time) -> None:
         self._node = node
-        self._root = logging.getLogger(root)
         self._publication = node.advertise(ROSOUT, _LOG, hash_of(_LOG, "ros1"), queue=_QUEUE, hold_s=_HOLD_S)
-        self._handler = _ToGraph(self._say)
+        self._tap = LogTap(root, self._say)
+        self._root = self._tap.root
         self._clock = clock
         self._sequence = 0
-        self._level = self._root.level
         self._servers: list[ServiceServer] = []
 
     def __enter__(self) -> Console:
-        top = logging.getLogger()
-        if not top.handlers and logging.lastResort is not None:
-            top.addHandler(logging.lastResort)  # what prints warnings as long as nobody handles anything
-        if self._root.level == logging.NOTSET:
-            self._root.setLevel(logging.INFO)
-        self._root.addHandler(self._handler)
+        self._tap.__enter__()
         for name, kind, handler in (("get_loggers", _GET, self._loggers), ("set_logger_level", _SET, self._set_level)):
             self._servers.append(self._node.serve(f"{self._node.name}/{name}", kind, handler))
         return self
@@ -67,8 +61,7 @@ class Console:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._root.removeHandler(self._handler)
-        self._root.setLevel(self._level)
+        self._tap.__exit__(kind, error, trace)
         for server in self._servers:
             self._node.unserve(server)
         self._node.unadvertise(self._publication)
@@ -104,18 +97,6 @@ class Console:
             raise ValueError(f"there is no logger {name} with a level {level}; levels are {', '.join(_LEVELS)}")
         logging.getLogger(name).setLevel(_LEVELS[level.lower()])
         return b""
-
-
-class _ToGraph(logging.Handler):
-    def __init__(self, say: Callable[[logging.LogRecord, str], None]) -> None:
-        super().__init__()
-        self._say = say
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            self._say(record, self.format(record))
-        except Exception:
-            self.handleError(record)
 
 
 def _word(level: int) -> str:

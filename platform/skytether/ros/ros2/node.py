@@ -68,6 +68,7 @@ class Ros2Node(NodeBase):
         super().__init__(name, say)
         self.dialect = dialect
         self.sim_time = sim_time
+        self.log_level = logging.INFO
         self._router = router or ("the one that its configuration names" if config_file else DEFAULT_ROUTER)
         self._config = _config(router or (None if config_file else DEFAULT_ROUTER), config_file)
         self._lock = threading.Lock()

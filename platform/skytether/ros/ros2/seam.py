@@ -137,6 +137,11 @@ class GraphNode(Protocol):
         """Whether our node uses simulated time (``use_sim_time``)."""
         ...
 
+    @property
+    def log_level(self) -> int:
+        """Of our node's logger, in numbers of `logging`, which are ROS 2's."""
+        ...
+
     def start(self) -> None:
         """Begin to join the graph; returns at once."""
         ...

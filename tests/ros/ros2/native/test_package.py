@@ -42,6 +42,7 @@ GONE = object()
 """Value of a key that is not written."""
 LISTENER = """
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 
 lock, one_says = threading.Lock(), say
@@ -54,6 +55,9 @@ def heard(message):
         values = {pair.key: pair.value for pair in status.values}
         say(["status", status.name, int.from_bytes(status.level, "little"), status.message, values])
 node.create_subscription(DiagnosticArray, "/diagnostics", heard, 100)
+def logged(message):
+    say(["log", message.name, message.level, message.msg])
+node.create_subscription(Log, "/rosout", logged, qos(latched=True, depth=1000))
 
 def nodes():
     found = node.get_node_names_and_namespaces()
@@ -161,6 +165,7 @@ class Listener:
     def __init__(self, node):
         self._node = node
         self.statuses = {}
+        self.logs = []
 
     def status(self, name, wanted):
         """Wait for a status that is as wanted."""
@@ -171,6 +176,8 @@ class Listener:
         for what, *rest in self._node.all():
             if what == "status":
                 self.statuses[rest[0]] = SimpleNamespace(level=rest[1], message=rest[2], values=rest[3])
+            elif what == "log":
+                self.logs.append(rest)
         return self.statuses
 
     def nodes(self):
@@ -185,6 +192,8 @@ class Listener:
     def _next(self, what):
         while True:
             found = self._node.next()
+            if found[0] == "log":
+                self.logs.append(found[1:])
             if found[0] == what:
                 return found[1:]
 
@@ -239,6 +248,8 @@ def test_a_robot_is_where_launch_says_and_ends_when_it_is_told_to(launched, ros2
     assert listener.status("fleet/one/skytether: session", lambda status: True).message == "not connected"
     service = listener.status("fleet/one/skytether: service", lambda status: status.message)
     assert (service.level, service.values["asked for"]) == (1, "recorder")
+    until(lambda: listener.hear() and any("no orchestrator answers" in log[2] for log in listener.logs), "the log")
+    assert {log[:2] == ["fleet.one.skytether", 30] for log in listener.logs if "no orchestrator" in log[2]} == {True}
     nodes, drivers = listener.nodes()
     assert {"/fleet/one/mine", "/fleet/one/skytether"} <= set(nodes)
     assert drivers == ["skytether"]

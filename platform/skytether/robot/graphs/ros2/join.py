@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from skytether.ros.names import resolve
 from skytether.ros.ros1.arguments import PRIVATE, RosArguments
 from skytether.ros.ros2.config import join_graph
+from skytether.ros.ros2.console import Console
 
 from ..graph_config import RobotGraphConfig
 from .robot import Ros2Robot, Ros2RobotConfig
@@ -30,7 +32,7 @@ def join(section: Ros2Config, shared: RobotGraphConfig, folder: Path, ros: RosAr
         ConfigError: ROS 2 or the extra is missing, or Zenoh does not take a setting.
     """
     config = robot_config(section, shared)
-    with join_graph(section, folder, config.home) as node:
+    with join_graph(section, folder, config.home) as node, Console(node, resolve(section.node, config.home)):
         for name in ros.unused:
             _log.warning("the parameter %s is none of %s", name, ", ".join(PRIVATE))
         robot = Ros2Robot(config, node)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import os
 import signal
 import socket
@@ -93,6 +94,8 @@ class RclpyNode(NodeBase):
         """Whether our node's parameter ``use_sim_time`` is set now."""
         self._definitions: dict[str, str | None] = {}
         """By type; None: the program is asked."""
+        self.log_level = logging.INFO
+        """Of our node's logger: ``--log-level`` and the service ``set_logger_levels`` set it."""
         self._heard = 0
         """Frames of the program."""
         self._hung = False
@@ -282,7 +285,7 @@ class RclpyNode(NodeBase):
 
     def _look(self, told: dict[str, Any]) -> None:
         """The graph is another."""
-        self.nodes, self.sim_time = told["nodes"], told["sim_time"]
+        self.nodes, self.sim_time, self.log_level = told["nodes"], told["sim_time"], told["log_level"]
         known = {str(row[0]): _endpoint(row) for row in told["endpoints"]}
         changed = known != self._known
         self._known = known

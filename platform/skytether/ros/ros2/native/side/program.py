@@ -12,11 +12,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
@@ -92,7 +94,8 @@ class Program:
         # A log file below the home folder is of use to nobody, and where that cannot be written there is no node.
         arguments = ["skytether", "--ros-args", "--disable-external-lib-logs", *start["arguments"]]
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node(start["node"], namespace=start["namespace"])
+        more = {"enable_logger_service": True} if "enable_logger_service" in signature(Node).parameters else {}  # Jazzy
+        self._node = rclpy.create_node(start["node"], namespace=start["namespace"], **more)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         # The reader sees the end too, behind what was told before it: no velocity may follow the farewell.
@@ -362,7 +365,8 @@ class Program:
         dropped = self._sender.dropped()
         lost = {c: [dropped.get(c, 0), self._lost.get(c, 0)] for c in {*dropped, *self._lost}}
         news = {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
-        return {**news, "sim_time": self._node.get_parameter_or("use_sim_time").value is True}
+        sim_time = self._node.get_parameter_or("use_sim_time").value is True
+        return {**news, "sim_time": sim_time, "log_level": int(self._node.get_logger().get_effective_level())}
 
     def _known(self, endpoints: list[list[Any]]) -> list[list[Any]]:
         """Those whose nodes are known, or will not be."""
