@@ -110,6 +110,23 @@ def test_the_cloud_drives_and_silence_hands_over_within_300_ms_and_back(base, or
     assert base.velocity == (0.0, 0.0)
 
 
+def test_who_is_told_to_end_while_it_starts_leaves_nothing_that_drives(base, orchestrator, monkeypatch):
+    start = threading.Thread.start
+
+    def told_to_end(thread):
+        if thread.name == "agent_watch":
+            wait_for(lambda: base.written and base.velocity[0] > 0.0)
+            raise KeyboardInterrupt
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", told_to_end)
+    config = AgentConfig(robot="walker", url="", token="", service="x", fallback="admittance", bind=("127.0.0.1", 0))
+    with pytest.raises(KeyboardInterrupt), Agent(config, base, client=orchestrator):
+        pass
+    assert base.velocity == (0.0, 0.0)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("agent_")]
+
+
 def test_a_name_server_that_never_answers_delays_no_hand_over(base, orchestrator, service, monkeypatch):
     """The service is said to have moved to a host that has to be asked for; the name server is dead meanwhile."""
     host, port = service.bridge.address

@@ -182,8 +182,8 @@ class Agent:
         }
         for name, target in targets.items():
             thread = threading.Thread(target=target, name=f"agent_{name}", daemon=True)
-            self._threads.append(thread)
             thread.start()
+            self._threads.append(thread)
 
     def close(self) -> None:
         """Stop the wheels first, then the rest; the instance is let go."""
@@ -463,7 +463,11 @@ class Agent:
         return None if opened is None else Serving(opened.session, opened.instance.id, opened.shared)
 
     def __enter__(self) -> Agent:
-        self.start()
+        try:
+            self.start()
+        except BaseException:  # a signal, too: what has begun to drive must stop before its graph is left
+            self.close()
+            raise
         return self
 
     def __exit__(
