@@ -18,7 +18,6 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
@@ -94,7 +93,8 @@ class Program:
         # A log file below the home folder is of use to nobody, and where that cannot be written there is no node.
         arguments = ["skytether", "--ros-args", "--disable-external-lib-logs", *start["arguments"]]
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        more = {"enable_logger_service": True} if "enable_logger_service" in signature(Node).parameters else {}  # Jazzy
+        knows = "enable_logger_service" in signature(rclpy.create_node).parameters  # Jazzy and newer
+        more = {"enable_logger_service": True} if knows else {}
         self._node = rclpy.create_node(start["node"], namespace=start["namespace"], **more)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
