@@ -7,7 +7,6 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ import psutil
 
 from skytether.guard.velocity import STANDSTILL
 
-from . import deaths, hardware, stops, storm
+from . import deaths, storm
 from .attacks import Attacks
+from .graphs import ROLES, with_a_writer
 from .robot import PlayedRobot, scan_of
 from .ros2_hardware import Ros2Hardware
 from .stage import Stage
 
-_ROLES = ("agent", "gate", "guard", "writer")
-_FROZEN_S = 1.0
 _FREEZES_S = (0.2, 1.0, 3.0)
 _MANY_RAYS = 10_000
 _PILES_UP_S = 1.5
@@ -38,20 +36,7 @@ def enter(attacks: Attacks) -> None:
     def add(name: str, what: str, run: deaths.Run, seconds: float) -> None:
         attacks.add(f"ros2-{name}", f"ROS 2: {what}", run, seconds=seconds, robot=_robot)
 
-    for role in _ROLES:
-        add(f"{role}-killed", f"the {role} is killed", deaths.killed(role), 4)
-        add(f"{role}-frozen", f"the {role} is frozen for 1 s, and goes on", deaths.frozen(role, _FROZEN_S), 3)
-    for first, second in permutations(("gate", "guard", "writer"), 2):
-        add(
-            f"{first}-{second}-killed",
-            f"the {first} is killed, then the {second}",
-            deaths.both_killed(first, second),
-            5,
-        )
-    add("guard-terminated", "the guard is told to end", deaths.ended(signal.SIGTERM, everybody=False), 5)
-    add("stop-gate-killed", "a stop is acknowledged, and the gate killed", stops.stop_and_kill("gate"), 5)
-    add("wheels-gone", "the wheels' node is gone for 0.5 s", hardware.wheels_gone(0.5), 3)
-    add("laser-silent", "the laser falls silent", hardware.blind("nothing any more", lambda _: lambda: None), 4)
+    with_a_writer(add)
     for role in ("writer", "gate"):
         words = f"the {role}'s program" if role == "writer" else "each program of the gate"
         add(f"{role}-program-killed", f"{words} is killed", _killed(role), 8)
@@ -69,7 +54,7 @@ def enter(attacks: Attacks) -> None:
     )
     add("stranger", "another node listens to the velocities, as if they were of another type", _stranger, 5)
     for seed in storm.SEEDS:
-        add(f"storm-{seed}", storm.WHAT.format(seed), storm.storm(seed, _ROLES), 6)
+        add(f"storm-{seed}", storm.WHAT.format(seed), storm.storm(seed, ROLES), 6)
 
 
 def _programs(stage: Stage, role: str) -> list[int]:

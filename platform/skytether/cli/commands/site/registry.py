@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -12,8 +13,16 @@ from ...options import options_of
 from ...output import console, fail, or_dash, plain, print_json, print_table, show
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from skytether.api.rest import Site
 
+_M = TypeVar("_M", bound="BaseModel")
+Speed = Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")]
+Cost = Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")]
+Images = Annotated[
+    list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
+]
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _LONGEST_S = 86_400.0
 
@@ -52,18 +61,14 @@ def add_site(
     option: Annotated[
         list[str] | None, typer.Option(help="KEY=VALUE of the runtime's options; may be given again.")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")] = 1.0,
-    cost: Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")] = 0.0,
-    image: Annotated[
-        list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
-    ] = None,
+    speed: Speed = 1.0,
+    cost: Cost = 0.0,
+    image: Images = None,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
 ) -> None:
     """Add a place where instances run."""
-    from pydantic import ValidationError
-
     from skytether.api.rest import SiteCreate
 
     asked = {
@@ -74,11 +79,7 @@ def add_site(
         "speed": speed,
         "cost": cost,
     }
-    try:
-        request = SiteCreate.model_validate({**asked, "images": tuple(image or ("*",))})
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
+    request = _checked(SiteCreate, {**asked, "images": tuple(image or ("*",))})
     with connected(url, token_file) as client:
         made = client.create_site(request)
     show(made, json)
@@ -110,11 +111,9 @@ def invite_node(
             help="KEY=VALUE of the Docker runtime's options; may be given again. It goes before the machine's."
         ),
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")] = 1.0,
-    cost: Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")] = 0.0,
-    image: Annotated[
-        list[str] | None, typer.Option(help="Pattern of images that may run there; may be given again; all else.")
-    ] = None,
+    speed: Speed = 1.0,
+    cost: Cost = 0.0,
+    image: Images = None,
     url: Url = None,
     token_file: TokenFile = None,
     json: Json = False,
@@ -124,16 +123,10 @@ def invite_node(
     With it goes the fingerprint of the key by which the machine knows the orchestrator. A token for the same name that
     was not used is worth nothing any more.
     """
-    from pydantic import ValidationError
-
     from skytether.api.rest import Invite
 
     asked = {"name": name, "tier": tier, "options": options_of(option), "speed": speed, "cost": cost}
-    try:
-        request = Invite.model_validate({**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
+    request = _checked(Invite, {**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
     with connected(url, token_file) as client:
         made = client.invite(request)
     if json:
@@ -146,6 +139,17 @@ def invite_node(
     console.print(f"  skytether site join {where} --token-file -", markup=False, soft_wrap=True)
     console.print("with this token, which cannot be shown again:", markup=False)
     typer.echo(made.token)
+
+
+def _checked(kind: type[_M], asked: Mapping[str, object]) -> _M:
+    """A request as it is asked for; one that cannot be ends the command with a sentence."""
+    from pydantic import ValidationError
+
+    try:
+        return kind.model_validate(asked)
+    except ValidationError as error:
+        first = error.errors()[0]
+        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
 
 
 def _seconds(text: str) -> float:

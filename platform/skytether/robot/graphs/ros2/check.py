@@ -171,11 +171,10 @@ def _wheels(config: Ros2RobotConfig, cmd_vel: str, node: GraphNode) -> Finding:
     ours = Endpoint(Kind.PUBLISHER, name, config.cmd_vel_type, hash_of(config.cmd_vel_type, "cdr"))
     others = node.endpoints(name, Kind.SUBSCRIPTION)
     wrong = mismatches(ours, others)
-    unheard = clashes(ours, others) if isinstance(node, RclpyNode) else []
-    if unheard and not wrong:
-        return Finding("wheels", name, ours.type, unheard[0], good=False)
     if wrong:
         hint = "" if wrong[0].endpoint.type == ours.type else "; set ros2.cmd_vel_type"
         return Finding("wheels", name, ours.type, wrong[0].reason + hint, good=False)
+    if isinstance(node, RclpyNode) and (unheard := clashes(ours, others)):
+        return Finding("wheels", name, ours.type, unheard[0], good=False)
     says = "is listened to" if others else "nobody listens to it yet; is cmd_vel right?"
     return Finding("wheels", name, ours.type, says)
