@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import gc
 import socket
+import ssl
 import tempfile
 import threading
 import time
@@ -16,7 +18,21 @@ import pytest
 from node_scene import MadeUpEngine, NodeScene, connection, context_of, first_line, linked_by, until
 
 from skytether.api.client import Client
-from skytether.api.node import GO, Issued, Join, Link, Said, Standing, Stands, Way, Welcome, line_of
+from skytether.api.node import (
+    ALPN,
+    GO,
+    SERVER_NAME,
+    Hello,
+    Issued,
+    Join,
+    Link,
+    Said,
+    Standing,
+    Stands,
+    Way,
+    Welcome,
+    line_of,
+)
 from skytether.api.rest import InstanceCreate, SiteCreate
 from skytether.node import calls, join
 from skytether.node.calls import RefusedError, first_call, trusting
@@ -254,3 +270,45 @@ def test_a_handshake_that_failed_leaves_nothing_that_waits_for_the_collector(nod
         until(lambda: sum(isinstance(one, SSLProtocol) for one in gc.get_objects()) <= before)
     finally:
         gc.enable()
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning")
+def test_who_comes_in_the_moment_the_door_is_closed_is_not_left_open(
+    nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The listener's loop sees who comes and that it is to end in one and the same turn."""
+    opened: list[socket.socket] = []
+    closes: list[threading.Thread] = []
+    clock, known = nodes.core.clock, threading.Event()
+
+    def busy() -> float:
+        if threading.current_thread().name == "nodes" and known.is_set() and not closes:
+            loop, told = asyncio.get_running_loop(), threading.Event()
+            tell = loop.call_soon_threadsafe
+
+            def tells(*given: Any) -> Any:
+                handle = tell(*given)
+                told.set()
+                return handle
+
+            monkeypatch.setattr(loop, "call_soon_threadsafe", tells)
+            opened.append(socket.create_connection(("127.0.0.1", nodes.port), timeout=10))
+            closes.append(threading.Thread(target=nodes.shut))
+            closes[0].start()
+            assert told.wait(10)
+        return clock()
+
+    nodes.shut()
+    monkeypatch.setattr(nodes.core, "clock", busy)
+    nodes.open()
+    with contextlib.suppress(OSError), contextlib.closing(socket.create_connection(("127.0.0.1", nodes.port))) as first:
+        context = ssl.create_default_context()
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context.set_alpn_protocols([ALPN])
+        with context.wrap_socket(first, server_hostname=SERVER_NAME) as link:
+            known.set()
+            link.sendall(line_of(Hello()))
+            link.recv(1)
+    closes[0].join()
+    with opened[0], contextlib.suppress(ConnectionError):
+        assert opened[0].recv(1) == b""

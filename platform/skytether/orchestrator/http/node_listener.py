@@ -194,7 +194,10 @@ class NodeListener:
     async def _accept(self) -> None:
         while True:
             try:
-                taken, peer = await self._loop.sock_accept(self._listener)
+                taken, peer = self._listener.accept()
+            except BlockingIOError:
+                await self._somebody()
+                continue
             except OSError as error:  # no file for another one
                 log.warning("a node's connection cannot be taken: %s", error.strerror)
                 gives_way = self._table.stranger()
@@ -204,6 +207,15 @@ class NodeListener:
                 continue
             self._admit(taken, str(peer[0]))
             await asyncio.sleep(_AT_ONCE_S)
+
+    async def _somebody(self) -> None:
+        """Until somebody connects: `sock_accept` would lose the connection that comes while it is cancelled."""
+        came = asyncio.Event()
+        self._loop.add_reader(self._listener, came.set)
+        try:
+            await came.wait()
+        finally:
+            self._loop.remove_reader(self._listener)
 
     def _admit(self, taken: socket.socket, host: str) -> None:
         address = place_of(host)
