@@ -194,6 +194,13 @@ HOST: dict[str, Any] = {
         ({"Mounts": [named(NoCopy=False)]}, "it copies files of its image"),
         ({"Mounts": [named(nocopy=True)]}, "it copies files of its image"),
         ({"Mounts": [named(NoCopy=True, nocopy=False)]}, "a volume has 'nocopy'"),
+        # What is there already, such as the kernel's files, to be written to.
+        ({"Tmpfs": {"/sys/": "remount,rw"}}, "at /sys/ is mounted by 'remount'"),
+        ({"Tmpfs": {"/tmp": "size=1m", "/link/to/sys": "rw,nosuid,remount"}}, "is mounted by 'remount'"),
+        ({"Tmpfs": {"/tmp": "rbind"}}, "is mounted by 'rbind'"),
+        ({"Tmpfs": {"/tmp": "shared"}}, "is mounted by 'shared'"),
+        ({"Tmpfs": {"/tmp": ["remount"]}}, "is mounted by"),
+        ({"Tmpfs": ["/sys/"]}, "is mounted by"),
         ({"Devices": [{"PathOnHost": "/dev/sda"}]}, "by `site join --device /dev/sda`"),
         ({"Devices": [{"PathOnHost": "/dev/video0", "pathonhost": "/dev/sda"}]}, "a device has 'pathonhost'"),
         ({"DeviceRequests": [{"Driver": "cdi", "DeviceIDs": ["vendor.com/all=all"]}]}, "odd devices"),

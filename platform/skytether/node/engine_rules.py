@@ -86,6 +86,9 @@ _TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
 FOLDER = "/run/skytether"
 """In containers: what is put there is for the service, and what it says of itself is in files in there."""
 _READ = {f"{FOLDER}/instance/{name}" for name in ("ready.json", FILE_NAME)}
+_TMPFS = re.compile(r"(?:(?:size|mode|uid|gid|nr_inodes)=[0-9]+[kmg]?|nosuid|nodev|noexec|exec|rw|ro)")
+"""Options of a file system in memory. Others would not make one: ``remount`` makes ``/sys`` as it is writable, and
+``bind`` mounts what is there."""
 _MOST_PIDS = 1 << 15
 """Of a container's processes and threads."""
 _MOST_PORTS = 1
@@ -211,6 +214,7 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         None if host.get("IpcMode", "none") in ("none", "private") else "it shares memory with others",
         None if _at(host, "LogConfig").get("Type", "json-file") == "json-file" else "its log goes elsewhere",
         _only(_at(host, "LogConfig"), {"Type", "Config"}, "a log"),
+        *(_tmpfs(path, options) for path, options in _at(host, "Tmpfs").items()),
         *(_mount(mount) for mount in _list(host, "Mounts")),
         *(_device(one, devices) for one in _list(host, "Devices")),
         *(_gpu(one, devices) for one in _list(host, "DeviceRequests")),
@@ -236,6 +240,11 @@ def _network_name(name: str) -> str | None:
     """Names that an engine might take for the beginning of an id are not taken."""
     odd = name in ("host", "none", "default") or re.fullmatch("[0-9a-f]+", name)
     return f"its network is '{name[:80]}'" if odd else None
+
+
+def _tmpfs(path: str, options: Any) -> str | None:
+    odd = [one for one in str(options).split(",") if one and not _TMPFS.fullmatch(one)]
+    return f"its file system in memory at {path[:80]} is mounted by '{odd[0][:40]}'" if odd else None
 
 
 def _mount(mount: Any) -> str | None:
