@@ -197,6 +197,10 @@ class Bridge:
             wake, self._watched = not self._watched, True
         return not wake or self._soon(self._on_handover)
 
+    def count_dropped(self, topic: str, count: int) -> None:
+        with self._lock:
+            self._overrun[topic] += count
+
     def call(self, name: str, payload: bytes | memoryview, timeout: float) -> bytes:
         """Ask the other end, and wait for its answer. Waits for a session too, as long as the time-out allows.
 

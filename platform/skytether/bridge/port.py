@@ -26,6 +26,10 @@ class Publisher(Protocol):
         """
         ...
 
+    def count_dropped(self, topic: str, count: int) -> None:
+        """Count messages that the graph could not hand over, for they came too quickly; safe from any thread."""
+        ...
+
 
 class Port(Protocol):
     """A graph as the bridge sees it. Messages and events come in the bridge's thread; calls must return at once."""

@@ -108,6 +108,10 @@ class Translated:
         translated = self._translated(topic, payload)
         return translated is not None and self._bridge.publish(topic, translated)
 
+    def count_dropped(self, topic: str, count: int) -> None:
+        """See `Publisher.count_dropped`."""
+        self._bridge.count_dropped(topic, count)
+
     def call(self, name: str, payload: bytes | memoryview, timeout: float) -> bytes:
         """See `Bridge.call`."""
         return self._exchange(name, bytes(payload), lambda request: self._bridge.call(name, request, timeout))

@@ -98,8 +98,11 @@ class Ros2Node(NodeBase):
         publication.waits = waits
         return self._add(publication)
 
-    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Subscription:
-        """Be a subscription; the function gets each serialised message, in a thread of Zenoh's."""
+    def subscribe(
+        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+    ) -> Subscription:
+        """Be a subscription; the function gets each serialised message, in a thread of Zenoh's, which drops none."""
+        del lose
         return self._add(Subscription(self, endpoint, take))
 
     def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:

@@ -218,12 +218,12 @@ class Ros2Port:
             if self._may(Access.PUBLISH, row.name, endpoint.name):
                 way.handle = way.publication = self._node.publish(endpoint, waits=row.reliable)
         else:
-            send = partial(self._send, row.name)
+            send, lose = partial(self._send, row.name), partial(self._lose, row.name)
             if endpoint.name == STATIC_TF:
                 merge = StaticTransforms(self.encoding).merge
-                way.handle = self._node.subscribe(endpoint, lambda payload: send(merge(payload)))
+                way.handle = self._node.subscribe(endpoint, lambda payload: send(merge(payload)), lose=lose)
             else:
-                way.handle = self._node.subscribe(endpoint, send)
+                way.handle = self._node.subscribe(endpoint, send, lose=lose)
 
     def _send(self, topic: str, payload: bytes) -> None:
         """In a thread of the node's: a message from the graph."""
@@ -233,6 +233,11 @@ class Ros2Port:
             self._publisher.publish(topic, payload)
         except ValueError as error:  # too large
             self._node.report(f"size {topic}", str(error))
+
+    def _lose(self, topic: str, count: int) -> None:
+        """In a thread of the node's: messages from the graph that came too quickly."""
+        if self._publisher is not None:
+            self._publisher.count_dropped(topic, count)
 
     def _agree(self, topic: Topic) -> None:
         """A topic that was agreed with the peer: a row for any takes what it names."""

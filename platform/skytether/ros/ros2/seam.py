@@ -91,8 +91,16 @@ class GraphNode(Protocol):
         """
         ...
 
-    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Handle:
-        """Be a subscription; the function gets each serialised message, one at a time, and must return at once."""
+    def subscribe(
+        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+    ) -> Handle:
+        """Be a subscription.
+
+        Args:
+            endpoint: Which.
+            take: Gets each serialised message, one at a time, and must return at once.
+            lose: Told how many messages, since it was last called, came too quickly to be taken.
+        """
         ...
 
     def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Handle:

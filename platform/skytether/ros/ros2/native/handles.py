@@ -18,6 +18,7 @@ from skytether.bridge.calls import CallError
 
 from ..dialect import Endpoint
 from ..qos import Qos, follow
+from .overrun import Overrun
 from .side.frames import Frame, Kind, control, fresh, numbered, pull_number
 from .side.outbox import Sender
 
@@ -80,6 +81,10 @@ class Handle:
 
     def review(self, others: Collection[Endpoint]) -> None:
         """In the node's thread: these are the endpoints of others that go with this one."""
+
+    def lose(self, count: int) -> None:
+        """In the node's thread: so many more messages did not come, for they came too quickly."""
+        self.dropped += count
 
 
 class Publication(Handle):
@@ -170,9 +175,19 @@ class Publication(Handle):
 class Subscription(Handle):
     """A subscription; it is made when somebody publishes, with the quality that is offered, and follows changes."""
 
-    def __init__(self, host: Host, channel: int, endpoint: Endpoint, take: Callable[[bytes], object]) -> None:
+    def __init__(
+        self,
+        host: Host,
+        channel: int,
+        endpoint: Endpoint,
+        take: Callable[[bytes], object],
+        lose: Callable[[int], object] | None = None,
+    ) -> None:
         super().__init__(host, channel, endpoint)
         self._take = take
+        self._lose = lose
+        self._taken = self._lost = 0
+        self._overrun = Overrun(endpoint.qos.depth)
         self._asked: Qos | None = None
 
     def join(self, sender: Sender) -> None:
@@ -206,10 +221,24 @@ class Subscription(Handle):
         if self.refused:
             self.dropped += 1
             return
+        self._taken += 1
         try:
             self._take(frame.body)
         except Exception:  # the node's thread must live on
             _log.exception("A message of %s was lost", self.endpoint.name)
+
+    def lose(self, count: int) -> None:
+        super().lose(count)
+        self._lost += count
+        if self._lose is not None:
+            self._lose(count)
+
+    def overrun(self, now: float) -> str:
+        """A sentence if messages come quicker than they are taken; empty if not, or not any more. ``now`` in s."""
+        found = self._overrun.look(self._taken, self._lost, now)
+        name = self.endpoint.name
+        how = "publish them less often, or give the topic's row more depth"
+        return f"{name}: messages come quicker than they are taken: {found}; {how}" if found else ""
 
 
 class Server(Handle):

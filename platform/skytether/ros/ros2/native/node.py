@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
@@ -130,9 +131,11 @@ class RclpyNode(NodeBase):
             )
         )
 
-    def subscribe(self, endpoint: Endpoint, take: Callable[[bytes], object]) -> Subscription:
+    def subscribe(
+        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+    ) -> Subscription:
         """Be a subscription; the function gets each serialised message, in the node's thread."""
-        return self._add(Subscription(self, next(self._channels), endpoint, take))
+        return self._add(Subscription(self, next(self._channels), endpoint, take, lose))
 
     def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:
         """Be a service; see `Server`."""
@@ -161,6 +164,7 @@ class RclpyNode(NodeBase):
             if self._sender is not None:
                 self._sender.put(control(do="close", channel=handle.channel))
                 self._sender.remove(handle.channel)
+        self.settle(f"overrun {handle.channel}")
 
     # --- the program -------------------------------------------------------------------------------------------------
 
@@ -209,7 +213,7 @@ class RclpyNode(NodeBase):
         return f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
 
     def _see_that_it_answers(self) -> None:
-        """Thread that ends a program which hangs, and says if there is no other node.
+        """Thread that ends a program which hangs, and says if there is no other node, or too much comes.
 
         It counts its own turns, for this process may stand still, too.
         """
@@ -222,6 +226,7 @@ class RclpyNode(NodeBase):
                 self.report("alone", f"ROS 2 graph ({self.middleware}, domain {self.domain}): {NOBODY}")
             elif self.nodes:
                 self.settle("alone")
+            self._look_at_queues(time.monotonic())
             if silent >= 10:
                 silent, self._hung = 0, True
                 with self._lock:
@@ -248,7 +253,7 @@ class RclpyNode(NodeBase):
         finally:
             with self._lock:
                 self._link = self._sender = None
-                self._known, self.middleware = {}, ""
+                self._known, self._lost, self.middleware = {}, {}, ""
                 self._definitions = {kind: text for kind, text in self._definitions.items() if text is not None}
                 for handle in self._handles.values():
                     handle.leave()
@@ -325,10 +330,17 @@ class RclpyNode(NodeBase):
         if new <= 0:
             return
         self._lost[handle.channel] = dropped + lost
-        handle.dropped += new
-        if lost:
-            name = handle.endpoint.name
-            self.report(f"lost {name}", f"{name}: messages come quicker than they are taken; {lost} are lost so far")
+        handle.lose(new)
+
+    def _look_at_queues(self, now: float) -> None:
+        with self._lock:
+            subscriptions = [handle for handle in self._handles.values() if isinstance(handle, Subscription)]
+        for handle in subscriptions:
+            key, sentence = f"overrun {handle.channel}", handle.overrun(now)
+            if sentence:
+                self.report(key, sentence)
+            else:
+                self.settle(key)
 
 
 def clashes(ours: Endpoint, others: Sequence[Endpoint]) -> list[str]:
