@@ -16,11 +16,12 @@ ARGUMENTS = {
     "program": (EnvironmentVariable("SKYTETHER", default_value="skytether"), "The program skytether, by path or name"),
     "service": ("", "Service to ask for; empty: robot.yaml's"),
     "gate": ("false", "Whether the gate before the wheels is to be a process of its own, which outlives the agent"),
+    "use_sim_time": ("false", "Whether all nodes stamp with the time of /clock; false: as robot.yaml says"),
 }
 
 
-def _text(name):
-    return ParameterValue(LaunchConfiguration(name), value_type=str)
+def _parameter(name, kind=str):
+    return ParameterValue(LaunchConfiguration(name), value_type=kind)
 
 
 def generate_launch_description():
@@ -32,6 +33,11 @@ def generate_launch_description():
         "respawn": True,
         "respawn_delay": 2.0,
     }
+    common = {
+        "config": _parameter("config"),
+        "program": _parameter("program"),
+        "use_sim_time": _parameter("use_sim_time", bool),
+    }
     return LaunchDescription(
         [
             *(
@@ -41,14 +47,14 @@ def generate_launch_description():
             Node(
                 executable="robot_gate",
                 name="skytether_gate_launch",
-                parameters=[{"config": _text("config"), "program": _text("program")}],
+                parameters=[common],
                 condition=IfCondition(LaunchConfiguration("gate")),
                 **both,
             ),
             Node(
                 executable="robot_run",
                 name="skytether_launch",
-                parameters=[{"config": _text("config"), "program": _text("program"), "service": _text("service")}],
+                parameters=[{**common, "service": _parameter("service")}],
                 **both,
             ),
         ]

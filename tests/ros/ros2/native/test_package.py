@@ -424,6 +424,8 @@ def test_the_three_launch_files_start_the_same(monkeypatch):
     assert [node["exec"] for node in nodes] == ["robot_gate", "robot_run"]
     script = (PACKAGE / "setup.py").read_text()
     assert all(f"{node['exec']} = skytether_ros.nodes:" in script for node in nodes)
+    assert arguments["use_sim_time"][0] == "false"
+    assert {node["param"]["use_sim_time"] for node in nodes} == {"$(var use_sim_time)"}, "of both"
     used = {f"$(var {name})" for name in arguments}
     assert used == {
         value for node in nodes for value in (node["namespace"], node.get("if"), *node["param"].values())
@@ -461,8 +463,8 @@ def python_file(monkeypatch):
     def argument(name, *, default_value, description):
         arguments[name] = (default_value, description)
 
-    def text(value, *, value_type):
-        assert value_type is str
+    def parameter(value, *, value_type):
+        assert value_type is (bool if value == "$(var use_sim_time)" else str)
         return value
 
     played: dict[str, dict[str, Any]] = {
@@ -475,7 +477,7 @@ def python_file(monkeypatch):
         },
         "launch_ros": {},
         "launch_ros.actions": {"Node": node},
-        "launch_ros.parameter_descriptions": {"ParameterValue": text},
+        "launch_ros.parameter_descriptions": {"ParameterValue": parameter},
     }
     for name, content in played.items():
         module = ModuleType(name)
