@@ -59,14 +59,16 @@ class GroupsBench:
     def start(self) -> None:
         clock, store = self.clock, self.store
         self.metrics = Metrics(list, 64)
-        self.sites = Sites(self.folder / "sites", store, _look, Timing(site_silent=1e9), self._runtime)
+        self.sites = Sites(self.folder / "sites", store, Timing(site_silent=1e9), self._runtime)
+        self.groups = Groups(self.folder / "groups", store, self._provider)
+        self.demand = Demand(store, self.groups, self.sites, clock, Weights(), steady=clock.steady)
         self.placer = Placer(
             store,
             self.sites,
             Weights(),
             self.lead,
             clock.steady,
-            prospects=lambda record: self.demand.prospects(record),
+            prospects=self.demand.prospects,
         )
         self.passes = Passes(
             store,
@@ -83,25 +85,21 @@ class GroupsBench:
             self.lead,
             clock.steady,
         )
-        self.demand: Demand = Demand(
-            store, lambda: self.groups, lambda: self.sites, self.placer.promised, clock, Weights(), steady=clock.steady
-        )
         self.scaler = Scaler(
             store,
-            lambda: self.groups,
-            lambda: self.sites,
+            self.sites,
             self.passes.successors,
             self.demand,
+            self.placer.promised,
             self.lead,
             clock,
             lambda machine, group, options: Invitation("https://orchestrator", f"token-of-{machine}"),
             steady=clock.steady,
         )
-        self.groups = Groups(self.folder / "groups", store, lambda _: 3600.0, self._provider)
-        self.sites.refresh()
+        self.sites.start(_look, local=False)
         for site in self.sites.all():
             site.loop.wait_first(10.0)
-        self.groups.refresh()
+        self.groups.start(lambda _: 3600.0)
 
     def restart(self) -> None:
         """It was killed, and the next one comes."""

@@ -101,7 +101,8 @@ class Orchestrator:
         clock = self.clock = clock or self._shared_clock or time.time
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
         self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
-        self.disk_usage = DiskUsage(lambda: self.sites.stored(), settings.quotas, lambda site: self.sites.hosted(site))
+        self.sites = Sites(settings.state_dir / "sites", self.store, settings.timing, find_runtime)
+        self.disk_usage = DiskUsage(self.sites.stored, settings.quotas, self.sites.hosted)
         self.quotas = Quotas(self.store, settings.quotas, self.disk_usage)
         self.reports = Reports(self.store, self.quotas.drop_names)
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
@@ -124,13 +125,18 @@ class Orchestrator:
         limiter = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)
         self.access = Access(self.store, secrets, clock, limiter)
         self.stop_orders = StopOrders(self.store, clock)
-        self.sites: Sites = Sites(
-            settings.state_dir / "sites",
-            self.store,
-            self._unless_outdated(lambda site: self._passes.reconciler.site_turn(site)),
-            settings.timing,
-            find_runtime,
-        )
+        self.authority: Authority | None = None
+        self.nodes: Enrolment | None = None
+        """Machines that joined; None: none can."""
+        self.node_port = settings.nodes.port
+        """TCP port where they connect."""
+        if settings.nodes.port is not None:
+            self.authority = Authority(settings.secrets_dir or settings.state_dir, clock)
+            days, renew_days = settings.nodes.certificate_days, settings.nodes.renew_days
+            self.nodes = Enrolment(self.store, self.sites, self.authority, clock, days, renew_days, settings.nodes.urls)
+        invites = MachineInvites(self.nodes, settings.nodes.urls)
+        self.groups = Groups(settings.state_dir / "groups", self.store, find_provider, invites.lacks)
+        demand = Demand(self.store, self.groups, self.sites, clock, settings.weights)
         placer = Placer(
             self.store,
             self.sites,
@@ -138,9 +144,9 @@ class Orchestrator:
             self.leadership,
             site_instances=settings.quotas.site_instances,
             disk_usage=self.disk_usage,
-            prospects=lambda record: demand.prospects(record),
+            prospects=demand.prospects,
         )
-        passes: Passes = Passes(
+        self._passes: Passes = Passes(
             self.store,
             self.catalog,
             self.sites,
@@ -157,45 +163,18 @@ class Orchestrator:
             disk_usage=self.disk_usage,
             left=self.quotas.left,
         )
-        self._passes: Passes = passes
-        self.authority: Authority | None = None
-        self.nodes: Enrolment | None = None
-        """Machines that joined; None: none can."""
-        self.node_port = settings.nodes.port
-        """TCP port where they connect."""
-        if settings.nodes.port is not None:
-            self.authority = Authority(settings.secrets_dir or settings.state_dir, clock)
-            days, renew_days = settings.nodes.certificate_days, settings.nodes.renew_days
-            self.nodes = Enrolment(
-                self.store, lambda: self.sites, self.authority, clock, days, renew_days, settings.nodes.urls
-            )
-        invites = MachineInvites(self.nodes, settings.nodes.urls)
-        demand: Demand = Demand(
-            self.store,
-            lambda: self.groups,
-            lambda: self.sites,
-            placer.promised,
-            clock,
-            settings.weights,
-        )
+        passes = self._passes
         self.scaler = Scaler(
             self.store,
-            lambda: self.groups,
-            lambda: self.sites,
+            self.sites,
             passes.successors,
             demand,
+            placer.promised,
             self.leadership,
             clock,
             invites,
             wake_placer=self._wake_placer,
             forget_site=self.metrics.forget_site,
-        )
-        self.groups: Groups = Groups(
-            settings.state_dir / "groups",
-            self.store,
-            self._unless_outdated(self.scaler.turn),
-            find_provider,
-            invites.lacks,
         )
         self.placer = Loop("placer", self._unless_outdated(passes.placement.turn), time.monotonic)
         self.writer = Loop("reports", self._unless_outdated(self._write_reports), time.monotonic)
@@ -275,8 +254,8 @@ class Orchestrator:
             )
         self.elector.start()
         self.elector.wait_first(_FIRST_LOOK)
-        self.sites.start(self.settings.local_site, declared)
-        self.groups.start(groups)
+        self.sites.start(self._unless_outdated(self._passes.reconciler.site_turn), self.settings.local_site, declared)
+        self.groups.start(self._unless_outdated(self.scaler.turn), groups)
         self.placer.start()
         self.writer.start()
         self.keeper.start()

@@ -40,9 +40,8 @@ class Demand:
     def __init__(
         self,
         store: Store,
-        groups: Callable[[], Groups],
-        sites: Callable[[], Sites],
-        promised: Callable[[], Sums],
+        groups: Groups,
+        sites: Sites,
         clock: Callable[[], float],
         weights: Weights,
         steady: Callable[[], float] = time.monotonic,
@@ -51,17 +50,16 @@ class Demand:
         self._store = store
         self._groups = groups
         self._sites = sites
-        self._promised = promised
         self._clock = clock
         self._weights = weights
         self._steady = steady
 
-    def views(self, own: SiteGroup) -> list[GroupView]:
+    def views(self, own: SiteGroup, promised: Sums) -> list[GroupView]:
+        """Of all groups, for the thread of one of them; ``promised``: what sites have promised."""
         machines = self._store.machines()
-        promised = self._promised()
         views = []
         for row in self._store.site_groups():
-            group = self._groups().find(row.name)
+            group = self._groups.find(row.name)
             mine = [self._view(own, one, promised) for one in machines if one.group == row.name]
             offer = _least(group.offer, group.proven) if group else None
             retry_at = row.retry_at if row.retry_at - self._clock() <= BACKOFF_MAX else -math.inf  # another clock's
@@ -69,7 +67,7 @@ class Demand:
         return views
 
     def _view(self, own: SiteGroup, row: MachineRow, promised: Sums) -> MachineView:
-        site = self._sites().find(row.name)
+        site = self._sites.find(row.name)
         used = promised.get(row.name, NOTHING)
         takes = site is not None and not (site.unreachable or site.draining or site.evacuating)
         total = site.capacity if site is not None and takes else None
@@ -109,7 +107,7 @@ class Demand:
     def prospects(self, record: Record) -> list[Prospect]:
         """What each group could do for an instance that no site takes; from any thread, for who leads or not."""
         found = []
-        for group in self._groups().all():
+        for group in self._groups.all():
             view = GroupView(group.asked, _least(group.offer, group.proven) or _UNKNOWN, draining=group.draining)
             candidate = replace(self._candidate(record, view), draining=group.draining)
             decision = place(record.spec.needs, {}, [candidate], image=record.spec.image, weights=self._weights)
@@ -120,7 +118,7 @@ class Demand:
     def _could_take(self, record: Record, offers: Mapping[str, GroupView]) -> tuple[str, ...]:
         group_of = {one.name: view.asked.name for view in offers.values() for one in view.machines}
         self._note_futile(record, group_of)
-        useless = {name for name in offers if (group := self._groups().find(name)) and _is_futile(record, group.futile)}
+        useless = {name for name in offers if (group := self._groups.find(name)) and _is_futile(record, group.futile)}
         measured: dict[str, Measurement] = {}
         for site, given in record.measurements.items():
             name, one = group_of.get(site), Measurement.model_validate(given)
@@ -133,7 +131,7 @@ class Demand:
 
     def _note_futile(self, record: Record, group_of: Mapping[str, str]) -> None:
         for refused in record.refused:
-            group = self._groups().find(group_of.get(refused["site"], ""))
+            group = self._groups.find(group_of.get(refused["site"], ""))
             if group is None or refused["reason"] not in _FOR_GOOD:
                 continue
             if len(group.futile) >= _MOST_FUTILE:
@@ -142,7 +140,7 @@ class Demand:
 
     def _candidate(self, record: Record, view: GroupView) -> Candidate:
         asked = view.asked
-        group = self._groups().find(asked.name)
+        group = self._groups.find(asked.name)
         return Candidate(
             name=asked.name,
             tier=asked.tier,

@@ -116,41 +116,43 @@ class SiteGroup:
 class Groups:
     """All groups, in memory and in the store."""
 
+    _step: Callable[[SiteGroup], float]
+    """What each group's thread does again and again; from `start` on."""
+
     def __init__(
         self,
         folder: Path,
         store: Store,
-        step: Callable[[SiteGroup], float],
         find_provider: Callable[[str], type[Provider]] = load_provider,
         lacks: Callable[[], str] = str,
     ) -> None:
-        """What it works with.
+        """There are none before `start`.
 
         Args:
             folder: Where the providers keep what they note.
             store: The database.
-            step: What each group's thread does again and again.
             find_provider: Gives a provider by its name.
             lacks: What is to be set before machines can join by themselves; empty: nothing.
         """
         self._lacks = lacks
         self._folder = folder
         self._store = store
-        self._step = step
         self._find_provider = find_provider
         self._lock = threading.Lock()
         self._groups: dict[str, SiteGroup] = {}
         self._looker = Loop("groups", self._look, time.monotonic)
 
-    def start(self, declared: Iterable[GroupCreate] = ()) -> None:
+    def start(self, step: Callable[[SiteGroup], float], declared: Iterable[GroupCreate] = ()) -> None:
         """Open every group of the store.
 
         Args:
+            step: What each group's thread does again and again, from now on.
             declared: Groups that are to be there, and as these.
 
         Raises:
             InvalidError: A declared one cannot be.
         """
+        self._step = step
         for asked in declared:
             self._declare(asked)
         self.refresh()

@@ -18,6 +18,7 @@ from skytether.api.rest import SiteCreate
 
 from ..domain.errors import DomainError, NotFoundError
 from ..providers.base import Condition, Found, Invitation, Order, ProviderFailure, ProviderSilentError
+from ..scheduling.promises import Sums
 from ..scheduling.site import Site
 from ..scheduling.sites import Sites
 from ..scheduling.successors import Successors
@@ -26,7 +27,7 @@ from ..store.group_store import GroupRow, MachineRow
 from ..store.leader import Lead, LeadLostError, fence, fenced
 from ..store.store import Store
 from .demand import Demand
-from .groups import Groups, SiteGroup
+from .groups import SiteGroup
 from .scaling import BACKOFF_MAX, Drain, Make, Step, backoff, decide
 
 log = logging.getLogger(__name__)
@@ -59,10 +60,10 @@ class Scaler:
     def __init__(
         self,
         store: Store,
-        groups: Callable[[], Groups],
-        sites: Callable[[], Sites],
+        sites: Sites,
         successors: Successors,
         demand: Demand,
+        promised: Callable[[], Sums],
         lead: Lead,
         clock: Callable[[], float],
         invite: Invites,
@@ -70,12 +71,26 @@ class Scaler:
         forget_site: Callable[[str], None] = lambda _: None,
         steady: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``clock`` gives seconds since the epoch, ``steady`` those of a clock that nobody sets."""
+        """What it works with.
+
+        Args:
+            store: Where groups and machines are.
+            sites: Where machines become sites.
+            successors: Moves what runs at a machine that is given back.
+            demand: What is asked of the groups.
+            promised: What sites have promised.
+            lead: It acts while this leads.
+            clock: Seconds since the epoch.
+            invite: Lets a machine become a site by itself.
+            wake_placer: Called when there is room for another.
+            forget_site: Called with the name of a site or a group that is no more.
+            steady: Seconds of a clock that nobody sets.
+        """
         self._store = store
-        self._groups = groups
         self._sites = sites
         self._successors = successors
         self._demand = demand
+        self._promised = promised
         self._lead = lead
         self._clock = clock
         self._invite = invite
@@ -111,7 +126,7 @@ class Scaler:
         self._destroy_strangers(group, rows, there)
         for machine in rows:
             self._follow(group, row, machine, sorted((f for f in there if f.name == machine.name), key=_age))
-        views = self._demand.views(group)
+        views = self._demand.views(group, self._promised())
         now = self._clock()
         for step in decide(views, self._demand.waiting(views), now):
             if step.group == group.name and self._leads():
@@ -164,7 +179,7 @@ class Scaler:
             self._remove(group, machine, found)
         else:
             mine = self._only_one(group, machine, found)
-            site = self._sites().find(machine.name)
+            site = self._sites.find(machine.name)
             if site is not None:
                 site.group = group.name
             if why := self._lost(group, machine, mine, site):
@@ -252,7 +267,7 @@ class Scaler:
             images=asked.images,
         )
         try:
-            return self._sites().add(site)
+            return self._sites.add(site)
         except DomainError as error:
             log.warning("group %s: %s is no site: %s", group.name, name, error)
             return None
@@ -261,8 +276,8 @@ class Scaler:
         """Have a site go, and what runs there moved before."""
         try:
             if not site.evacuating:
-                self._sites().evacuate(site.name)
-            if not site.draining and self._sites().drain(site.name):
+                self._sites.evacuate(site.name)
+            if not site.draining and self._sites.drain(site.name):
                 self._forget_site(site.name)
         except NotFoundError:
             pass  # it is gone already
@@ -270,7 +285,7 @@ class Scaler:
             log.info("site %s is not deleted yet: %s", site.name, error)
 
     def _remove(self, group: SiteGroup, machine: MachineRow, found: Sequence[Found]) -> None:
-        site = self._sites().find(machine.name)
+        site = self._sites.find(machine.name)
         if site is not None:  # it became one in the last moment, or is not empty yet
             self._empty(site)
             return
@@ -308,7 +323,7 @@ class Scaler:
         elif isinstance(step, Drain):
             if self._store.advance_machine(step.machine, Stage.DRAINING, now, step.why):
                 self._tell(group, f"{step.machine} is given back: {step.why}")
-                site = self._sites().find(step.machine)
+                site = self._sites.find(step.machine)
                 if site is not None:
                     self._empty(site)
         elif self._store.advance_machine(step.machine, Stage.REMOVING, now, step.why):

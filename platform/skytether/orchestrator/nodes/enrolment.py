@@ -63,7 +63,7 @@ class Enrolment:
     def __init__(
         self,
         store: Database,
-        sites: Callable[[], Sites],
+        sites: Sites,
         authority: Authority,
         clock: Callable[[], float],
         days: float,
@@ -74,7 +74,7 @@ class Enrolment:
 
         Args:
             store: The database.
-            sites: Gives the sites.
+            sites: Where a machine that joins becomes one.
             authority: Signs.
             clock: Seconds since the epoch.
             days: How long a certificate is good for.
@@ -103,7 +103,7 @@ class Enrolment:
             InvalidError: Wrong options.
         """
         asked = site.model_copy(update={"runtime": RUNTIME, "options": self._options(site, "node.invalid", None)})
-        self._sites().check(asked, by_owner=by_owner)
+        self._sites.check(asked, by_owner=by_owner)
         now, token = self._clock(), new_token()
         kept = site.model_copy(update={"runtime": RUNTIME})
         invitation = Invitation(secrets.token_hex(8), TokenHash.of(token), kept, by, now, now + min(ttl_s, LONGEST_S))
@@ -151,7 +151,7 @@ class Enrolment:
 
     def _check_free(self, invitation: Invitation) -> None:
         name = invitation.site.name
-        if self._sites().find_anew(name) is not None:
+        if self._sites.find_anew(name) is not None:
             raise ConflictError(
                 f"there is a site '{name}' already: invite this machine under another name, or remove that one first "
                 f"(`skytether site remove {name}`); the token is still good"
@@ -195,7 +195,7 @@ class Enrolment:
             return self._rows.join(invitation, site, node, fingerprint(key))
 
         try:
-            self._sites().add(site, put=put)
+            self._sites.add(site, put=put)
         except ConflictError:
             self.look(asked.token)  # somebody else was quicker with this token, or with this name: it says which
             raise
@@ -259,12 +259,12 @@ class Enrolment:
         self._rows.seen(known.name, self._clock(), seen_as, machine)
         if address is None or not known.node.follow:
             return
-        site = self._sites().find_anew(known.name)
+        site = self._sites.find_anew(known.name)
         if site is None or site.asked.options.get("advertise_host") == address:
             return
         if not self._moves.wait(known.name):
             before = site.asked.options.get("advertise_host")
-            self._sites().change_options(known.name, {"advertise_host": address})
+            self._sites.change_options(known.name, {"advertise_host": address})
             log.warning("site %s came back under another address: %s, no longer %s", known.name, address, before)
 
     def still_linked(self, seen_as: Mapping[str, str]) -> set[str]:

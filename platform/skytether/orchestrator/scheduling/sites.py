@@ -38,29 +38,33 @@ _CLOSE_TIMEOUT = 5.0
 class Sites:
     """All sites, in memory and in the store."""
 
+    _step: Step
+    """What each site's thread does again and again; from `start` on."""
+
     def __init__(
-        self, folder: Path, store: Store, step: Step, timing: Timing, find_runtime: Callable[[str], type[Runtime]]
+        self, folder: Path, store: Store, timing: Timing, find_runtime: Callable[[str], type[Runtime]]
     ) -> None:
-        """``step`` is what each site's thread does again and again; ``find_runtime`` gives a runtime by its name."""
+        """There are none before `start`; ``find_runtime`` gives a runtime by its name."""
         self._find_runtime = find_runtime
         self._folder = folder
         self._store = store
-        self._step = step
         self._timing = timing
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
         self._told_of_deletions: list[Callable[[str], object]] = []
 
-    def start(self, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
+    def start(self, step: Step, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
         """Open every site of the store, and give them a moment to answer.
 
         Args:
+            step: What each site's thread does again and again, from now on.
             local: Make one, if there is none.
             declared: Sites that are to be there, and as these.
 
         Raises:
             InvalidError: A declared one cannot be.
         """
+        self._step = step
         for asked in declared:
             self._declare(asked)
         if local and not self._store.sites():
