@@ -175,7 +175,7 @@ def test_what_a_page_of_internals_names_is_there(name: str, packages: tuple[str,
     page = (ROOT / "docs" / "internals" / f"{name}.md").read_text()
     platform = ROOT / "platform" / "skytether"
     homes = [platform, ROOT, *(folder / one for folder in (platform, ROOT / "tests") for one in packages)]
-    homes += [ROOT / "tests" / "robot" / "safety"]
+    homes += [ROOT / "tests" / "robot" / "safety", *(ROOT / "tests" / "robot" / "safety").iterdir()]
     files = re.findall(r"`([\w/]+\.py)`", page)
     assert len(files) > 20
     for file in files:

@@ -23,7 +23,7 @@ from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Bool, LaserScan, encode
 from skytether.robot.graphs.inbox import Topics
 from skytether.robot.safety.client import GateLink
-from skytether.robot.safety.hardware import SocketSensors
+from skytether.robot.safety.io.hardware import SocketSensors
 from skytether.robot.safety.protocol import COMMAND_SOCKET, GateState, pack_state
 
 LINGERS_S = 60

@@ -20,7 +20,7 @@ from skytether.guard.wheels import SocketWheels
 from skytether.messages import Bool, encode
 from skytether.robot.graphs.inbox import Topics
 from skytether.robot.safety.client import GateError, GateLink, ask, listens, stop
-from skytether.robot.safety.hardware import SocketSensors
+from skytether.robot.safety.io.hardware import SocketSensors
 from skytether.robot.safety.protocol import COMMAND_SOCKET, CONTROL_SOCKET, GateState, default_folder, pack_state
 
 root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user too")

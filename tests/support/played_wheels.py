@@ -7,7 +7,7 @@ from random import Random
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Header, Odometry, Time, Twist, TwistWithCovariance, Vector3
-from skytether.robot.safety.motion import MotionParams
+from skytether.robot.safety.rules.motion import MotionParams
 
 _NOISE = Velocity(MotionParams().linear_tolerance, MotionParams().angular_tolerance)
 

@@ -21,10 +21,10 @@ from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.messages import Header, LaserScan, Time
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.safety.config import SafetyConfig
-from skytether.robot.safety.footprint import Points
-from skytether.robot.safety.heartbeat import differs
-from skytether.robot.safety.rules import Gate
+from skytether.robot.safety.config.safety_config import SafetyConfig
+from skytether.robot.safety.gate.heartbeat import differs
+from skytether.robot.safety.geometry.footprint import Points
+from skytether.robot.safety.rules.rules import Gate
 
 _FINE_S = 0.004
 """Longest piece of the way that is integrated at once."""

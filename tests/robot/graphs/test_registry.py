@@ -22,7 +22,7 @@ from skytether.messages import LaserScan, MarkerArray, Twist, decode, encode
 from skytether.robot.config.robot_config import RobotConfig
 from skytether.robot.graphs.registry import GRAPHS, keys
 from skytether.robot.safety.client import GateError, ask
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config.safety_config import SafetyConfig
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 30.0

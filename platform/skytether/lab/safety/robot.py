@@ -29,7 +29,7 @@ from skytether.guard.clock import now
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Time
 from skytether.robot.safety.client import GateError, ask
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config.safety_config import SafetyConfig
 
 from .socket_hardware import Hardware, SocketHardware
 

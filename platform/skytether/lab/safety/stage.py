@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from skytether.guard.clock import now
 from skytether.robot.control.supervisor import Limits
 from skytether.robot.safety.client import GateError
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config.safety_config import SafetyConfig
 
 from .checker import Demand, Finding, Violation, Wheels, check
 from .robot import PlayedRobot, StagingError

@@ -16,9 +16,9 @@ from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Bool, LaserScan
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.safety.config import SafetyConfig
-from skytether.robot.safety.heartbeat import differs
-from skytether.robot.safety.rules import Gate
+from skytether.robot.safety.config.safety_config import SafetyConfig
+from skytether.robot.safety.gate.heartbeat import differs
+from skytether.robot.safety.rules.rules import Gate
 
 from .attacks import Attacks
 from .checker import Demand, Finding, Told, Violation, check

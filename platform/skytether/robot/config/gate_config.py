@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
 from skytether.api.config_file import read_config
 from skytether.robot.graphs.registry import GRAPHS, keys
-from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, SafetyConfig
+from skytether.robot.safety.config.safety_config import NO_GATE, WITHOUT_SECTION, SafetyConfig
 from skytether.ros.names import namespace_of
 from skytether.ros.ros1.arguments import RosArguments
 

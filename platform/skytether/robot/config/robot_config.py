@@ -24,9 +24,9 @@ from skytether.robot.graphs.graph_config import RobotGraphConfig
 from skytether.robot.graphs.kind import GateSection, GraphKind, RobotSection
 from skytether.robot.graphs.registry import GRAPHS, sections_of, with_sections
 from skytether.robot.offload.task_manager import Mode, Policy
-from skytether.robot.safety.bounds import LONGEST_REASON, check_plausible
-from skytether.robot.safety.config import NO_GATE, WITHOUT_SECTION, SafetyConfig
-from skytether.robot.safety.protected import protected_names as safety_names
+from skytether.robot.safety.config.bounds import LONGEST_REASON, check_plausible
+from skytether.robot.safety.config.protected import protected_names as safety_names
+from skytether.robot.safety.config.safety_config import NO_GATE, WITHOUT_SECTION, SafetyConfig
 from skytether.ros.names import Names, check_name, namespace_of, resolve
 from skytether.ros.permissions import Access, Allowed, Permissions
 from skytether.ros.ros1.arguments import RosArguments

@@ -14,8 +14,8 @@ from skytether.api.config_file import ConfigError
 from skytether.guard.velocity import Velocity
 from skytether.robot.config.gate_config import load_safety
 from skytether.robot.control.supervisor import Limits
-from skytether.robot.safety.commission import Commission, CommissionError, Plan, Step
-from skytether.robot.safety.rig import HardwareRig
+from skytether.robot.safety.commission.commission import Commission, CommissionError, Plan, Step
+from skytether.robot.safety.commission.rig import HardwareRig
 
 from ...output import fail
 

@@ -11,8 +11,8 @@ import typer
 from skytether.api.config_file import ConfigError
 from skytether.guard.record import decode
 from skytether.robot.config.gate_config import load_safety
+from skytether.robot.safety.gate.start import become_guard
 from skytether.robot.safety.protocol import default_record
-from skytether.robot.safety.start import become_guard
 
 from ...output import fail, print_foreign, print_json
 from ...ros_words import RosWords, given

@@ -24,7 +24,7 @@ from skytether.guard.folder import objection
 from skytether.guard.record import lost_at_reboot
 from skytether.robot.config.gate_config import load_safety
 from skytether.robot.safety.client import GateError, ask, listens
-from skytether.robot.safety.config import SafetyConfig
+from skytether.robot.safety.config.safety_config import SafetyConfig
 from skytether.ros.ros1.arguments import RosArguments
 
 from ...output import console, fail

@@ -24,9 +24,9 @@ from skytether.messages import (
     Vector3,
 )
 from skytether.robot.control.command import Hand
-from skytether.robot.safety.footprint import Footprint, Points
-from skytether.robot.safety.sweep import boundary
-from skytether.robot.safety.zones import Zone
+from skytether.robot.safety.geometry.footprint import Footprint, Points
+from skytether.robot.safety.geometry.sweep import boundary
+from skytether.robot.safety.rules.zones import Zone
 
 from .picture import Picture, Pieces
 from .snapshot import Snapshot

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from skytether.control.admittance import Velocity
-from skytether.robot.safety.footprint import Footprint, Points
-from skytether.robot.safety.places import Place
-from skytether.robot.safety.sweep import swept
-from skytether.robot.safety.zones import Asked
+from skytether.robot.safety.geometry.footprint import Footprint, Points
+from skytether.robot.safety.geometry.sweep import swept
+from skytether.robot.safety.rules.places import Place
+from skytether.robot.safety.rules.zones import Asked
 
 Pieces = tuple[Footprint, ...]
 """That overlap."""

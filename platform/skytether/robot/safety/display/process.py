@@ -22,14 +22,14 @@ from skytether.guard.mailbox import bind
 from skytether.guard.settings import thaw
 from skytether.messages import MarkerArray, Message, warm
 from skytether.robot.log_throttle import LogThrottle
-from skytether.robot.safety.config import SafetyConfig
-from skytether.robot.safety.display_config import DisplayConfig
-from skytether.robot.safety.hardware import receive_known
-from skytether.robot.safety.io_factory import open_display
-from skytether.robot.safety.modes import Envelope, Modes
-from skytether.robot.safety.places import Places
-from skytether.robot.safety.process import log_without_waiting
+from skytether.robot.safety.config.display_config import DisplayConfig
+from skytether.robot.safety.config.safety_config import SafetyConfig
+from skytether.robot.safety.io.hardware import receive_known
+from skytether.robot.safety.io.io_factory import open_display
+from skytether.robot.safety.io.process_setup import log_without_waiting
 from skytether.robot.safety.protocol import DISPLAY_SOCKET
+from skytether.robot.safety.rules.modes import Envelope, Modes
+from skytether.robot.safety.rules.places import Places
 
 from .markers import markers, silence
 from .picture import picture

@@ -11,9 +11,9 @@ from math import inf, isfinite
 import numpy as np
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.robot.safety.dead_reckoning import Variation
-from skytether.robot.safety.rules import Decision
-from skytether.robot.safety.zones import Asked, Zone
+from skytether.robot.safety.geometry.dead_reckoning import Variation
+from skytether.robot.safety.rules.rules import Decision
+from skytether.robot.safety.rules.zones import Asked, Zone
 
 MOST_POINTS = 4000
 """The nearest; the sum of all fits into a datagram of this machine."""
