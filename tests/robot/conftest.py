@@ -6,7 +6,8 @@ from math import nan
 import pytest
 
 from skytether.api.client import ApiError
-from skytether.api.rest import Instance, InstanceCreate, Placement, Problem, Renew, Session, State
+from skytether.api.manifest import Manifest, Tier
+from skytether.api.rest import Instance, InstanceCreate, Placement, Problem, Renew, Session, Site, State
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, MessageReceived
@@ -109,7 +110,13 @@ def make_cloud() -> type[Cloud]:
 
 
 class ObedientOrchestrator:
-    """Gives every robot what it asks for, without a network; fails as it is told."""
+    """Gives every robot what it asks for, without a network; fails as it is told.
+
+    Attributes:
+        requests: All that it was asked for, also while it failed.
+        rtt: Its sites, and how long a probe of each takes [s].
+        changes: What is different of one instance, by its id.
+    """
 
     KEY = base64.b64encode(bytes(32)).decode()
 
@@ -123,9 +130,13 @@ class ObedientOrchestrator:
         self.successor: str | None = None
         self.placement: Placement | None = None
         self.key_taken = False
+        self.requests: list[InstanceCreate] = []
+        self.rtt: dict[Tier, float] = {}
+        self.changes: dict[str, dict[str, object]] = {}
         self._number = 0
 
     def create_instance(self, request: InstanceCreate, *, idempotency_key: str) -> Instance:
+        self.requests.append(request)
         self._number += self.fail is None
         return self._answer("create", idempotency_key)
 
@@ -145,13 +156,24 @@ class ObedientOrchestrator:
     def delete_instance(self, instance_id: str) -> Instance:
         return self._answer("delete", instance_id)
 
+    def sites(self) -> list[Site]:
+        return [Site(name=name, tier=name, runtime="process") for name in self.rtt]
+
+    def get_service(self, name: str) -> Manifest:
+        spec = {"entrypoint": name, "needs": {"max_rtt_ms": 100}}
+        about = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": name}}
+        return Manifest.model_validate({**about, "spec": spec})
+
+    def probe(self, site: Tier) -> float:
+        return self.rtt[site]
+
     def _answer(self, name: str, what: object, instance_id: str = "") -> Instance:
         self.calls.append((name, what))
         if self.fail is not None:
             raise self.fail
         state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
         epoch = datetime(2026, 1, 1, tzinfo=UTC)
-        return Instance(
+        instance = Instance(
             id=instance_id or f"i{self._number}",
             robot="walker",
             service="virtual-trail",
@@ -164,6 +186,7 @@ class ObedientOrchestrator:
             updated_at=epoch,
             lease_expires_at=epoch,
         )
+        return instance.model_copy(update=self.changes.get(instance.id, {}))
 
 
 @pytest.fixture

@@ -1,14 +1,13 @@
 import threading
 import time
 from dataclasses import replace
-from itertools import count
 from math import isnan
 
 import pytest
 
 from skytether.api.manifest import Needs as ServiceNeeds
 from skytether.api.manifest import TopicSpec
-from skytether.api.rest import Session, TopicReport
+from skytether.api.rest import Session, State, TopicReport
 from skytether.bridge import BridgeError, topics_from_api
 from skytether.messages import WrenchStamped, type_hash
 from skytether.robot.agent.agent import Agent
@@ -58,12 +57,17 @@ class Rig:
     def ask(self):
         """One exchange, and what the control loop and the watch do of it."""
         self.agent.ask()
-        self.agent._control_loop._change_over()
-        self.agent._settle()
+        self.tick()
+        self.agent.watch(self.now)
 
     @property
     def bridges(self):
         return [endpoint for *_, endpoint in self.made]
+
+    @property
+    def session(self):
+        """The robot's side of the bridge that was made last."""
+        return self.made[-1][1]
 
 
 @pytest.fixture
@@ -121,8 +125,7 @@ def test_an_experiment_may_put_a_link_in_between(base, orchestrator, make_bridge
 
 def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     rig.ask()
-    old = rig.agent._control_loop.session
-    make_cloud(old)
+    make_cloud(rig.session)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
     rig.agent.watch(rig.now)
     assert rig.agent.status().rtt == 0.7
@@ -131,7 +134,7 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
     assert not rig.agent.status().connected
     assert isnan(rig.agent.status().rtt), "of the session before"
-    cloud = make_cloud(rig.agent._control_loop.session)
+    cloud = make_cloud(rig.session)
     assert rig.agent.status().connected
     cloud.send(rig.now)
     rig.agent.tick(rig.now)
@@ -140,25 +143,22 @@ def test_a_new_session_replaces_the_old_one(rig, orchestrator, make_cloud):
 
 def test_while_the_cloud_drives_another_session_takes_over_with_its_first_command(rig, orchestrator, make_cloud):
     rig.ask()
-    old = rig.agent._control_loop.session
-    before = make_cloud(old)
+    before = make_cloud(rig.session)
     while rig.agent.source is not Source.CLOUD:
         before.send(rig.now)
         rig.tick()
     orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
     rig.ask()
-    assert rig.agent._control_loop.session is old
     for _ in range(20):  # the other one is joined, and has not commanded yet
         before.send(rig.now)
         rig.tick()
         rig.agent.watch(rig.now)
     assert rig.agent.source is Source.CLOUD
     assert [endpoint.running for endpoint in rig.bridges] == [True, True]
-    sessions = rig.agent._open_sessions
-    after = make_cloud(sessions["00000000000000cd"].session)
+    assert rig.bridges[0].published[-1] == rig.bridges[1].published[-1], "both get the readings"
+    after = make_cloud(rig.session)
     after.send(rig.now)
     rig.tick()
-    assert rig.agent._control_loop.session is not old
     assert rig.agent.source is Source.CLOUD
     rig.agent.watch(rig.now)
     assert [endpoint.running for endpoint in rig.bridges] == [False, True]
@@ -192,24 +192,26 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(base, orch
     rig = Rig(base, orchestrator, make_bridge, graph=(graph := OneAtATime()))
 
     def drive():
-        cloud = make_cloud(rig.agent._control_loop.session)
+        cloud = make_cloud(rig.session)
         for _ in range(500):
             cloud.send(rig.now)
             rig.tick()
         assert rig.agent.source is Source.CLOUD
 
     rig.ask()
-    kept, old = rig.agent.status().instance, rig.agent._control_loop.session
     drive()
-    orchestrator.session = SESSION.model_copy(update={"id": "00000000000000cd"})
+    other = {"session": SESSION.model_copy(update={"id": "00000000000000cd"}), "successor": None}
+    orchestrator.successor, orchestrator.changes = "i2", {"i2": other}
+    while graph.opened < 2:
+        rig.ask()
+    assert [endpoint.running for endpoint in rig.bridges] == [True, True]
+    other["state"] = State.FAILED  # it never commanded
     rig.ask()
-    rig.agent._stay(kept, "the other one never commanded")
     assert [endpoint.running for endpoint in rig.bridges] == [False, False]
-    rig.tick()
     assert rig.agent.source is Source.FALLBACK
-    orchestrator.session = SESSION
+    orchestrator.successor = None
     rig.ask()
-    assert (rig.agent._control_loop.session.id, graph.opened) == (old.id, 3)
+    assert (rig.made[-1][0].id, graph.opened) == (rig.made[0][0].id, 3)
     assert rig.bridges[-1].running
     drive()
 
@@ -259,7 +261,7 @@ def test_the_bridges_counters_feed_choice_and_report(rig):
 
 def test_what_the_service_needs_of_the_link_is_taken_over(rig, make_cloud):
     rig.ask()
-    cloud = make_cloud(rig.agent._control_loop.session)
+    cloud = make_cloud(rig.session)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=0.7),))
     for _ in range(200):
         rig.now += 0.01
@@ -279,7 +281,7 @@ def test_an_answer_of_the_orchestrator_widens_no_limit_of_the_robot(rig, orchest
     needs = SESSION.needs.model_copy(update={"max_rtt_ms": 1e9, "max_loss": 1.0})
     orchestrator.session = SESSION.model_copy(update={"needs": needs})
     rig.ask()
-    cloud = make_cloud(rig.agent._control_loop.session)
+    cloud = make_cloud(rig.session)
     rig.bridges[0].snapshot = SessionStats(True, (), (PathStats(0, None, rtt=1.2),))
     for _ in range(200):
         rig.now += 0.01
@@ -301,7 +303,7 @@ def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_fo
     rows = [t.model_copy(update={"period_ms": 10}) if t.name == "cmd_vel" else t for t in SESSION.topics]
     orchestrator.session = SESSION.model_copy(update={"topics": tuple(rows)})
     rig.ask()
-    cloud, sent = make_cloud(rig.agent._control_loop.session), 0
+    cloud, sent = make_cloud(rig.session), 0
     for _ in range(500):
         rig.now += 0.01
         for i in range(10):
@@ -319,23 +321,25 @@ def test_a_service_that_sends_ten_times_as_often_is_named_once_and_its_newest_fo
 
 def test_a_session_that_the_service_refuses_is_told(rig):
     rig.ask()
-    rig.agent._control_loop.session.notify(Refused("topic force: types differ"))
+    rig.session.notify(Refused("topic force: types differ"))
     assert rig.agent.status().trouble == "the service refused the session: topic force: types differ"
-    rig.agent._control_loop.session.notify(Connected(()))
+    rig.session.notify(Connected(()))
     assert rig.agent.status().trouble == ""
 
 
-def test_a_control_loop_that_dies_leaves_the_wheels_standing(rig, base):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_control_loop_that_dies_leaves_the_wheels_standing(base, orchestrator):
     def die():
-        if len(base.written) == 50:
+        if len(base.written) == 20:
             raise SystemExit
 
-    rig.agent._clock = count(50.0, 0.005).__next__
     base.on_read = die
-    with pytest.raises(SystemExit):
-        rig.agent._control()
-    assert base.written[-2][0] > 0
-    assert base.velocity == (0.0, 0.0)
+    with Agent(CONFIG, base, client=orchestrator):
+        (loop,) = (thread for thread in threading.enumerate() if thread.name == "agent_control")
+        loop.join(30)
+        assert len(base.written) == 21
+        assert base.written[-2][0] > 0
+        assert base.velocity == (0.0, 0.0)
 
 
 def test_closing_stands_the_wheels_whatever_the_loop_does(rig, base):

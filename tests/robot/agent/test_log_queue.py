@@ -87,7 +87,7 @@ def test_who_never_reads_is_left_behind(reader):
     lines.use()
     for _ in range(10):
         LOG.warning("unread")
-    thread = lines._thread
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "log")
     lines.done()
     assert reader.lines == []
     reader.reads.set()

@@ -1,14 +1,14 @@
 import json
 import socket
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 
 import httpx
 import pytest
 from typer.testing import CliRunner
 
-from skytether.api.rest import Placement
+from skytether.api.rest import Placement, Session
 from skytether.cli.app import app
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
@@ -25,28 +25,52 @@ CONFIG = AgentConfig(
 
 
 @pytest.fixture
-def agent(base, orchestrator):
-    agent = Agent(CONFIG, base, client=orchestrator, clock=lambda: 50.0)
+def agent(base, orchestrator, bridge):
+    """After a while: it has an instance and a bridge."""
+    orchestrator.placement = Placement(site="edge")
+    orchestrator.session = Session(id="00000000000000ab", key=orchestrator.KEY, host="10.0.0.1", port=4000)
+    topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
+    bridge.snapshot = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
+    agent = Agent(CONFIG, base, client=orchestrator, bridge=lambda *_: bridge, clock=lambda: 50.0)
+    agent.ask()
     for i in range(10):
         agent.tick(50.0 + i / 100)
+    agent.watch(50.1)
     return agent
 
 
 @pytest.fixture
-def busy(agent):
-    """After a while: an instance, a session, a decision."""
-    agent.ask()
-    agent._instance = agent._instance.model_copy(update={"placement": Placement(site="edge")})
-    topic = TopicStats("cmd_vel", "out", 127, delivered=40, delay_p50=0.02)
-    agent._stats = SessionStats(True, (topic,), (PathStats(0, None, rtt=0.04, mtu=1400),))
-    agent._totals.take(agent, agent._stats)
+def status(agent):
+    """That agent's, with a decision."""
     options = (Option("edge", {"delay": 0.3, "loss": 0.1}), Option("cloud", refused="answers no probe"))
-    agent._site_prober._decision = replace(agent._site_prober.decision, options=options, challenger=(options[0], 45.0))
-    return agent
+    status = agent.status()
+    return replace(status, decision=replace(status.decision, options=options, challenger=(options[0], 45.0)))
 
 
-def test_the_document_says_everything_in_plain_numbers(busy):
-    found = document("walker", "guide", busy.status(), 60.0)
+@pytest.fixture
+def serve(agent):
+    """Serves a status as the agent would; gives the port."""
+    with ExitStack() as servers:
+
+        def serve(status):
+            server = StatusServer(
+                0,
+                lambda: document("walker", "guide", status, 60.0),
+                lambda: metrics("walker", "guide", status, agent.report()),
+            )
+            servers.callback(server.close)
+            return server.port
+
+        yield serve
+
+
+@pytest.fixture
+def port(serve, status):
+    return serve(status)
+
+
+def test_the_document_says_everything_in_plain_numbers(status):
+    found = document("walker", "guide", status, 60.0)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert (found["source"], found["why"]) == ("fallback", "no command has come yet")
     assert found["instance"] == {"id": "i1", "state": "running", "site": "edge", "reason": ""}
@@ -57,32 +81,29 @@ def test_the_document_says_everything_in_plain_numbers(busy):
     assert "secret" not in json.dumps(found)
 
 
-def test_topics_stand_beside_what_became_of_their_messages(busy, monkeypatch):
+def test_topics_stand_beside_what_became_of_their_messages(status, serve):
     scan = TopicStats("scan", "in", 5, refused=3, offered=10, sent=8, delivered=5, superseded=1, lost=1)
     seen = (
         Followed("scan", "/scan", "sensor_msgs/msg/LaserScan", "from", ("/laser",), True, "best effort"),
         Followed("map", "/map", "nav_msgs/msg/OccupancyGrid", "from"),
         Followed("goal", "/goal", "x", "to", refused="another type hash"),
     )
-    status = replace(busy.status(), session=SessionStats(True, (scan,)), topics=seen, rates={("scan", "in"): 39.96})
+    status = replace(status, session=SessionStats(True, (scan,)), topics=seen, rates={("scan", "in"): 39.96})
     (first, *rest) = document("walker", "guide", status, 60.0)["topics"]
     counts = first["messages"]
     assert counts["published"] == counts["refused"] + counts["dropped"] + counts["sent"] == 13
     assert counts["sent"] == sum(counts[n] for n in ("delivered", "superseded", "lost", "unsettled"))
     assert (first["hz"], first["graph"]["nodes"], first["graph"]["quality"]) == (40.0, ["/laser"], "best effort")
     assert [(t["topic"], t["messages"]) for t in rest] == [("map", None), ("goal", None)]
-    monkeypatch.setattr(type(busy), "status", lambda _: status)
-    busy._serve()
-    shown = CliRunner().invoke(app, ["robot", "status", "--port", str(busy.status_port)], env={"COLUMNS": "200"})
-    busy.close()
+    shown = CliRunner().invoke(app, ["robot", "status", "--port", str(serve(status))], env={"COLUMNS": "200"})
     assert "/scan from /laser (best effort)" in shown.output
     assert "/map: nobody publishes it yet" in shown.output
     assert "not carried: another type hash" in shown.output
     assert "published = refused + dropped + sent" in shown.output
 
 
-def test_the_diagnostics_tell_control_service_and_session_apart(busy):
-    found = diagnostics("walker", "guide", "/walker/skytether", busy.status(), 60.5)
+def test_the_diagnostics_tell_control_service_and_session_apart(status):
+    found = diagnostics("walker", "guide", "/walker/skytether", status, 60.5)
     assert found["header"]["stamp"] == {"sec": 60, "nanosec": 500_000_000}
     assert [(s["name"], s["level"], s["message"]) for s in found["status"]] == [
         ("walker/skytether: control", Level.WARN, "driven by fallback: no command has come yet"),
@@ -91,12 +112,12 @@ def test_the_diagnostics_tell_control_service_and_session_apart(busy):
     ]
     values = {value["key"]: value["value"] for value in found["status"][1]["values"]}
     assert values == {"asked for": "guide", "instance": "i1", "site": "edge"}
-    asking = diagnostics("walker", "guide", "/s", replace(busy.status(), instance=None), 0.0)["status"][1]
+    asking = diagnostics("walker", "guide", "/s", replace(status, instance=None), 0.0)["status"][1]
     assert (asking["level"], asking["message"]) == (Level.WARN, "no instance")
 
 
-def test_metrics_are_those_of_the_report_and_the_robots_own(busy):
-    text = metrics("walker", "guide", busy.status(), busy.report()).decode()
+def test_metrics_are_those_of_the_report_and_the_robots_own(status, agent):
+    text = metrics("walker", "guide", status, agent.report()).decode()
     for line in (
         'skytether_control_source{robot="walker",service="guide",source="fallback"} 1.0',
         'skytether_fallback_transitions_total{reason="start",robot="walker",service="guide"} 1.0',
@@ -112,34 +133,25 @@ def test_metrics_are_those_of_the_report_and_the_robots_own(busy):
     ) in text
 
 
-@pytest.fixture
-def served(busy):
-    busy._serve()
-    yield busy
-    busy.close()
-    assert busy.status_port is None
-
-
-def test_both_are_served_on_loopback_and_nothing_else_is(served):
-    url = f"http://127.0.0.1:{served.status_port}"
+def test_both_are_served_on_loopback_and_nothing_else_is(port):
+    url = f"http://127.0.0.1:{port}"
     assert httpx.get(f"{url}/status").json()["robot"] == "walker"
     assert httpx.get(f"{url}/metrics?x=1").headers["content-type"].startswith("text/plain")
     assert httpx.get(f"{url}/token").status_code == 404
     assert httpx.post(f"{url}/status").status_code == 501
 
 
-def test_the_command_prints_tables_or_json(served):
-    port = str(served.status_port)
-    result = CliRunner().invoke(app, ["robot", "status", "--port", port, "--json"])
+def test_the_command_prints_tables_or_json(port):
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(port), "--json"])
     assert json.loads(result.stdout)["service"] == "guide"
-    result = CliRunner().invoke(app, ["robot", "status", "--port", port])
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(port)])
     assert result.exit_code == 0
 
 
-def test_what_a_service_said_last_is_shown_as_it_is_and_obeyed_by_nobody(served, monkeypatch):
+def test_what_a_service_said_last_is_shown_as_it_is_and_obeyed_by_nobody(status, serve):
     said = 'its last line: "[/x] [red]\x1b]0;title\x07"'
-    monkeypatch.setattr(served, "_instance", served._instance.model_copy(update={"reason": said}))
-    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    status = replace(status, instance=status.instance.model_copy(update={"reason": said}))
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(serve(status))])
     assert result.exit_code == 0
     assert "[/x] [red]\\x1b]0;title\\x07" in result.output
     assert "\x1b]" not in result.output
@@ -177,7 +189,7 @@ def test_who_asks_without_end_holds_up_neither_the_others_nor_the_end(capfd):
         again.start()
         threads.append(again)
         server.close()
-        assert not server._thread.is_alive()
+        assert not [thread for thread in threading.enumerate() if thread.name == "status"]
     finally:
         ended.set()
         for thread in threads:
@@ -185,10 +197,8 @@ def test_who_asks_without_end_holds_up_neither_the_others_nor_the_end(capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_more_connections_than_there_is_room_for_are_closed(monkeypatch):
-    for patience in ("_PATIENCE_S", "_Handler.timeout"):
-        monkeypatch.setattr(f"skytether.robot.agent.status.{patience}", 60.0)  # it is not this that ends them
-    server = StatusServer(0, dict, lambda: b"")
+def test_more_connections_than_there_is_room_for_are_closed():
+    server = StatusServer(0, dict, lambda: b"", patience_s=60.0)  # it is not this that ends them
     links = [socket.create_connection(("127.0.0.1", server.port), timeout=10) for _ in range(16)]
     for _ in range(24):
         with socket.create_connection(("127.0.0.1", server.port), timeout=10) as beyond:
@@ -208,36 +218,35 @@ def test_a_status_that_cannot_be_told_harms_nobody():
 
 
 def test_an_agent_whose_port_is_taken_answers_on_the_next_and_is_found_by_its_robot_s_name(
-    served, base, orchestrator, caplog
+    port, base, orchestrator, caplog
 ):
-    other = Agent(replace(CONFIG, robot="second", status_port=served.status_port), base, client=orchestrator)
-    other._serve()
-    try:
-        assert other.status_port in range(served.status_port + 1, served.status_port + 16)
-        assert f"the status of robot second is on port {other.status_port}" in caplog.text
-        port = str(served.status_port)
+    with Agent(replace(CONFIG, robot="second", status_port=port), base, client=orchestrator) as second:
+        found_at = second.status_port
+        assert found_at in range(port + 1, port + 16)
         for name in ("walker", "second"):
-            found = CliRunner().invoke(app, ["robot", "status", name, "--port", port, "--json"])
+            found = CliRunner().invoke(app, ["robot", "status", name, "--port", str(port), "--json"])
             assert json.loads(found.stdout)["robot"] == name
-        nobody = CliRunner().invoke(app, ["robot", "status", "third", "--port", port])
+        nobody = CliRunner().invoke(app, ["robot", "status", "third", "--port", str(port)])
         assert nobody.exit_code == 1
         assert "no agent of robot third answers" in " ".join(nobody.output.split())
-    finally:
-        other.close()
+    assert second.status_port is None
+    assert f"the status of robot second is on port {found_at}" in caplog.text
 
 
-def test_no_free_port_keeps_no_robot_from_driving(served, base, orchestrator, caplog, monkeypatch):
-    monkeypatch.setattr("skytether.robot.agent.status.PORTS", 1)
-    other = Agent(replace(CONFIG, status_port=served.status_port), base, client=orchestrator)
-    other._serve()
-    assert other.status_port is None
-    assert "no status on port" in caplog.text
+def test_no_free_port_keeps_no_robot_from_driving(base, orchestrator, caplog):
+    last = 65_535  # above it there is none to be tried
+    first = StatusServer(last, dict, lambda: b"")
+    with Agent(replace(CONFIG, status_port=last), base, client=orchestrator) as agent:
+        assert agent.status_port is None
+    first.close()
+    assert base.written
+    assert "no status on port 65535 of loopback" in caplog.text
 
 
-def test_in_a_pipe_no_row_is_broken_and_a_site_called_local_is_listed_once(served):
+def test_in_a_pipe_no_row_is_broken_and_a_site_called_local_is_listed_once(status, serve):
     options = (Option("local", {"delay": 0.3}), Option(None, refused="the fallback only stops, " * 6))
-    served._site_prober._decision = replace(served._site_prober.decision, options=options)
-    result = CliRunner().invoke(app, ["robot", "status", "--port", str(served.status_port)])
+    port = serve(replace(status, decision=replace(status.decision, options=options)))
+    result = CliRunner().invoke(app, ["robot", "status", "--port", str(port)])
     first = [line.split("│")[1].strip() for line in result.stdout.splitlines() if line.count("│") == 4]
     assert first.count("local") == 1
     assert "own controller" in first

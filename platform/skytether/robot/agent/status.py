@@ -33,7 +33,6 @@ PORTS = 16
 """Tried one after the other, the configured one first: there may be several robots on a machine."""
 _LOOPBACK = "127.0.0.1"
 _PATIENCE_S = 2.0
-"""For one request, from its first byte to the last of its answer."""
 _MOST = 16
 """Connections at a time, each of which has a thread; who comes on top is closed."""
 _ACCOUNT = ("published", "refused", "dropped", "sent", "delivered", "superseded", "lost", "unsettled")
@@ -115,8 +114,20 @@ class StatusServer:
         port: Where it listens on loopback.
     """
 
-    def __init__(self, port: int, status: Callable[[], dict[str, Any]], metrics: Callable[[], bytes]) -> None:
+    def __init__(
+        self,
+        port: int,
+        status: Callable[[], dict[str, Any]],
+        metrics: Callable[[], bytes],
+        patience_s: float = _PATIENCE_S,
+    ) -> None:
         """Bind and begin, at the first of `ports` that is free.
+
+        Args:
+            port: Where to begin to look for one.
+            status: What ``/status`` says.
+            metrics: What ``/metrics`` says.
+            patience_s: For one request, from its first byte to the last of its answer.
 
         Raises:
             OSError: None is.
@@ -128,8 +139,9 @@ class StatusServer:
 
         class Handler(_Handler):
             pages = answers
+            timeout = patience_s
 
-        self._server = _bound(port, Handler)
+        self._server = _bound(port, Handler, patience_s)
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="status", daemon=True)
         self._thread.start()
@@ -146,15 +158,15 @@ def ports(first: int) -> range:
     return range(first, min(first + PORTS, 65_536)) if first else range(1)
 
 
-def _bound(port: int, handler: type[_Handler]) -> _Server:
+def _bound(port: int, handler: type[_Handler], patience_s: float) -> _Server:
     *earlier, last = ports(port)
     for one in earlier:
         try:
-            return _Server((_LOOPBACK, one), handler)
+            return _Server((_LOOPBACK, one), handler, patience_s)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
-    return _Server((_LOOPBACK, last), handler)
+    return _Server((_LOOPBACK, last), handler, patience_s)
 
 
 class _Server(ThreadingMixIn, HTTPServer):
@@ -163,7 +175,8 @@ class _Server(ThreadingMixIn, HTTPServer):
     request_queue_size = _MOST
     """Come at once, too: of five, which is the default, the sixth had to knock again, a second later."""
 
-    def __init__(self, address: tuple[str, int], handler: type[_Handler]) -> None:
+    def __init__(self, address: tuple[str, int], handler: type[_Handler], patience_s: float) -> None:
+        self._patience_s = patience_s
         self._since: dict[Any, float] = {}
         self.telling = threading.Lock()
         super().__init__(address, handler)
@@ -181,7 +194,7 @@ class _Server(ThreadingMixIn, HTTPServer):
 
     def service_actions(self) -> None:
         """Ten times a second: end whoever takes longer, one byte after the other, say."""
-        latest = time.monotonic() - _PATIENCE_S
+        latest = time.monotonic() - self._patience_s
         for request, since in self._since.copy().items():
             if since < latest:
                 with suppress(OSError):  # it has gone by itself
