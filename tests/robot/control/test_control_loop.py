@@ -39,11 +39,12 @@ class Rig:
         self.now = 100.0
         self.driver = ControlLoop(base, fallback or Admittance(), limits or Limits(), Needs(), self.now, observer)
         self._make_cloud = cloud
-        self._epochs = count(1)
+        self.epochs = count(1)
+        """Numbers of handshakes, of all sessions."""
         self.cloud = None
 
     def connect(self, bridge):
-        session = LiveSession("1", frozenset({"force"}), "cmd_vel", self._epochs)
+        session = LiveSession("1", frozenset({"force"}), "cmd_vel", self.epochs)
         session.open(lambda port: bridge, ("127.0.0.1", 1))
         self.cloud = self._make_cloud(session)
         self.driver.session = session
@@ -104,7 +105,7 @@ def test_a_change_of_session_loses_no_command_that_came_before_it(base, bridge, 
     rig = Rig(base, make_cloud, observer=lambda command, objection: seen.append((command.linear, objection)))
     rig.connect(bridge)
     assert rig.run(1.5, linear=0.2).source is Source.CLOUD
-    other = LiveSession("2", frozenset(), "cmd_vel", rig._epochs)
+    other = LiveSession("2", frozenset(), "cmd_vel", rig.epochs)
     rig.driver.offer(other)
     rig.run(0.05, linear=0.2)
     seen.clear()

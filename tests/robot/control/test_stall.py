@@ -25,13 +25,18 @@ class Robot:
     def __init__(self, base, bridge, make_cloud):
         self.base = base
         self.now, self.boot = 100.0, 5000.0
-        self.driver = ControlLoop(base, Admittance(), LIMITS, Needs(), self.now, None, lambda: (self.now, self.boot))
+        self.stopped = 0.0
+        """How long it is stopped after each begin of a tick, before it writes [s]."""
+        self.driver = ControlLoop(base, Admittance(), LIMITS, Needs(), self.now, None, self.clocks)
         session = LiveSession("1", frozenset({"force"}), "cmd_vel", count(1))
         session.open(lambda port: bridge, ("127.0.0.1", 1))
         self.bridge = bridge
         self.cloud = make_cloud(session)
         self.driver.session = session
         self.speed = 0.2
+
+    def clocks(self):
+        return self.now + self.stopped, self.boot + self.stopped
 
     def tick(self, gap=TICK, slept=0.0):
         self.now += gap
@@ -90,7 +95,7 @@ def test_who_is_stopped_before_writing_writes_a_standstill_that_nobody_wants(rob
     robot.speed = robot.base.push = 0.0
     robot.run(1.0)
     assert robot.base.why[-1]
-    robot.driver._clocks = lambda: (robot.now + 1.0, robot.boot + 1.0)
+    robot.stopped = 1.0
     robot.tick()
     assert robot.told[-1] == 0.0
     assert not robot.base.why[-1]

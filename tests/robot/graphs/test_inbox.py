@@ -98,11 +98,11 @@ def test_presses_from_many_threads_are_all_seen():
     threads = [threading.Thread(target=press) for _ in range(4)]
     for thread in threads:
         thread.start()
-    seen = 0
+    seen = []
     while any(thread.is_alive() for thread in threads):
-        seen += len(box.inbox.take_stops())
-    seen += len(box.inbox.take_stops())
+        seen.append(len(box.inbox.take_stops()))
     for thread in threads:
         thread.join()
-    assert seen >= 1
-    assert all(len(kept) <= 2 for kept in box.inbox._stops.values())
+    seen.append(len(box.inbox.take_stops()))
+    assert sum(seen) >= 1
+    assert max(seen) <= 2, "of a topic its last press, and its last word"

@@ -47,5 +47,8 @@ def test_a_name_server_that_does_not_answer_is_not_waited_for_but_its_late_answe
             resolver.address(f"{i}.example", 1)
     assert len(asked) == 8
     answer.set()
-    resolver._timeout = 30
+    for thread in threading.enumerate():
+        if thread.name == "resolver":
+            thread.join(30)
     assert resolver.address("service.example", 1) == ("192.0.2.1", 1)
+    assert asked.count("service.example") == 1, "the late answer was there"

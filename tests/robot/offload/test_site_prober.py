@@ -86,7 +86,8 @@ def test_an_orchestrator_that_is_away_changes_nothing_and_is_asked_again(rig):
 
 def test_it_moves_when_the_link_to_where_it_is_has_been_bad(rig, orchestrator):
     rig.look(5)
-    here = orchestrator._answer("get", "i1", "i1").model_copy(update={"id": "i1", "placement": Placement(site="edge")})
+    orchestrator.placement = Placement(site="edge")
+    here = orchestrator.get_instance("i1")
     rig.tasks.placed(here)
     rig.tasks.live(PathQuality(0.5, 0.0, 0.0))
     assert rig.look(3).site == "edge"
@@ -101,8 +102,9 @@ def test_it_moves_when_the_link_to_where_it_is_has_been_bad(rig, orchestrator):
 
 def test_what_placement_refused_is_not_asked_for_again_at_once(rig, orchestrator):
     rig.look(5)
-    refused = Placement(site="cloud", refused=(Refusal(site="edge", reason="cpu", detail="needs 1 core"),))
-    rig.tasks.placed(orchestrator._answer("get", "i1", "i1").model_copy(update={"id": "i1", "placement": refused}))
+    refused = (Refusal(site="edge", reason="cpu", detail="needs 1 core"),)
+    orchestrator.placement = Placement(site="cloud", refused=refused)
+    rig.tasks.placed(orchestrator.get_instance("i1"))
     assert rig.look(30).site == "cloud"
     assert rig.look(60).site == "edge"
 
@@ -128,7 +130,7 @@ def test_the_systems_battery_is_known_or_not():
 
 def test_a_move_by_the_orchestrator_is_not_contradicted(rig, orchestrator):
     rig.look(5)
-    here = orchestrator._answer("get", "i1", "i1").model_copy(update={"placement": Placement(site="edge")})
-    rig.tasks.placed(here)
-    rig.tasks.placed(here.model_copy(update={"placement": Placement(site="cloud")}))
+    for site in ("edge", "cloud"):
+        orchestrator.placement = Placement(site=site)
+        rig.tasks.placed(orchestrator.get_instance("i1"))
     assert rig.tasks.decision.site == "cloud"
