@@ -133,7 +133,8 @@ class Ros1Graph:
         process.send_signal(number)
         return process.wait(WAIT_S)
 
-    def _running(self) -> list[psutil.Process]:
+    def processes(self) -> list[psutil.Process]:
+        """All that live of what was started here, with what they started."""
         home = str(self.folder)
         return [
             process
@@ -145,7 +146,7 @@ class Ros1Graph:
     def close(self) -> None:
         """End everything that was started here, with all that it started."""
         # Nodes that roscore and roslaunch start lead sessions of their own: all have our folder in their environment.
-        while left := self._running():
+        while left := self.processes():
             for found in left:
                 with contextlib.suppress(psutil.Error):
                     found.kill()

@@ -64,7 +64,7 @@ def test_zones_and_state_are_seen_by_a_node_of_the_robot(graph, walker, tmp_path
     wait_for(lambda: (found := newest()) and "/scan" in found[2][-1][-1], "the blind laser to be seen")
     # The process that draws is killed: the robot's gate goes on, and it comes again.
     before = ask(folder, {"do": "status"}, 30)
-    (display,) = [p for p in graph._running() if "skytether.robot.safety.display.process" in p.cmdline()]
+    (display,) = [p for p in graph.processes() if "skytether.robot.safety.display.process" in p.cmdline()]
     display.send_signal(signal.SIGKILL)
     wait_for(lambda: "display ended" in (tmp_path / "gate.log").read_text(), "its end to be named")
     count = len(heard.read_text().splitlines())

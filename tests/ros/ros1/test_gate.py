@@ -15,6 +15,7 @@ from skytether.messages import Bool, Joy, LaserScan, Twist, decode, encode, type
 from skytether.robot.graphs.ros1.gate_io import Ros1Wheels
 from skytether.robot.graphs.ros1.kind import Ros1Way
 from skytether.robot.safety.client import GateError, ask
+from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
@@ -116,14 +117,16 @@ def test_the_wheels_of_a_ros_1_robot_are_behind_the_gate(graph, gated, walker, t
     assert "Traceback" not in (tmp_path / "gate.log").read_text()
 
 
-def test_a_velocity_that_waits_in_a_writer_that_stands_still_is_never_told(graph, walker):
+def test_a_velocity_that_waits_in_a_writer_that_stands_still_is_never_told(graph, walker, monkeypatch):
     """It stands between two threads: the velocity is handed over, and not sent yet."""
+    nodes, start = [], Node.start
+    monkeypatch.setattr(Node, "start", lambda node: (nodes.append(node), start(node)))
     wheels = Ros1Wheels(Ros1Way(master=graph.uri, cmd_vel="/told"), "guard", 0.1)
     told = []
     listener = Listener(lambda data, _: told.append(decode(Twist, data, "ros1").linear.x))
     walker.node.subscribe("/told", Twist.TYPE, type_hash(Twist, "ros1"), listener)
     wait_for(wheels.listeners, "the wheels to listen")
-    wheels._node.soon(lambda: time.sleep(0.5))
+    nodes[0].soon(lambda: time.sleep(0.5))
     wheels.write(Velocity(0.5, 0.0))
     time.sleep(0.6)
     wait_for(lambda: wheels.write(Velocity(0.1, 0.0)) or told, "a velocity")

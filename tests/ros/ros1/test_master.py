@@ -8,8 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from skytether.ros.ros1 import master
-from skytether.ros.ros1.master import Master, MasterError, call
+from skytether.ros.ros1.master import LARGEST, Master, MasterError, call
 from skytether.ros.ros1.registry import Registry
 
 XML = "<methodResponse><params><param>{}</param></params></methodResponse>"
@@ -120,11 +119,10 @@ def test_an_answer_that_dribbles_ends_in_time(begun):
         assert time.monotonic() - since < 10
 
 
-def test_an_answer_without_end_is_not_kept(monkeypatch):
-    monkeypatch.setattr(master._Bounded, "room", 100_000)
+def test_an_answer_without_end_is_not_kept():
     with (
-        answering(b"HTTP/1.1 200 OK\r\n\r\n<methodResponse>", b" " * 50_000, pause_s=0.001) as uri,
-        pytest.raises(MasterError, match="bytes"),
+        answering(b"HTTP/1.1 200 OK\r\n\r\n<methodResponse>", b" " * (LARGEST // 4), pause_s=0.001) as uri,
+        pytest.raises(MasterError, match=f"more than {LARGEST} bytes"),
     ):
         call(uri, "getUri", "/me")
 

@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import zenoh
+
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName, RmwZenoh
 from skytether.ros.ros2.graph import Graph, learned_hash, mismatches
 from skytether.ros.ros2.node import Ros2Node
@@ -54,16 +56,60 @@ def test_a_hash_is_learned_from_the_other_side_only():
     assert learned_hash(OURS, [other(kind=Kind.SUBSCRIPTION), other(type="x/msg/Y"), other(type_hash="")]) == ""
 
 
-def test_an_answer_that_took_too_long_is_no_graph_without_anybody():
+class Session:
+    """Of a router that tells of the graph as the test says, and can be asked no oftener."""
+
+    def __init__(self, *answers):
+        self.answers = list(answers)
+        self.waited = []
+        self.info = SimpleNamespace(routers_zid=lambda: ["router"], peers_zid=list)
+
+    def zid(self):
+        return "ours"
+
+    def liveliness(self):
+        return self
+
+    def declare_token(self, token):
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def declare_subscriber(self, *_, **options):
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def get(self, _, timeout):
+        self.waited.append(timeout)
+        return self.answers.pop(0)
+
+    def close(self):
+        pass
+
+
+def reply(number, name):
+    token = RmwZenoh(0).token("theirs", number, NodeName("/", name), other(node=f"/{name}"))
+    return SimpleNamespace(ok=SimpleNamespace(key_expr=token))
+
+
+def test_an_answer_that_took_too_long_is_no_graph_without_anybody(monkeypatch):
     """Zenoh tells it by a reply that is an error, beside those that came in time."""
     said = []
     node = Ros2Node(RmwZenoh(0), router="tcp/127.0.0.1:1", say=said.append)
-    first, second = (SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in ("a", "b"))
-    answers = [[first, SimpleNamespace(ok=None)], [first, second], []]
-    live = SimpleNamespace(get=lambda _, timeout: answers.pop(0))
-    session = SimpleNamespace(liveliness=lambda: live)
-    assert not node._look_at_all(session, 2.0)
+    first, second = reply(1, "talker"), reply(2, "singer")
+    session = Session([first, SimpleNamespace(ok=None)], [first, second])
+    monkeypatch.setattr(zenoh, "open", lambda config: session)
+    node.start()
+    assert node.wait_until_joined(30)
+    assert {endpoint.node for endpoint in node.endpoints()} == {"/talker", "/singer"}
+    node.close()
     assert "does not tell of all the graph within 2 s" in said[0]
-    assert node._look_at_all(session, 4.0)
-    assert {key for key, _ in node._changes} == {"a", "b"}
-    assert node._look_at_all(session, 2.0), "nobody is there"
+    assert session.waited == [2.0, 4.0]
+
+
+def test_who_is_alone_has_joined_at_once(monkeypatch):
+    node = Ros2Node(RmwZenoh(0), router="tcp/127.0.0.1:1")
+    session = Session([])
+    monkeypatch.setattr(zenoh, "open", lambda config: session)
+    node.start()
+    assert node.wait_until_joined(30)
+    assert node.endpoints() == []
+    node.close()
+    assert session.waited == [2.0]

@@ -5,6 +5,7 @@ import threading
 import time
 
 import pytest
+import zenoh
 from ros2_graph import Router, Stage
 
 from skytether.bridge.calls import CallError
@@ -135,13 +136,12 @@ def test_we_as_late_joiner_get_their_latched_messages(stage):
 def test_who_has_joined_knows_the_graph_on_a_busy_machine_too(stage, monkeypatch):
     """The router tells the graph to the subscription, and then nothing new in its answer."""
     stage.rmw("talker").publisher("/chatter", DDS_STRING, RIHS_STRING)
-    at_once = Ros2Node._on_token
+    at_once = zenoh.handlers.Callback
 
-    def late(node, sample):
-        time.sleep(0.2)
-        at_once(node, sample)
+    def late(told, **options):
+        return at_once(lambda sample: (time.sleep(0.2), told(sample)), **options)
 
-    monkeypatch.setattr(Ros2Node, "_on_token", late)
+    monkeypatch.setattr(zenoh.handlers, "Callback", late)
     node = stage.ours()
     assert node.wait_until_joined(30)
     assert [e.node for e in node.endpoints("/chatter", Kind.PUBLISHER)] == ["/talker"]
