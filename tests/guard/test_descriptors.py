@@ -93,6 +93,14 @@ def reading(topic, message):
     return topic.encode() + b"\0" + encode(message, "cdr")
 
 
+def find(inode):
+    """The descriptors of this process that are of this file."""
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # the one of the folder itself is gone by now
+            if os.stat(f"/proc/self/fd/{name}").st_ino == inode:
+                yield int(name)
+
+
 def open_files():
     return len(os.listdir("/proc/self/fd"))
 
@@ -203,21 +211,20 @@ def test_where_there_is_no_room_for_descriptors_the_socket_is_silent(monkeypatch
     own.close()
 
 
-def test_too_many_that_wait_to_be_closed_leave_the_socket_silent(monkeypatch, tmp_path):
-    closer = descriptors.Closer()
-    monkeypatch.setattr(closer, "_run", lambda: None)
-    monkeypatch.setattr(descriptors, "_CLOSER", closer)
-    monkeypatch.setattr(descriptors, "_MOST_WAITING", 1)
+def test_too_many_that_wait_to_be_closed_leave_the_socket_silent(monkeypatch, lingering, tmp_path):
+    monkeypatch.setattr(descriptors, "_CLOSER", descriptors.Closer(most=2))
     monkeypatch.setattr(descriptors, "REFUSED", False)
     monkeypatch.setattr(descriptors, "_SO_PASSRIGHTS", 9999)
     own = bind(str(tmp_path / "s"))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-        for data in (b"a", b"b"):
-            send(sender, data, socket.socket(), to=str(tmp_path / "s"))
+        behind = socket.socket()
+        known = os.fstat(behind.fileno()).st_ino
+        for data, file in ((b"a", lingering()), (b"b", behind), (b"c", socket.socket())):
+            send(sender, data, file, to=str(tmp_path / "s"))
         assert descriptors.receive(own, 100)[0] == b"a"
+        assert descriptors.receive(own, 100)[0] == b"b"
         with pytest.raises(BlockingIOError):
             descriptors.receive(own, 100)
-        (held,) = closer._waiting
-        assert fcntl.fcntl(held, fcntl.F_GETFD) & fcntl.FD_CLOEXEC
-        os.close(held)
+        (held,) = find(known)
+        assert fcntl.fcntl(held, fcntl.F_GETFD) & fcntl.FD_CLOEXEC, "no program that is started meanwhile gets it"
     own.close()

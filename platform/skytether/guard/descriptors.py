@@ -48,9 +48,14 @@ REFUSED = _refused()
 
 
 class Closer:
-    """Closes descriptors in a thread of its own, which may wait as long as it likes."""
+    """Closes descriptors in a thread of its own, which may wait as long as it likes.
 
-    def __init__(self) -> None:
+    Args:
+        most: How many wait for the thread, the one that it closes among them.
+    """
+
+    def __init__(self, most: int = _MOST_WAITING) -> None:
+        self._most = most
         self._waiting: deque[int] = deque()
         self._there = threading.Semaphore(0)
         self._started = False
@@ -63,7 +68,7 @@ class Closer:
             except (RuntimeError, MemoryError):
                 return False
             self._started = True
-        return len(self._waiting) < _MOST_WAITING
+        return len(self._waiting) < self._most
 
     def close(self, descriptors: list[int]) -> None:
         """Have them closed. Returns at once."""
