@@ -42,9 +42,15 @@ class Engine:
         self.container: dict[str, Any] = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": []}
         self.links: set[str] = set()
         """In its images."""
+        self.pipes: set[str] = set()
+        """In its images."""
         self.volumes: list[dict[str, Any]] = []
         self.emptied = False
         """What is made there is removed at once by somebody."""
+        self.networks: dict[str, dict[str, str]] = {}
+        """Labels by name."""
+        self.file = b""
+        """What is in its containers."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
         engine = self
@@ -66,9 +72,18 @@ class Engine:
                     said = {"RepoDigests": engine.digests}
                 text = json.dumps(said).encode()
                 missing = self.path.startswith("/images/new") or (engine.emptied and self.command in ("HEAD", "DELETE"))
+                if self.path.startswith("/networks?"):
+                    text = json.dumps([{"Name": name} for name in engine.networks]).encode()
+                if engine.networks and self.command == "GET" and (name := self.path.partition("/networks/")[2]):
+                    missing, text = (
+                        name not in engine.networks,
+                        json.dumps({"Labels": engine.networks.get(name)}).encode(),
+                    )
+                if self.command == "GET" and "/archive" in self.path:
+                    text = engine.file
                 self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
-                stat = {"mode": 1 << 27 if asked in engine.links else 0}
+                stat = {"mode": 1 << 27 if asked in engine.links else 1 << 25 if asked in engine.pipes else 0o644}
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
                 self.send_header("Content-Length", str(len(text)))
                 self.end_headers()
@@ -180,6 +195,109 @@ def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: s
     assert [line for line in engine.lines if line.startswith("POST")] == [f"POST {path}"]
     assert not got
     assert "content-type" not in {name.lower() for name in headers}
+
+
+def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -> None:
+    """While it waits for the rest of one nobody can end that container, whoever it is."""
+
+    async def run() -> None:
+        gate, engine_s = EngineGate(engine.path), AsyncMock(asyncio.StreamWriter, write=Mock())
+        reader = asyncio.StreamReader()
+        sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", b"a" * 60_000)
+        reader.feed_data(sent[:-1])
+        way = asyncio.create_task(gate.pass_requests((reader, engine_s), (reader, engine_s)))
+        while reader._buffer:  # type: ignore[attr-defined]  # noqa: SLF001 asyncio's own
+            await asyncio.sleep(0)
+            if reader._waiter is not None:  # type: ignore[attr-defined]  # noqa: SLF001
+                break
+        engine_s.write.assert_not_called()
+        reader.feed_data(sent[-1:])
+        reader.feed_eof()
+        await way
+        assert engine_s.write.call_args.args[0].endswith(b"a" * 60_000)
+
+    asyncio.run(run())
+
+
+def test_of_a_file_no_more_is_fetched_than_reports_have(engine: Engine) -> None:
+    """An engine that waits until somebody takes the rest of it lets nobody end the container."""
+    asked = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    engine.file = bytes(range(256)) * 40
+    assert say(engine, asked).endswith(engine.file)
+    engine.file = bytes(1 << 20)
+    assert b"larger than those that a site asks for" in say(engine, asked)
+
+
+def test_orchestrators_make_some_networks_and_not_all_that_an_engine_has_room_for(engine: Engine) -> None:
+    """Its owner could make none any more, and what this machine knows by these addresses elsewhere is out of reach."""
+    options = {"com.docker.network.bridge.name": "skt-0123456789"}
+    made = {"Name": "skytether-n", "CheckDuplicate": True, "Driver": "bridge", "Options": options}
+    body = json.dumps({**made, "Labels": {"skytether.io/network": "filtered"}}).encode()
+    engine.networks = {f"skytether-{number}": {} for number in range(11)}
+    assert b"200 OK" in say(engine, request("POST /v1.41/networks/create", body))
+    assert json.loads(engine.asked[-1][2])["Name"] == "skytether-n"
+    engine.networks["skytether-11"] = {}
+    assert b"as many as they may" in say(engine, request("POST /v1.41/networks/create", body))
+    assert len([line for line in engine.lines if line.startswith("POST")]) == 1
+
+
+@pytest.mark.parametrize(
+    ("networks", "good", "says"),
+    [
+        ({"lab": {"skytether.io/open": "yes"}}, True, b""),
+        ({"lab": {}}, False, b"lab is not of an orchestrator"),  # it was open as the container was made
+        ({"lab": None}, False, b"lab is not of an orchestrator"),
+        ({"another": {}}, False, b'{"message": "network lab not found"}'),  # as an engine says it
+    ],
+)
+@pytest.mark.parametrize(
+    "container",
+    [
+        {"HostConfig": {"NetworkMode": "lab", "ReadonlyRootfs": True}, "NetworkSettings": {"Networks": {}}},
+        {
+            "HostConfig": {"NetworkMode": f"container:{ID}", "ReadonlyRootfs": True},
+            "NetworkSettings": {"Networks": {"lab": {}}},
+        },
+    ],
+)
+def test_a_container_starts_in_networks_that_are_open_to_it_still(
+    engine: Engine, networks: dict[str, Any], container: dict[str, Any], good: bool, says: bytes
+) -> None:
+    """It is connected by their names: who closed a network by making it anew would find it in there."""
+    engine.networks, engine.container = networks, {**container, "Mounts": []}
+    got = say(engine, request(f"POST /v1.41/containers/{ID}/start"))
+    assert (b"200 OK" in got) is good
+    assert says in got
+    assert any(line.endswith("/start") for line in engine.lines) is good
+
+
+def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Engine) -> None:
+    """The kernel's files are hidden by what is in its /dev, and its volumes are mounted while others may use them."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    host = {"NetworkMode": "skytether", "ReadonlyRootfs": True}
+    start = request(f"POST /v1.41/containers/{ID}/start")
+    for mounts, more, says in (
+        ([volume("/d", "skytether-d")], {}, b"200 OK"),
+        ([volume("/dev", "skytether-d")], {}, b"/dev is the kernel's"),
+        ([volume("/sys/fs")], {}, b"/sys/fs is the kernel's"),
+        ([volume("/d", "skytether-d")], {"Tmpfs": {"/dev//x": ""}}, b"/dev/x is the kernel's"),
+        ([volume("/d", "skytether-d")], {"Tmpfs": {"/d/x/": ""}}, b"/d/x is in /d, where things can be moved"),
+        ([volume("/d", "skytether-d")], {"Tmpfs": {"/lib/x": ""}}, b"/lib is a link in its image"),
+    ):
+        engine.container, engine.links = {"HostConfig": {**host, **more}, "Mounts": mounts}, {"/lib"}
+        assert says in say(engine, start)
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "/etc/group"])
+def test_no_engine_waits_for_ever_for_what_an_image_says_of_users(engine: Engine, path: str) -> None:
+    """It reads that as it starts a container, which nobody ends then: of a pipe it waits, of a device it takes all."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    engine.container = {"HostConfig": {"NetworkMode": "skytether", "ReadonlyRootfs": True}}
+    start = request(f"POST /v1.41/containers/{ID}/start")
+    engine.pipes = {path, "/run/pipe"}
+    assert f"{path} is a link in its image, or no file".encode() in say(engine, start)
+    engine.pipes = {"/run"}
+    assert b"200 OK" in say(engine, start)
 
 
 @pytest.mark.parametrize("tag", ["1", f"sha256:{ID}"])
@@ -331,7 +449,9 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
         (request(f"POST /containers/{OTHER}/kill"), b"is not of an orchestrator"),
         (request(f"POST /containers/{ID[:12]}/kill"), b"nothing that a site needs"),
         (request("GET /containers/database/json"), b"nothing that a site needs"),
-        (request("DELETE /networks/bridge"), b"bridge is not of an orchestrator"),
+        (request("DELETE /networks/bridge"), b"nothing that a site needs"),
+        (request("DELETE /networks/skytether-b"), b"skytether-b is not of an orchestrator"),
+        (request("DELETE /volumes/skytether-b"), b"skytether-b is not of an orchestrator"),
         (request(f"PUT /containers/%65{OTHER[1:]}/archive?path=/run/skytether", b"tar"), b"is not of an orchestrator"),
         (request("POST /containers/create", CREATED % b"bridge"), b"bridge is not of an orchestrator"),
         (request("POST /containers/create", CREATED % b"0123456789ab"), b"its network is"),

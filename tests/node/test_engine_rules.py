@@ -209,6 +209,8 @@ HOST: dict[str, Any] = {
         ({"DeviceRequests": [gpu()]}, "by `site join --device /dev/nvidia0`"),
         ({"DeviceRequests": [{**gpu("0"), "Capabilities": [["gpu", "display"]]}]}, "odd devices"),
         ({"LogConfig": {"Type": "syslog"}}, "its log goes elsewhere"),
+        # To an engine whose own kind of log goes elsewhere, it says where to.
+        ({"LogConfig": {"Config": {"syslog-address": "udp://127.0.0.1:53"}}}, "its log goes elsewhere"),
         ({"NetworkMode": None}, "its network is ''"),  # and not the network of that name
         ({"ReadonlyRootfs": False}, "it may change its own files"),
         ({"ReadonlyRootfs": None}, "it may change its own files"),
@@ -264,6 +266,9 @@ def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any]
         ),
         ("POST", "/networks/n/connect", {"Container": ID, "EndpointConfig": {"Aliases": ["database"]}}, {}),
         ("GET", "/networks/0123456789ab", None, {}),  # the beginning of an id
+        # Who makes one by that name would find it gone, if it was not there yet as we looked.
+        ("DELETE", "/networks/database", None, {}),
+        ("DELETE", "/volumes/database", None, {}),
         # Of 1.23 a start takes what a container is made of.
         ("POST", f"/v1.23/containers/{ID}/start", None, {}),
         ("POST", f"/v1.40/containers/{ID}/start", None, {}),
@@ -292,7 +297,7 @@ def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are()
     )
     made["HostConfig"] = HOST
     assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
-    assert judge(Call("DELETE", "/networks/n", {}, None)) == (None, (("networks", "n"),))
+    assert judge(Call("DELETE", "/networks/skytether-n", {}, None)) == (None, (("networks", "skytether-n"),))
     assert judge(Call("PUT", f"/containers/{ID}/archive", {"path": "/run/skytether"}, None)) == (
         None,
         (("containers", ID),),
@@ -340,6 +345,7 @@ NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ
         (allowed("unshare", includes={"caps": ["CAP_SYS_ADMIN"]}), True),
         ({"names": ["clone3", "mount"], "action": "SCMP_ACT_ERRNO", "errnoRet": 38}, True),
         (allowed("read", "unshare"), False),
+        (allowed("read", "io_uring_setup"), False),
         ({"name": "mount", "action": "SCMP_ACT_ALLOW"}, False),
         (allowed("unshare", includes={"caps": ["CAP_NET_ADMIN"]}), False),
         (allowed("unshare", includes={"arches": ["amd64"]}), False),

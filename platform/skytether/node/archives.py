@@ -1,4 +1,4 @@
-"""Whether an engine may look into a container's files while that runs.
+"""Whether an engine may look into a container's files while that runs, and start it beside others.
 
 For that, engines mount its volumes at the paths of its files, from the outside: look whether there is a link on the
 way, then mount. Whoever can move a folder on that way in between has his volume mounted anywhere on the machine. So
@@ -23,10 +23,14 @@ from .machine import ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
+_KERNEL = re.compile(r"/(?:dev|proc|sys)(?:/.*)?", re.DOTALL)
+"""What an engine mounts in each container beside, and holds it by."""
 _ANONYMOUS = "[0-9a-f]{64}"
 _STAT = "x-docker-container-path-stat"
-_LINK = 1 << 27
-"""Go's bit in a file's mode."""
+_LINK, _NO_FILE = 1 << 27, 1 << 19
+"""Go's bits in a file's mode: of a link, and the lowest of those that say that it is none."""
+_USERS = {"/etc/passwd", "/etc/group"}
+"""An engine reads them as it starts a container: of a pipe it waits for ever, of a device it takes all that comes."""
 _KNOWN = 4096
 
 
@@ -38,7 +42,9 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
     if (inspected.get("HostConfig") or {}).get("ReadonlyRootfs") is not True:
         return "it may change its own files"
     mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
-    for path in (*mounts, *_FILES):
+    for path in (*mounts, *_FILES, *_in_memory(inspected)):
+        if _KERNEL.fullmatch(path):
+            return f"{path} is the kernel's"
         for above, mount in mounts.items():
             below = path.startswith(f"{above.rstrip('/')}/")
             own = mount.get("Type") == "volume" and re.fullmatch(_ANONYMOUS, str(mount.get("Name")))
@@ -47,14 +53,20 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _in_memory(inspected: Mapping[str, Any]) -> list[str]:
+    paths = (inspected.get("HostConfig") or {}).get("Tmpfs") or ()
+    return [posixpath.normpath(f"/{path.strip('/')}") for path in paths]
+
+
 def ways(inspected: Mapping[str, Any]) -> set[str]:
     """All folders and files that must be no links, in the image of a container."""
-    ends = [PurePosixPath(path) for path in (*(str(one["Destination"]) for one in inspected["Mounts"]), *_FILES)]
-    return {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
+    mounts = (str(one["Destination"]) for one in inspected.get("Mounts") or ())
+    ends = [PurePosixPath(path) for path in (*mounts, *_FILES, *_in_memory(inspected))]
+    return _USERS | {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
 
 
 class Images:
-    """Knows of images which paths in there are no links. Asks one thing at a time, and waits for it."""
+    """Knows of images what is at paths in there. Asks one thing at a time, and waits for it."""
 
     def __init__(self, engine: str) -> None:
         """``engine``: path of its socket."""
@@ -62,8 +74,8 @@ class Images:
         self._name = f"skytether-look-{secrets.token_hex(4)}"
         self._known: dict[tuple[str, str], bool] = {}
 
-    def link(self, image: str, paths: Iterable[str]) -> str | None:
-        """One of these paths that is a link in an image; None: none is.
+    def odd(self, image: str, paths: Iterable[str]) -> str | None:
+        """One of these paths that is a link in an image, or no file where there must be one; None: none is.
 
         A container is made of it, and never started: nothing moves there.
 
@@ -75,7 +87,7 @@ class Images:
         if new := [path for path in wanted if (image, path) not in self._known]:
             found = self._look(image, new)
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
-            return next((path for path in new if found[image, path]), None) or self.link(image, set(wanted) - set(new))
+            return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
         return next((path for path in wanted if self._known[image, path]), None)
 
     def _look(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
@@ -96,7 +108,7 @@ class Images:
             raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
         container = json.loads(made.content)["Id"]
         try:
-            found = {(image, path): self._is_link(container, path) for path in paths}
+            found = {(image, path): self._is_odd(container, path) for path in paths}
         except BaseException:
             self._remove(container)
             raise
@@ -109,10 +121,12 @@ class Images:
             ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE").status < HTTPStatus.BAD_REQUEST
         )
 
-    def _is_link(self, container: str, path: str) -> bool:
+    def _is_odd(self, container: str, path: str) -> bool:
         answer = ask(self._engine, f"/containers/{container}/archive?{urlencode({'path': path})}", method="HEAD")
         if answer.status == HTTPStatus.NOT_FOUND:
             return False
         if answer.status != HTTPStatus.OK:
             raise ValueError(f"its engine says {answer.status} to {path}")
-        return bool(json.loads(base64.b64decode(answer.headers[_STAT]))["mode"] & _LINK)
+        return bool(
+            json.loads(base64.b64decode(answer.headers[_STAT]))["mode"] & (_LINK if path not in _USERS else -_NO_FILE)
+        )

@@ -12,16 +12,18 @@ import json
 import logging
 import re
 import time
+from collections.abc import Awaitable
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl, unquote, urlencode
 
 from skytether.api.printable import printable
-from skytether.api.splice import PIECE, Stream
+from skytether.api.service_report import MOST_BYTES
+from skytether.api.splice import Stream
 
 from .archives import Images, moved, ways
-from .engine_rules import NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
-from .machine import ask, ask_json
+from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
+from .machine import Answer, ask
 from .registries import Registries
 
 log = logging.getLogger(__name__)
@@ -30,8 +32,10 @@ _LINE = re.compile(rb"([A-Z]{3,7}) (/[!-~]{0,8000}) HTTP/1\.1")
 _PASSED = (b"accept", b"x-registry-auth")
 """Headers that the engine gets as they are. The type of what is sent is told by us: an engine reads a form, too, and
 believes it before the query."""
-_MOST_JSON, _MOST_ARCHIVE = 1 << 20, 64 << 20
-"""Bytes of a request's body."""
+_MOST_JSON, _MOST_ARCHIVE = 1 << 20, 2 << 20
+"""Bytes of a request's body; an archive holds a grant, with what a robot asked for."""
+_MOST_FILE = MOST_BYTES + (8 << 10)
+"""Of the archive of one file, which is one of reports: the file, and some heads of 512 bytes."""
 _MOST_DIGITS = 12
 """Of a length."""
 _LARGE, _MOST_LARGE, _BODY_S = 1 << 15, 16, 20.0
@@ -49,6 +53,10 @@ _KNOWN = 4096
 """Containers that are remembered to be ours."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
+_MADE_S, _MOST_NETWORKS = 60.0, 12
+"""For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
+take them all has addresses that the machine knows elsewhere."""
+_JSON, _TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 _WEIGH_S, _MOST_WEIGHED = 300.0, 32 << 20
 """What an engine may take to say how large all is that it has: seconds, and bytes."""
 
@@ -82,7 +90,7 @@ class EngineGate:
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
         self._large = asyncio.Semaphore(_MOST_LARGE)
-        self._looking, self._weighing = asyncio.Lock(), asyncio.Lock()
+        self._looking, self._weighing, self._making = asyncio.Lock(), asyncio.Lock(), asyncio.Lock()
 
     async def pass_requests(self, asks: Stream, engine: Stream) -> None:
         """Until the one who asks has ended, or was refused something."""
@@ -94,14 +102,12 @@ class EngineGate:
             return  # it has ended
         except (RefusedCall, asyncio.LimitOverrunError) as error:
             status = error.status if isinstance(error, RefusedCall) else HTTPStatus.FORBIDDEN
-            text = f"this machine's node refuses it: {error}"
-            self._tell(printable(str(error), lines=False))
-            body = json.dumps({"message": text}).encode()
-            rows = ("Content-Type: application/json", f"Content-Length: {len(body)}", "Connection: close")
-            head = "\r\n".join((f"HTTP/1.1 {status.value} {status.phrase}", *rows))
-            back.write(f"{head}\r\n\r\n".encode() + body)
+            gone = status == HTTPStatus.NOT_FOUND
+            text = str(error) if gone else f"this machine's node refuses it: {error}"
+            if not gone:
+                self._tell(printable(str(error), lines=False))
             with contextlib.suppress(OSError):
-                await back.drain()
+                await _answer(back, status, json.dumps({"message": text}).encode(), f"{_JSON}\r\nConnection: close")
 
     def _tell(self, text: str) -> None:
         """Each once, and a few of them."""
@@ -124,37 +130,39 @@ class EngineGate:
         method, (path, _, asked) = line[1].decode(), line[2].decode().partition("?")
         pairs = parse_qsl(asked, keep_blank_values=True)
         query, length = dict(pairs), headers.get(b"content-length", b"0")
-        archive = method == "PUT"
-        most = _MOST_ARCHIVE if archive else _MOST_JSON
+        archive, most = method == "PUT", _MOST_ARCHIVE if method == "PUT" else _MOST_JSON
         if len(query) != len(pairs) or not length.isdigit() or len(length) > _MOST_DIGITS or int(length) > most:
             raise RefusedCall("its query or its length is odd")
-        large = not archive and int(length) > _LARGE
-        async with self._large if large else contextlib.nullcontext():
+        async with self._large if int(length) > _LARGE else contextlib.nullcontext():
+            # All of it, an archive too: an engine that waits for the rest of one lets nobody end that container.
             async with asyncio.timeout(_BODY_S):
-                body = b"" if archive else await reader.readexactly(int(length))
+                body = await reader.readexactly(int(length))
             try:
-                said = json.loads(body) if body else None
+                said = json.loads(body) if body and not archive else None
             except (ValueError, RecursionError):
                 raise RefusedCall("its body is no JSON") from None
             await self._check(Call(method, unquote(path), query, said))
             target = path + (f"?{urlencode(query)}" if query else "")
-            if plain(unquote(path)) == WEIGHED:
-                await self._weigh(target, back)
+            if answered := self._answered(method, plain(unquote(path)), target, said):
+                await _answer(back, *await answered)
                 return
-            body = b"" if said is None else json.dumps(said).encode()
-            left = int(length) if archive else len(body)
-            kind = "Content-Type: application/json\r\n" if body else ""
+            if not archive:
+                body = b"" if said is None else json.dumps(said).encode()
+            kind = "Content-Type: application/json\r\n" if body and not archive else ""
             passed = b"".join(b"%s: %s\r\n" % (name, headers[name]) for name in _PASSED if name in headers)
-            head = f"{method} {target} HTTP/1.1\r\nHost: engine\r\nContent-Length: {left}\r\n{kind}".encode()
+            head = f"{method} {target} HTTP/1.1\r\nHost: engine\r\nContent-Length: {len(body)}\r\n{kind}".encode()
             writer.write(head + passed + b"\r\n" + body)
             await writer.drain()
-        while archive and left:
-            piece = await reader.read(min(left, PIECE))
-            if not piece:
-                raise asyncio.IncompleteReadError(b"", left)
-            left -= len(piece)
-            writer.write(piece)
-            await writer.drain()
+
+    def _answered(self, method: str, path: str, target: str, said: Any) -> Awaitable[tuple[int, bytes, str]] | None:
+        """What is asked of the engine by us, who then answer in its place; None: it answers itself."""
+        if path == WEIGHED:
+            return self._weigh(target)
+        if path == MADE:
+            return self._make(target, said)
+        if path.endswith("/archive") and method == "GET":
+            return self._file(target)
+        return None
 
     async def _check(self, call: Call) -> None:
         refused, subjects = judge(call, self._devices)
@@ -170,6 +178,8 @@ class EngineGate:
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
         if call.path.endswith("/archive"):
             await self._may_be_opened(subjects[0][1])
+        elif plain(call.path).endswith("/start"):
+            await self._may_be_started(subjects[0][1])
 
     async def _may_be_pulled(self, image: str) -> None:
         """Raises if something else of this machine has that name: who starts it by that name would start ours."""
@@ -190,33 +200,69 @@ class EngineGate:
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
         try:
             async with self._looking:
-                link = await asyncio.to_thread(self._images.link, str(found["Image"]), ways(found))
+                odd = await asyncio.to_thread(self._images.odd, str(found["Image"]), ways(found))
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-        if link:
-            raise RefusedCall(f"its files are not looked at: {link} is a link in its image")
+        if odd:
+            raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file")
         self._opened = self._opened if len(self._opened) < _KNOWN else set()
         self._opened.add(container)
 
-    async def _weigh(self, target: str, back: asyncio.StreamWriter) -> None:
-        """Answer in the engine's place, with what is ours."""
+    async def _may_be_started(self, container: str) -> None:
+        """Raises unless its networks are ours still: it is connected by their names as it starts.
+
+        And the engine looks into its files: it mounts its volumes, and reads who it is.
+        """
+        status, found = await self._asked(f"/containers/{container}/json")
+        if status != HTTPStatus.OK:
+            raise RefusedCall(f"No such container: {container}", HTTPStatus.NOT_FOUND)
+        mode = str((found.get("HostConfig") or {}).get("NetworkMode"))
+        for name in sorted({*((found.get("NetworkSettings") or {}).get("Networks") or ()), mode}):
+            if not name.startswith("container:") and not await self._is_ours(("joined networks", name)):
+                if (await self._asked(f"/networks/{name}"))[0] == HTTPStatus.NOT_FOUND:
+                    raise RefusedCall(f"network {name} not found", HTTPStatus.NOT_FOUND)
+                raise RefusedCall(f"{name[:80]} is not of an orchestrator")
+        await self._may_be_opened(container)
+
+    async def _file(self, target: str) -> tuple[int, bytes, str]:
+        """An engine that waits until somebody takes the rest of a file lets nobody end its container."""
+        answer = await self._ask(target, most=_MOST_FILE + 1)
+        if len(answer.content) > _MOST_FILE:
+            raise RefusedCall("the file is larger than those that a site asks for")
+        return answer.status, answer.content, _TAR if answer.status == HTTPStatus.OK else _JSON
+
+    async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
+        """A network, unless there are many of ours."""
+        async with self._making:
+            status, found = await self._asked(f"/networks?{urlencode({'filters': json.dumps({'label': [NETWORK]})})}")
+            if status != HTTPStatus.OK or len(found) >= _MOST_NETWORKS:
+                raise RefusedCall(f"orchestrators made {_MOST_NETWORKS} networks here, as many as they may")
+            answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
+        return answer.status, answer.content, _JSON
+
+    async def _weigh(self, target: str) -> tuple[int, bytes, str]:
+        """Of what there is what is ours."""
+        async with self._weighing:
+            answer = await self._ask(target, patience=_WEIGH_S, most=_MOST_WEIGHED)
         try:
-            async with self._weighing:
-                answer = await asyncio.to_thread(ask, self._engine, target, patience=_WEIGH_S, most=_MOST_WEIGHED)
             found = json.loads(answer.content)
             volumes = found.get("Volumes") or (found.get("VolumeUsage") or {}).get("Items") or ()
             ours = [one for one in volumes if OWNER in (one.get("Labels") or ())]
-        except (OSError, ValueError, AttributeError, TypeError) as error:
+        except (ValueError, AttributeError, TypeError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-        body = json.dumps({"Volumes": ours}).encode()
-        rows = f"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
-        back.write(rows.encode() + body)
-        await back.drain()
+        return HTTPStatus.OK, json.dumps({"Volumes": ours}).encode(), _JSON
+
+    async def _ask(self, path: str, **how: Any) -> Answer:
+        try:
+            return await asyncio.to_thread(ask, self._engine, path, **how)
+        except (OSError, ValueError) as error:
+            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
     async def _asked(self, path: str) -> tuple[int, Any]:
+        answer = await self._ask(path)
         try:
-            return await asyncio.to_thread(ask_json, self._engine, path)
-        except (OSError, ValueError) as error:
+            return answer.status, json.loads(answer.content)
+        except ValueError as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
     async def _is_ours(self, subject: Subject) -> bool:
@@ -240,6 +286,13 @@ class EngineGate:
             self._ours = self._ours if len(self._ours) < _KNOWN else set()
             self._ours.add(name)
         return True
+
+
+async def _answer(back: asyncio.StreamWriter, status: int, body: bytes, rows: str) -> None:
+    """``rows``: more of its head."""
+    head = f"HTTP/1.1 {int(status)} {HTTPStatus(status).phrase}\r\nContent-Length: {len(body)}\r\n{rows}\r\n\r\n"
+    back.write(head.encode() + body)
+    await back.drain()
 
 
 def _header(row: bytes) -> tuple[bytes, bytes]:

@@ -25,11 +25,13 @@ NOBODY = "-"
 """As an owner: the node itself made it, and no orchestrator touches it."""
 OPEN = "skytether.io/open"
 """Label of a network that the machine's owner made, and that containers of sites may be in."""
+MADE = "/networks/create"
 WEIGHED = "/system/df"
 """Says of all that an engine has what it is and how large: of the answer what is ours is passed on only."""
 _CONTAINER_ID = "[0-9a-f]{64}"
 """Whole: an engine takes names and beginnings of ids, too, and what these mean may change between two calls."""
 _ID = r"([A-Za-z0-9][A-Za-z0-9_.-]*)"
+_NETWORK = r"skytether(?:-[A-Za-z0-9_.-]+)?"
 _BEFORE = re.compile(r"^/v1\.(?:4[1-9]|[5-9]\d|[1-9]\d\d)(?=/)")
 """Versions of the engine's interface, from the oldest that a site uses on: ``start`` of 1.23 takes a ``HostConfig``."""
 _CALLS = tuple(
@@ -60,11 +62,11 @@ _CALLS = tuple(
         ("GET", r"/images/[A-Za-z0-9](?:[A-Za-z0-9_:@-]|[./](?![./]))*/json", "", ""),
         ("POST", r"/images/create", "pull", "fromImage tag"),
         ("GET", r"/networks/ID", "network seen", ""),
-        ("POST", r"/networks/create", "network made", ""),
+        ("POST", MADE, "network made", ""),
         ("POST", r"/networks/ID/(?:connect|disconnect)", "joined", ""),
-        ("DELETE", r"/networks/ID", "network", ""),
+        ("DELETE", rf"/networks/({_NETWORK})", "network", ""),
         ("POST", r"/volumes/create", "volume made", ""),
-        ("DELETE", r"/volumes/ID", "volume", "force"),
+        ("DELETE", r"/volumes/(skytether-[A-Za-z0-9_.-]+|[0-9a-f]{64})", "volume", "force"),
     )
 )
 _LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
@@ -80,7 +82,7 @@ _OURS = "skytether-"
 """What names of ours begin with: of containers, of networks but for one, and of volumes that outlive their containers.
 By any other name, somebody else on this machine could have ours for his own: it is looked for before the beginnings of
 ids, and by name where a container starts."""
-_NETWORK, _BRIDGE = r"skytether(?:-[A-Za-z0-9_.-]+)?", "skt-[0-9A-Za-z]{1,11}"
+_BRIDGE = "skt-[0-9A-Za-z]{1,11}"
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
 _TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
 FOLDER = "/run/skytether"
@@ -91,6 +93,7 @@ _TMPFS = re.compile(r"(?:(?:size|mode|uid|gid|nr_inodes)=[0-9]+[kmg]?|nosuid|nod
 ``bind`` mounts what is there."""
 _MOST_PIDS = 1 << 15
 """Of a container's processes and threads."""
+_JSON_FILE = {"Type": "json-file"}
 _MOST_PORTS = 1
 """Published: each costs the machine a process of root or two."""
 
@@ -212,7 +215,8 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         _rights(host.get("CapAdd") or [], mode),
         _security(host.get("SecurityOpt")),
         None if host.get("IpcMode", "none") in ("none", "private") else "it shares memory with others",
-        None if _at(host, "LogConfig").get("Type", "json-file") == "json-file" else "its log goes elsewhere",
+        # Without a type, an engine gives what is set here to its own kind of log, which may be one that goes elsewhere.
+        None if (_at(host, "LogConfig") or _JSON_FILE).get("Type") == "json-file" else "its log goes elsewhere",
         _only(_at(host, "LogConfig"), {"Type", "Config"}, "a log"),
         *(_tmpfs(path, options) for path, options in _at(host, "Tmpfs").items()),
         *(_mount(mount) for mount in _list(host, "Mounts")),

@@ -27,6 +27,9 @@ _WAYS_OUT = {
     ),
     *("move_mount", "open_tree", "mount_setattr", "open_by_handle_at", "bpf", "perf_event_open", "userfaultfd"),
     *("init_module", "finit_module", "delete_module", "create_module", "kexec_load", "kexec_file_load", "reboot"),
+    # Newer engines refuse them, or what they do with others' processes and memory.
+    *("io_uring_setup", "io_uring_enter", "io_uring_register", "process_vm_readv", "process_vm_writev", "kcmp"),
+    *("open_tree_attr", "uselib", "ustat", "sysfs", "_sysctl", "iopl", "ioperm", "lookup_dcookie", "vm86old"),
     *("add_key", "keyctl", "request_key", "quotactl", "swapon", "swapoff", "acct", "syslog", "nfsservctl", "vm86"),
 }
 _NEW_NAMESPACES = 0x7E020000
