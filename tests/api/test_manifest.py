@@ -55,6 +55,12 @@ def test_an_action_is_neither_latched_nor_unreliable():
             TopicSpec(**MOVE, **more)
 
 
+@pytest.mark.parametrize("kind", ["action", "ros2_action"])
+def test_an_action_has_no_type_hash_for_each_of_its_parts_has_one_of_its_own(kind):
+    with pytest.raises(ValidationError, match=f"kind: {kind} has no type_hash: each of its topics and calls"):
+        TopicSpec(**MOVE | {"kind": kind}, type_hash="RIHS01_" + "0" * 64)
+
+
 def test_a_service_with_a_graph_needs_only_its_launch_file():
     spec = ServiceSpec(graph="ros1", launch="/launch/nav.launch", topics=[MOVE], remap={"move_base": "/move_base"})
     assert spec.entrypoint == GRAPH_ENTRYPOINTS["ros1"]

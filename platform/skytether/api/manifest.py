@@ -112,6 +112,8 @@ class TopicSpec(Strict):
             raise ValueError("latched: true needs reliable: true")
         if self.kind != "topic" and (not self.reliable or self.latched or self.name == ANY_TOPIC):
             raise ValueError(f"kind: {self.kind} is reliable and not latched, and has a name of its own")
+        if self.kind in ("action", "ros2_action") and self.type_hash:
+            raise ValueError(f"kind: {self.kind} has no type_hash: each of its topics and calls has one of its own")
         if self.shared and (self.kind != "topic" or self.type != SHARED_TYPE):
             raise ValueError(f"shared: true is for a topic of type {SHARED_TYPE}")
         return self

@@ -351,7 +351,7 @@ class Program:
 
     def _look(self, *, whole: bool) -> dict[str, Any]:
         wanted = {self._node.resolve_topic_name(name): name for name in list(self._names.values())}
-        if whole:
+        if whole or self._awaits_names():
             served = {self._names.get(channel, "") for channel in list(self._servers)}
             asked = {self._names.get(channel, "") for channel in list(self._clients)}
             self._all = graph.look(self._node, None) + graph.look_at_services(self._node, served, asked)
@@ -368,13 +368,17 @@ class Program:
         sim_time = self._node.get_parameter_or("use_sim_time").value is True
         return {**news, "sim_time": sim_time, "log_level": int(self._node.get_logger().get_effective_level())}
 
+    def _awaits_names(self) -> bool:
+        """Whether nodes of endpoints are about to be known; those of services only the whole look tells."""
+        now = time.monotonic()
+        return any(now - since < NAMED_S for since in self._unnamed.values())
+
     def _known(self, endpoints: list[list[Any]]) -> list[list[Any]]:
         """Those whose nodes are known, or will not be."""
         now = time.monotonic()
         unnamed = {e[0] for e in endpoints if not e[5]}
         self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
-        services = (graph.SERVER, graph.CLIENT)
-        return [e for e in endpoints if e[5] or e[1] in services or now - self._unnamed[e[0]] >= NAMED_S]
+        return [e for e in endpoints if e[5] or now - self._unnamed[e[0]] >= NAMED_S]
 
 
 def main(arguments: list[str]) -> int:
