@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import resource
 import socket
@@ -17,7 +18,7 @@ import pytest
 from node_scene import first_line, program, until
 
 from skytether.api.node import Issued, Link, Linked, Renew, line_of, read_request
-from skytether.node import calls
+from skytether.node import calls, run
 from skytether.node.store import NodeConfig, NodeError, NodeStore, new_key, request_for
 from skytether.orchestrator.nodes.authority import Authority, pem_of
 
@@ -145,6 +146,34 @@ def test_what_is_no_certificate_of_the_node_takes_its_own_from_nobody(
     assert hostile.store.identity.read_bytes() == before
     hostile.store.renew(key, hostile.issue(key))
     assert hostile.store.identity.read_bytes() != before
+
+
+@pytest.mark.parametrize("left", ["left", "left, and joined another"])
+def test_who_has_left_is_linked_no_more_whatever_an_orchestrator_says(
+    hostile: Hostile, left: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where no unit runs the node's program, and nobody ended that."""
+    monkeypatch.setattr(run, "_LOOK_S", 0.05)
+    linked, ended = threading.Event(), threading.Event()
+
+    def stay(link: ssl.SSLSocket) -> None:
+        linked.set()
+        hostile.stay(link)
+        ended.set()
+
+    hostile.answers[Link] = stay
+    node = threading.Thread(target=lambda: asyncio.run(run.NodeProgram(hostile.store).run()), daemon=True)
+    node.start()
+    assert linked.wait(30)
+    config = hostile.store.config()
+    hostile.store.clear()
+    if left != "left":
+        (tmp_path / "other").mkdir()
+        other, key = Authority(tmp_path / "other", time.time), new_key()
+        hostile.store.join(config, other.pem, key, hostile.issue(key, other))
+    assert ended.wait(30)
+    node.join(30)
+    assert not node.is_alive()
 
 
 def test_an_answer_in_drops_takes_no_longer_than_another(hostile: Hostile, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,6 +61,7 @@ class MadeUpEngine:
         }
         self.version = {"Version": "29.1", "ApiVersion": changes.pop("ApiVersion", "1.52")}
         self.asked = 0
+        self.containers: list[Any] = []
         self._server: socketserver.ThreadingUnixStreamServer | None = None
         self.start()
 
@@ -73,7 +74,12 @@ class MadeUpEngine:
             def do_GET(self) -> None:
                 engine.asked += 1
                 place = self.path.partition("?")[0].rpartition("/")[2]
-                found = {"version": engine.version, "info": engine.info, "volumes": {"Volumes": []}, "json": []}
+                found = {
+                    "version": engine.version,
+                    "info": engine.info,
+                    "volumes": {"Volumes": []},
+                    "json": engine.containers,
+                }
                 with contextlib.suppress(ConnectionError):
                     if place in found:
                         self._say(200, found[place])

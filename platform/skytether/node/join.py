@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import re
 import ssl
 import threading
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlencode
 
 from skytether.api.node import Invited, Issued, Join, Leave, Look, Standing, Stands
 from skytether.bridge.echo import EchoServer
@@ -19,7 +21,8 @@ from skytether.bridge.echo import EchoServer
 from . import checks, unit
 from .calls import RefusedError, Seen, UnreachableError, address_of, call, first_call, trusting
 from .checks import Finding
-from .machine import EngineInfo, address_towards, describe
+from .engine_rules import OWNER
+from .machine import EngineInfo, address_towards, ask, describe
 from .run import NodeProgram
 from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
 
@@ -29,6 +32,10 @@ _READY_S = 300.0
 """By when a site that joined has answered: a slow machine takes a minute to start a program."""
 _LOOK_S = 5.0
 """Between two looks whether the unit comes up at all."""
+_MOST_LIST = 64 << 20
+"""Bytes of a list of containers."""
+LOCAL_SOCKET = "/var/run/docker.sock"
+"""The one that `docker` asks by itself."""
 
 
 class ChecksError(NodeError):
@@ -45,7 +52,7 @@ class JoinOptions:
 
     urls: tuple[str, ...]
     token: str
-    engine: str = "unix:///var/run/docker.sock"
+    engine: str = f"unix://{LOCAL_SOCKET}"
     advertise: str | None = None
     """That robots are told; None: the address by which this machine reaches the orchestrator, whatever it is then."""
     ports: tuple[int, int] | None = None
@@ -301,7 +308,7 @@ def leave(
         store: Of the node.
         force: At once, whatever runs here, and also where no orchestrator answers.
         timeout_s: For what runs here to be moved.
-        tell: Called with how far it is.
+        tell: Called with how far it is, and with what is on this machine still.
 
     Returns:
         What is left to be done elsewhere; None: nothing.
@@ -310,8 +317,10 @@ def leave(
         NodeError: It did not work; the machine is a site still.
     """
     left: str | None = None
+    engine = ""
     try:
         config = store.config()
+        engine = config.engine
         _leave(config, store, force=force, timeout_s=timeout_s, tell=tell)
     except NodeError as error:
         if not force:
@@ -319,7 +328,25 @@ def leave(
         left = str(error)
     unit.remove()
     store.clear()
+    if still := _still_here(engine):
+        tell(still)
     return left
+
+
+def _still_here(engine: str) -> str:
+    """Containers that orchestrators made, which may be of one that others have taken, and says that it has ended them.
+
+    Not removed by us: another orchestrator may use the same engine.
+    """
+    asked = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
+    try:
+        found = json.loads(ask(engine, f"/containers/json?{asked}", most=_MOST_LIST).content)
+        count = f"{len(found)} containers that orchestrators made are" if found else ""
+    except (OSError, ValueError):
+        count = "containers that orchestrators made may be"
+    docker = "docker" if engine in ("", LOCAL_SOCKET) else f"docker -H unix://{engine}"
+    removes = f"{docker} rm -fv $({docker} ps -aq --filter label={OWNER})"
+    return f"{count} here still, and run on: `{removes}` ends them" if count else ""
 
 
 def _leave(

@@ -74,7 +74,7 @@ class _Clock:
 
 
 class NodeProgram:
-    """Runs until it is cancelled."""
+    """Runs until it is cancelled, or the machine has left."""
 
     def __init__(self, store: NodeStore, on_linked: Callable[[str], object] = lambda _: None) -> None:
         """``on_linked`` is called with the address of each orchestrator whenever a link stands.
@@ -84,7 +84,8 @@ class NodeProgram:
         """
         self._store = store
         self._config = store.config()
-        self._trust: ssl.SSLContext = trusting(store.authority(), store.identity)
+        self._authority = store.authority()
+        self._trust: ssl.SSLContext = trusting(self._authority, store.identity)
         config = self._config
         self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices, config.registries)
         self._on_linked = on_linked
@@ -96,16 +97,27 @@ class NodeProgram:
         """Set where the engine did not answer somebody: whoever looks at it now and then looks at once."""
 
     async def run(self) -> None:
-        """Keep all links; returns when it is cancelled."""
+        """Keep all links; returns when it is cancelled, or the machine is no site of theirs any more."""
         _allow_connections()
         sslproto.SSLProtocol.max_size = PIECE  # of each connection's buffer: by itself a thousand ways take 256 MiB
         try:
             async with asyncio.TaskGroup() as group:
                 self._group = group
                 self._learn(self._config.urls)
-                await asyncio.Event().wait()
+                while self._is_joined():
+                    await asyncio.sleep(_LOOK_S)
+                for link in self._links.values():
+                    link.cancel()
+            log.info("this machine is no site any more")
         finally:
             await closed()
+
+    def _is_joined(self) -> bool:
+        """Whoever has left does not ask who may be linked still."""
+        try:
+            return self._store.exists() and self._store.authority() == self._authority
+        except NodeError:
+            return False
 
     def _learn(self, urls: tuple[str, ...]) -> None:
         """Link with those that are new, and keep them."""

@@ -305,9 +305,27 @@ def test_who_is_forced_to_leave_leaves_without_an_orchestrator(nodes: NodeScene)
     why = said(lambda: leave(nodes.store(), force=False, timeout_s=0))
     assert "with --force this machine leaves without a word" in why
     assert nodes.store().exists()
-    left = leave(nodes.store(), force=True, timeout_s=0)
+    told: list[str] = []
+    left = leave(nodes.store(), force=True, timeout_s=0, tell=told.append)
     assert left is not None
+    assert told == []
     assert not nodes.store().folder.exists()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_who_leaves_is_told_of_containers_that_are_here_still(nodes: NodeScene, there: bool) -> None:
+    """An orchestrator that somebody has taken says that it has ended them."""
+    engine = nodes.engine()
+    join.join(nodes.options(nodes.invite()))
+    nodes.shut()
+    engine.containers = [{"Id": "a"}, {"Id": "b"}]
+    if not there:
+        engine.stop()
+    told: list[str] = []
+    leave(nodes.store(), force=True, timeout_s=0, tell=told.append)
+    (text,) = told
+    assert text.startswith("2 containers" if there else "containers that orchestrators made may be here still")
+    assert f"`docker -H unix://{engine.path} rm -fv $(docker -H" in text
     assert nodes.operator.delete_site("edge", force=True)
 
 

@@ -230,14 +230,13 @@ def leave_node(
     if not force and not store.exists():
         fail(f"this machine has not joined, as far as {store.folder} says")
     try:
-        left = leave(store, force=force, timeout_s=timeout_s, tell=lambda text: console.print(text, markup=False))
+        left = leave(
+            store, force=force, timeout_s=timeout_s, tell=lambda text: console.print(text, markup=False, soft_wrap=True)
+        )
     except NodeError as error:
         fail(str(error))
     if left is not None:
         console.print(f"the orchestrator does not know: {left}", markup=False, soft_wrap=True)
-        console.print(
-            "what ran here may run still: docker rm -f $(docker ps -aq --filter label=skytether.io/owner)", markup=False
-        )
     console.print("this machine is no site any more", markup=False)
 
 
