@@ -385,8 +385,8 @@ def test_what_is_permitted_is_taken_and_what_is_not_is_said(robot):
         assert said in robot.log.read_text()
 
 
-def test_a_second_guard_says_what_to_do(robot):
-    command = [sys.executable, "-m", "skytether.cli", "robot", "gate", str(robot._file)]
+def test_a_second_guard_says_what_to_do(robot, tmp_path):
+    command = [sys.executable, "-m", "skytether.cli", "robot", "gate", str(tmp_path / "robot.yaml")]
     said = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert said.returncode == 1
     assert "another gate runs in" in said.stderr

@@ -61,7 +61,7 @@ class Robot:
         self.pad: Joy | None = None
         self.blocked = False
         self.told: list[tuple[float, float]] = []
-        self._log = log
+        self.log = log
         self._ended = threading.Event()
         self._wheels = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._wheels.bind(str(folder / "wheels.sock"))
@@ -92,7 +92,7 @@ class Robot:
         return True
 
     def start_agent(self) -> subprocess.Popen[bytes]:
-        with self._log.open("ab") as output:
+        with self.log.open("ab") as output:
             return subprocess.Popen(
                 [sys.executable, str(HERE / "agent_process.py"), str(self.folder)], stdout=output, stderr=output
             )
@@ -112,7 +112,7 @@ class Robot:
         wait(started, "the agent may drive", self)
 
     def drives(self) -> None:
-        wait(lambda: self._newest()[0] > 0.15, "the robot drives", self)
+        wait(lambda: self.newest()[0] > 0.15, "the robot drives", self)
 
     def stands(self, seconds: float = 0.5) -> None:
         """It comes to a standstill and stays there, that long at least."""
@@ -122,7 +122,7 @@ class Robot:
             time.sleep(seconds)
             return set(self.told) == {(0.0, 0.0)}
 
-        wait(lambda: self._newest() == (0.0, 0.0) and (not seconds or stays()), "the robot stands", self)
+        wait(lambda: self.newest() == (0.0, 0.0) and (not seconds or stays()), "the robot stands", self)
 
     def close(self) -> None:
         for process in (self.agent, self.guard):
@@ -155,7 +155,7 @@ class Robot:
 
         wait(still, "the enable signal is still", self)
 
-    def _newest(self) -> tuple[float, float]:
+    def newest(self) -> tuple[float, float]:
         return self.told[-1] if self.told else (0.0, 0.0)
 
     def _turn(self) -> None:
@@ -183,7 +183,7 @@ class Robot:
             while not self._ended.wait(0.04):
                 self._send(link, "scan", self._scan())
                 self._send(link, "estop", Bool(), "estop.sock")
-                linear, angular = (0.0, 0.0) if self.blocked else self._newest()
+                linear, angular = (0.0, 0.0) if self.blocked else self.newest()
                 self._send(link, "odom", Twist(linear=Vector3(x=linear), angular=Vector3(z=angular)))
                 if self.pad is not None:
                     self._send(link, "joy", self.pad)
@@ -205,7 +205,7 @@ def wait(condition: Callable[[], bool], what: str, robot: Robot | None = None) -
     end = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > end:
-            log = robot._log.read_text() if robot else ""
+            log = robot.log.read_text() if robot else ""
             pytest.fail(f"not within {PATIENCE_S} s: {what}\n{log}")
         time.sleep(0.02)
 
@@ -256,7 +256,7 @@ def test_the_agent_killed_or_frozen(robot):
     robot.stands()
     robot.agent = robot.start_agent()
     robot.drives()
-    said = robot._log.read_text().count("the last valid command is too old")
+    said = robot.log.read_text().count("the last valid command is too old")
     assert said <= 2  # once each time, not fifty times a second
 
 
@@ -365,7 +365,7 @@ def test_people_and_things_in_the_way(robot):
     robot.drives()
     robot.drives()
     robot.pad = Joy(axes=np.array([0.0, 1.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
-    wait(lambda: robot._newest() == pytest.approx((0.0, 0.4)), "the joystick turns the robot", robot)
+    wait(lambda: robot.newest() == pytest.approx((0.0, 0.4)), "the joystick turns the robot", robot)
     robot.pad = up
     robot.drives()  # the button was let go: the agent goes on
     robot.pad = Joy(axes=np.array([0.0, 1.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))

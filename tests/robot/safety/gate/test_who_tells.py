@@ -65,16 +65,17 @@ class Stage:
         )
         self.bounds, self.limits = config.bounds(), config.rules().limits
         self.file = board.make()
+        self.boards = [Board(self.file) for _ in range(3)]
         self.sockets = [end for pair in range(2) for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)]
         for end in self.sockets:
             end.setblocking(False)
         to_guard, self.from_gate, to_writer, from_guard = self.sockets
         clock = lambda: self.now  # noqa: E731
         self.heartbeat = Heartbeat(
-            to_guard, Way(self, "gate"), self.bounds, PERIOD, PATIENCE, Board(self.file), lambda *_: None, clock
+            to_guard, Way(self, "gate"), self.bounds, PERIOD, PATIENCE, self.boards[0], lambda *_: None, clock
         )
-        self.writer = Writer(config, from_guard, Way(self, "writer"), Board(self.file), clock)
-        self.board = Board(self.file)
+        self.writer = Writer(config, from_guard, Way(self, "writer"), self.boards[1], clock)
+        self.board = self.boards[2]
         self.guard = WriterWheels(to_writer)
         self.guard_watch = Watch(self.bounds, PERIOD, PATIENCE)
         self.said = STANDSTILL
@@ -130,7 +131,7 @@ class Stage:
     def close(self):
         for end in self.sockets:
             end.close()
-        for page in (self.board, self.heartbeat._teller._board, self.writer._teller._board):
+        for page in self.boards:
             page.close()
         os.close(self.file)
 

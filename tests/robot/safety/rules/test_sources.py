@@ -383,7 +383,10 @@ def test_after_a_gap_a_press_that_waited_counts_and_a_command_that_waited_does_n
     bench.gate.sense("estop", Bool(True), bench.now)
     assert bench.run(0.05).hand == Hand.NOBODY
     assert "pressed" in bench.gate.stopped
-    assert not bench.gate._sources._sources["navigation"].speaks(bench.now)
+    bench.says = {"estop": Bool(False)}
+    bench.run(TIMEOUT - 0.1)
+    assert bench.gate.reset(bench.now) == ""
+    assert bench.gate.start(bench.now) == ([], ""), "nobody was heard who could be let go on"
 
 
 def test_a_button_that_speaks_only_when_it_changes_is_not_waited_for():

@@ -97,6 +97,7 @@ class GateLoop:
         )
         also = lasting_file(str(folder), str(config.record_file()))
         self._keeper = EstopFile(str(folder / LATCH_FILE), boot_id(), _log.error, also)
+        self._keeper.start()
         self._control = Control(self._gate, self._heartbeat, self._keeper, self._status, clock)
         self._heir = Heir(str(folder), guard)
         self._requests = Requests(str(folder / CONTROL_SOCKET), self._control.handle)
@@ -114,7 +115,6 @@ class GateLoop:
 
     def run(self) -> None:
         """Turn until the guard is gone, then stop the wheels."""
-        self._keeper.start()
         deadline = self._clock()
         while not self._heartbeat.gone:
             self.turn()
