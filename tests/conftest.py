@@ -163,6 +163,7 @@ RERUN = {
     "orchestrator/test_hostile.py": "judges how quick others' renewals are beside an attacker who takes a core",
     "orchestrator/http/test_server.py": "judges how soon a killed program is back",
     "robot/safety/gate/test_cloud_processes.py": "as test_guard_processes.py",
+    "robot/safety/gate/test_cut_network.py": "as test_guard_processes.py",
     "robot/safety/gate/test_guard_processes.py": "judges each velocity of the wheels by the moment it was told",
     "robot/safety/gate/test_processes.py": "as test_guard_processes.py",
     "robot/safety/gate/test_sensing_processes.py": "as test_guard_processes.py",

@@ -28,8 +28,13 @@ class Wheels:
         self.fails: Exception | None = None
         self.room = True
 
+        self.silent = ""
+
     def full(self):
         return not self.room
+
+    def unread(self):
+        return self.silent
 
     def write(self, velocity):
         if self.fails:
@@ -298,3 +303,23 @@ def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
     with pytest.raises(PermissionError):
         os.ftruncate(file, 0)
     os.close(file)
+
+
+def test_wheels_that_do_not_acknowledge_are_braked_and_go_on_from_there(both):
+    """The node of the wheels hung or was cut off for seconds, and the first it heard then was full speed."""
+    first, _ = both
+    turns = iter(range(100))
+
+    def turn():
+        now = 1.0 + next(turns) * PERIOD
+        first.turn(now, FAST)
+        return first.wheels.told[-1].linear
+
+    assert turn() == pytest.approx(0.4)
+    first.wheels.silent = "/cmd_vel is not acknowledged by /base"
+    assert turn() == pytest.approx(0.4 - 2.0 * PERIOD)
+    assert [turn() for _ in range(12)][-1] == 0.0
+    assert first.teller.unread == first.wheels.silent
+    first.wheels.silent = ""
+    assert turn() == pytest.approx(1.0 * PERIOD)
+    assert first.teller.unread == ""

@@ -242,7 +242,7 @@ class Guard:
 
     def _tell(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
-        stopped, told = bool(self._latch.reason), True
+        stopped, told, kind = bool(self._latch.reason), True, "wheels"
         wrong = self._watch.target(now, stopped)[1]
         if wrong and self._gate is not None and self._gate.heard_at is not None and not self._ends:
             self._trouble(wrong.split()[0], "brake", f"the gate {wrong}; the guard stops the wheels", now)
@@ -251,6 +251,9 @@ class Guard:
                 self._wheels.hear()
                 self._watch.learn(self._board.newest())
                 self._wheels.write(*self._watch.asks(now, stopped))
+                if self._wheels.trouble:
+                    kind = "unread"
+                    raise OSError(self._wheels.trouble)
             else:
                 self._wheels.look()
                 told = self._wheels.tell(now, stopped)
@@ -258,7 +261,7 @@ class Guard:
         except OSError as error:  # tried again in a moment; a motor drive that hears nothing stops by itself
             sentence = f"the wheels cannot be told anything: {error.strerror or error}"
             self._troubles["wheels"] = sentence
-            self._trouble("wheels", "wheels", sentence, now)
+            self._trouble(kind, "wheels", sentence, now)
         if self._enable is not None:
             self._toggle(self._enable, now, well=not wrong and not self._latch.reason and not self._ends)
         return told

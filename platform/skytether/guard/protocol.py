@@ -57,7 +57,7 @@ class Answer(NamedTuple):
     kept: bool = True
     """The emergency stop is on disk as it is."""
     stopped: str = ""
-    """Why the robot stands until a person resets it; empty: it does not."""
+    """Why the robot stands until a person resets it; of a writer why the wheels stand; empty: they need not."""
 
 
 def pack_beat(beat: Beat) -> bytes:

@@ -14,6 +14,9 @@ Whoever turns the wheels may be held up, and read later what waits for it. Once 
 whether they turn: it is told what goes on from the last velocity, or, when that was too long ago, nothing until it has
 read all and the wheels stand by themselves. A word between them and a standstill would be a jump for one of the two.
 Only a stop is not kept waiting.
+
+Where whoever turns the wheels acknowledges what they are told, and does not any more, they are braked: perhaps they
+hear it, and if they do not, the first word that reaches them again finds them as they are, at a standstill.
 """
 
 from __future__ import annotations
@@ -67,6 +70,10 @@ class Wheels(Protocol):
         """Whether there is no room for more, as what was sent before waits to be read."""
         ...
 
+    def unread(self) -> str:
+        """Who does not acknowledge what is written, for longer than they may, in words; empty: all do, or none can."""
+        ...
+
     def listeners(self) -> frozenset[str] | None:
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
@@ -95,6 +102,8 @@ class Teller:
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers = False
+        self.unread = ""
+        """What is wrong with those who were told something last: they do not acknowledge it; empty: nothing."""
         self._broken_at = nan
         self._full_at = nan
         self._own, self._claim = board.of(role)  # of who had the role before
@@ -128,7 +137,8 @@ class Teller:
             self._failed(now)  # they know nothing of what was told before, and nobody else has told them
         if not stopped and self._waits(now):
             return False
-        velocity, _ = self._watch.want(now, stopped)
+        self.unread = self._wheels.unread()
+        velocity, _ = self._watch.want(now, stopped or bool(self.unread))
         at = self._clock()
         if at - now > LATE * self._period_s or not self._may(at):
             return False

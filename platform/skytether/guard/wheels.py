@@ -48,6 +48,10 @@ class SocketWheels:
         room.register(self._socket, select.POLLOUT)
         return not room.poll(0)
 
+    def unread(self) -> str:
+        """Wheels: not known; a driver that does not read has no room left."""
+        return ""
+
     def listeners(self) -> frozenset[str] | None:
         """Wheels: not known; a driver that starts anew is a write that fails."""
         return None
@@ -69,6 +73,8 @@ class WriterWheels:
         self.link = link
         self.heard_at: float | None = None
         """When the writer last answered."""
+        self.trouble = ""
+        """What it said of the wheels."""
 
     def write(self, velocity: Velocity, at: float) -> None:
         """Have the wheels told.
@@ -86,7 +92,7 @@ class WriterWheels:
 
     def lead_to(self, link: socket.socket | None) -> None:
         """Another writer, not heard yet, or none."""
-        self.link, self.heard_at = link, None
+        self.link, self.heard_at, self.trouble = link, None, ""
 
     def hear(self) -> None:
         """Take in that the writer is alive."""
@@ -99,7 +105,7 @@ class WriterWheels:
                 break
             answer = unpack_answer(data)
             if answer is not None:
-                self.heard_at = answer.at
+                self.heard_at, self.trouble = answer.at, answer.stopped
 
 
 def family_of(address: Address) -> socket.AddressFamily:

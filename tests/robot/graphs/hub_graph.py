@@ -146,6 +146,9 @@ class HubWheels:
     def full(self) -> bool:
         return False
 
+    def unread(self) -> str:
+        return ""
+
     def listeners(self) -> None:
         return None
 

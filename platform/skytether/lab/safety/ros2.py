@@ -27,6 +27,7 @@ _MANY_RAYS = 10_000
 _PILES_UP_S = 1.5
 """Of such scans in the buffer between the gate and its program: it is full."""
 _NAMED = "the subscription of /stranger has type std_msgs/msg/String"
+_UNREAD = "is not acknowledged by /played_hardware"
 _PROGRAM = "ros2/native/side/__main__.py"
 
 
@@ -52,6 +53,7 @@ def enter(attacks: Attacks) -> None:
         _button,
         5,
     )
+    add("wheels-frozen", "the wheels' node is frozen for 1 s, and goes on", _wheels_frozen, 5)
     add("stranger", "another node listens to the velocities, as if they were of another type", _stranger, 5)
     for seed in storm.SEEDS:
         add(f"storm-{seed}", storm.WHAT.format(seed), storm.storm(seed, ROLES), 6)
@@ -127,10 +129,23 @@ def _button(stage: Stage) -> None:
     robot.scan = robot.clear
 
 
+def _wheels_frozen(stage: Stage) -> None:
+    """Wheels that hear nothing stop by themselves: the first that they hear again is to find them so."""
+    graph = _graph(stage)
+    graph.freeze()
+    try:
+        stage.expect(lambda: _UNREAD in stage.robot.log.read_text(), "it is named who does not acknowledge velocities")
+        stage.sleep(1.0)
+        told = stage.robot.ask("status")["linear_m_s"]
+        if told:
+            stage.wrong("motion", f"wheels that have heard nothing for a second are told {told:.3f} m/s")
+    finally:
+        graph.thaw()
+    stage.drives_on("the robot drives on after the wheels' node was frozen")
+
+
 def _stranger(stage: Stage) -> None:
-    graph = stage.robot.hardware
-    if not isinstance(graph, Ros2Hardware):
-        raise TypeError("this robot is no ROS 2 graph")
+    graph = _graph(stage)
     graph.intrude()
     try:
         stage.expect(lambda: _NAMED in stage.robot.log.read_text(), "the gate names who asks for another type")
@@ -139,6 +154,13 @@ def _stranger(stage: Stage) -> None:
             stage.wrong("stuck", "a node that listens takes the wheels away")
     finally:
         graph.leave()
+
+
+def _graph(stage: Stage) -> Ros2Hardware:
+    graph = stage.robot.hardware
+    if not isinstance(graph, Ros2Hardware):
+        raise TypeError("this robot is no ROS 2 graph")
+    return graph
 
 
 @contextmanager

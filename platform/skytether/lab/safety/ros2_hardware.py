@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import signal
 import subprocess
 import threading
 from collections.abc import Mapping
@@ -74,6 +75,14 @@ class Ros2Hardware:
     def appear(self) -> None:
         """Hardware: subscribe."""
         self._tell(do="appear")
+
+    def freeze(self) -> None:
+        """The node's program stands still."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """It goes on."""
+        self._process.send_signal(signal.SIGCONT)
 
     def intrude(self) -> None:
         """Another node listens to the velocities, as if they were of another type."""

@@ -46,6 +46,11 @@ class Publication(Handle, Protocol):
         """Whether what was put before waits for longer than it may, see `GraphNode.publish`; then none is taken."""
         ...
 
+    @property
+    def unread_s(self) -> float:
+        """For how long somebody who listens has not acknowledged what is published, where that is known [s]."""
+        ...
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         ...

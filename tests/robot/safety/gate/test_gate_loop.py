@@ -52,6 +52,9 @@ class Hardware:
     def write(self, velocity: Velocity) -> None:
         self.told.append(velocity)
 
+    def unread(self) -> str:
+        return ""
+
     def listeners(self) -> None:
         return None
 

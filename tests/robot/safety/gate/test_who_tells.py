@@ -38,6 +38,9 @@ class Way:
     def write(self, velocity):
         self.stage.told.append((self.stage.now, self.who, velocity))
 
+    def unread(self):
+        return ""
+
     def listeners(self):
         return frozenset({"/base"})
 

@@ -63,6 +63,10 @@ class Ros1Wheels:
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
 
+    def unread(self) -> str:
+        """Wheels: not known; nothing is acknowledged."""
+        return ""
+
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""
         return frozenset(self._publication.subscribers)

@@ -20,6 +20,7 @@ from skytether.ros.ros2.qos import Qos
 from skytether.ros.ros2.seam import GraphNode, Ros2Error
 from skytether.ros.ros2.sim_time import GraphClock
 
+from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
 from .sections import Ros2Way
 
@@ -33,16 +34,15 @@ class Ros2Wheels:
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
-        fresh_s: Nobody gets a velocity or a level that is older [s]: the program that has the node sends them, and it,
-            or this process, may stand still meanwhile. While it does, nobody listens.
-        brakes_s: Within this time the gate stops the wheels if the writer is gone [s].
+        timing: Nobody gets a velocity or a level that is older than `WheelsTiming.fresh_s`: the program that has the
+            node sends them, and it, or this process, may stand still meanwhile. While it does, nobody listens.
         enable_topic: Of the enable signal, std_msgs/msg/Bool; empty: there is none.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros2Way, role: str, fresh_s: float, brakes_s: float = 0.0, enable_topic: str = "") -> None:
+    def __init__(self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "") -> None:
         self._way = way
         self._node = _start(way, role)
         self._clock = GraphClock(self._node)
@@ -50,7 +50,10 @@ class Ros2Wheels:
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
-        self._publication = self._node.publish(endpoint, farewell=farewell, farewell_after_s=brakes_s, fresh_s=fresh_s)
+        self._patience_s = timing.guard_s
+        self._publication = self._node.publish(
+            endpoint, farewell=farewell, farewell_after_s=timing.brakes_s, fresh_s=timing.fresh_s
+        )
         self._watch = None
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
@@ -58,7 +61,7 @@ class Ros2Wheels:
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
-            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE), fresh_s=fresh_s)
+            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE), fresh_s=timing.fresh_s)
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
@@ -77,6 +80,13 @@ class Ros2Wheels:
     def full(self) -> bool:
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
+
+    def unread(self) -> str:
+        """Wheels: who listens, if not all of them acknowledge; the middleware does not tell who it is."""
+        if self._publication.unread_s <= self._patience_s:
+            return ""
+        names = sorted({endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.SUBSCRIPTION)})
+        return f"{self._topic} is not acknowledged by {' or '.join(names)}; they are braked until it is"
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, none while they cannot be told anything."""

@@ -75,7 +75,7 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
     def open_wheels(self, way: Ros2Way, role: Role, timing: WheelsTiming, enable_topic: str) -> Wheels:
         from .gate_io import Ros2Wheels
 
-        return Ros2Wheels(way, role, timing.fresh_s, timing.brakes_s, enable_topic)
+        return Ros2Wheels(way, role, timing, enable_topic)
 
     def open_display(self, way: Ros2Way, topic: str) -> Display:
         from .gate_io import Ros2Display

@@ -97,7 +97,7 @@ class Writer:
         told = self._tell(now)
         self._due = self._watch.due(now, self._repeat_s) if told else now + self._period / 2
         try:
-            self._guard.send(pack_answer(Answer(now)))
+            self._guard.send(pack_answer(Answer(now, stopped=self._teller.unread)))
         except BlockingIOError:
             pass
         except OSError:

@@ -19,13 +19,15 @@ from skytether.bridge.calls import CallError
 from ..dialect import Endpoint
 from ..qos import Qos, follow
 from .overrun import Overrun
-from .side.frames import Frame, Kind, control, fresh, numbered, pull_number
+from .side.frames import Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_number
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)
 
 MAX_WAITING = 1000
 """Messages that wait for the node's program where none may be dropped."""
+_LATELY_S = 1.0
+"""What the program said longer ago is of before a pause in the publishing."""
 MAX_CALLS = 64
 """Requests and answers that wait for it."""
 
@@ -110,6 +112,8 @@ class Publication(Handle):
         self._numbers = itertools.count(1)
         self._waiting: deque[tuple[int, float]] = deque()
         """Number and time [s] of each that the program has not dealt with, where `fresh_s` says how old one may get."""
+        self._unread: tuple[float, float] = (0.0, 0.0)
+        """When the program said for how long what was published is unread, and that [s]."""
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
@@ -133,6 +137,16 @@ class Publication(Handle):
         with self._lock:
             return bool(self._waiting) and not 0 <= _now() - self._waiting[0][1] <= self._fresh_s
 
+    @property
+    def unread_s(self) -> float:
+        """For how long somebody who listens, and did, has not acknowledged what is published [s].
+
+        Known while messages with `fresh_s` are published, of who is reliable, and acknowledges each before the next.
+        """
+        with self._lock:
+            at, unread_s = self._unread
+        return unread_s if 0 <= _now() - at <= _LATELY_S else 0.0
+
     def _fresh(self, body: bytes) -> Frame:
         with self._lock:
             number, now = next(self._numbers), _now()
@@ -140,8 +154,9 @@ class Publication(Handle):
             return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
 
     def take(self, frame: Frame) -> None:
-        number, _ = pull_number(frame.body)
+        number, unread_s = pull_dealt_with(frame.body)
         with self._lock:
+            self._unread = (_now(), unread_s)
             while self._waiting and self._waiting[0][0] <= number:
                 self._waiting.popleft()
 
@@ -149,6 +164,7 @@ class Publication(Handle):
         super().leave()
         with self._lock:
             self._waiting.clear()
+            self._unread = (0.0, 0.0)
 
     def join(self, sender: Sender) -> None:
         ours = self.endpoint

@@ -8,7 +8,8 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, serialised message, which is published until then
-  or never; from the node the number alone: this message, and those before it, wait no more.
+  or never; from the node the number, and float64 seconds for which nobody has acknowledged what was published: this
+  message, and those before it, wait no more.
 """
 
 from __future__ import annotations
@@ -89,6 +90,17 @@ def fresh(channel: int, number: int, until: float, body: bytes) -> Frame:
 def pull_fresh(body: bytes) -> tuple[int, float, bytes]:
     """Number, time and message of `fresh`."""
     return *FRESH.unpack_from(body), body[FRESH.size :]
+
+
+def dealt_with(channel: int, number: int, unread_s: float) -> Frame:
+    """A frame of the node: it is done with a message of `fresh`, and all before it are unread for so long [s]."""
+    return Frame(Kind.FRESH, channel, FRESH.pack(number, unread_s))
+
+
+def pull_dealt_with(body: bytes) -> tuple[int, float]:
+    """Number and seconds of `dealt_with`."""
+    number, unread_s = FRESH.unpack(body)
+    return number, unread_s
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

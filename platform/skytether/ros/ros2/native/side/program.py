@@ -29,7 +29,18 @@ except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
 from . import definitions, graph, types
-from .frames import SHUT_DOWN, Frame, Kind, control, numbered, pull_frame, pull_fresh, pull_number, push_head
+from .frames import (
+    SHUT_DOWN,
+    Frame,
+    Kind,
+    control,
+    dealt_with,
+    numbered,
+    pull_frame,
+    pull_fresh,
+    pull_number,
+    push_head,
+)
 from .outbox import FIRST, Sender
 
 LOOK_S = 0.2
@@ -47,6 +58,7 @@ NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
 FAREWELL_S = 0.3
 """For the last messages to reach who listens."""
+_AT_ONCE = Duration()
 
 
 class _Server:
@@ -106,6 +118,8 @@ class Program:
         self._names: dict[int, str] = {}
         self._publishers: dict[int, Any] = {}
         self._farewells: dict[int, tuple[bytes, float]] = {}
+        self._read_at: dict[int, float] = {}
+        """When all that was published had been acknowledged last, where it was at some time [s]."""
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -188,10 +202,12 @@ class Program:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
             number, until, body = pull_fresh(frame.body)
-            publisher = self._publishers.get(frame.channel)
-            if publisher is not None and time.clock_gettime(time.CLOCK_BOOTTIME) <= until:
-                publisher.publish(body)
-            self._sender.put(numbered(Kind.FRESH, frame.channel, number, b""))
+            publisher, unread_s = self._publishers.get(frame.channel), 0.0
+            if publisher is not None:
+                unread_s = self._unread_s(frame.channel, publisher)
+                if _now() <= until:
+                    publisher.publish(body)
+            self._sender.put(dealt_with(frame.channel, number, unread_s))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -207,6 +223,22 @@ class Program:
                 server.answer(number, body)
             else:
                 server.leave(number)
+
+    def _unread_s(self, channel: int, publisher: Any) -> float:
+        """For how long somebody who listens, and did, has not acknowledged what was published [s].
+
+        Who always takes longer for that than it takes until the next message is not known by it, and never counts.
+        """
+        now = _now()
+        try:
+            read = publisher.wait_for_all_acked(_AT_ONCE)
+        except Exception:  # this middleware does not tell
+            read = True
+        if read and publisher.get_subscription_count():
+            self._read_at[channel] = now
+        elif read:
+            self._read_at.pop(channel, None)
+        return now - self._read_at.get(channel, now)
 
     def _do_publish(
         self,
@@ -275,6 +307,7 @@ class Program:
     def _do_close(self, channel: int) -> None:
         self._names.pop(channel, None)
         self._farewells.pop(channel, None)
+        self._read_at.pop(channel, None)
         server = self._servers.pop(channel, None)
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
@@ -379,6 +412,11 @@ class Program:
         unnamed = {e[0] for e in endpoints if not e[5]}
         self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
         return [e for e in endpoints if e[5] or now - self._unnamed[e[0]] >= NAMED_S]
+
+
+def _now() -> float:
+    """Of the clock that the agent has, too [s]."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def main(arguments: list[str]) -> int:

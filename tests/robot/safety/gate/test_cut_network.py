@@ -1,0 +1,51 @@
+"""A robot whose wheels are on another computer than its gate, and the network between the two is cut: real ROS 2."""
+
+from contextlib import contextmanager
+
+import pytest
+from networks import cable
+
+from skytether.lab.netns import Namespace
+from skytether.lab.safety.robot import PlayedRobot
+from skytether.lab.safety.ros2_hardware import Ros2Hardware
+from skytether.lab.safety.stage import Stage
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros2, pytest.mark.usefixtures("netns")]
+UNHURRIED = {"rate_hz": 20, "guard_s": 0.4, "limits": {"linear_max": 0.5, "angular_max": 0.8, "max_gap_s": 0.4}}
+CUT_S = 2.0
+"""Longer than any wheels may turn without a word, shorter than DDS takes to miss a participant."""
+
+
+@contextmanager
+def two_computers():
+    """The robot's own, and that of its wheels and sensors."""
+    with Namespace() as ours, Namespace() as wheels:
+        cable(ours, wheels, ("eth0", "10.9.0.1/24"), ("eth0", "10.9.0.2/24"))
+        for where in (ours, wheels):
+            where.ip("route", "add", "default", "dev", "eth0")  # for multicast, by which nodes are found
+        yield ours, wheels
+
+
+def test_wheels_that_were_cut_off_hear_a_standstill_first(tmp_path, ros2, monkeypatch):
+    """They had stopped by themselves, and the first that they heard again was full speed."""
+    monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    with two_computers() as (ours, wheels):
+
+        def cut():
+            with PlayedRobot(
+                tmp_path, UNHURRIED, hardware=lambda folder: wheels.run(lambda: Ros2Hardware(folder))
+            ) as robot:
+                robot.go()
+                stage = Stage(robot)
+                wheels.ip("link", "set", "eth0", "down")
+                stage.expect(lambda: "is not acknowledged by /played_hardware" in robot.log.read_text(), "it is named")
+                stage.sleep(CUT_S)
+                wheels.ip("link", "set", "eth0", "up")
+                wheels.ip("route", "add", "default", "dev", "eth0")
+                stage.drives_on("the robot drives on when the network is there again")
+                return stage.finding()
+
+        finding = ours.run(cut)
+    assert [violation.text for violation in finding.violations] == []
+    assert finding.velocity_max > 0.4
