@@ -5,18 +5,19 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 import yaml
-from ros2_nodes import ros2_nodes, until
+from ros2_nodes import far_nodes, ros2_nodes, until
 
 from skytether.api.client import Client
 from skytether.api.manifest import Manifest
 from skytether.api.rest import RobotCreate, SiteCreate
 from skytether.lab.embedded import EmbeddedOrchestrator
 
-__all__ = ["ros2_nodes"]
+__all__ = ["far_nodes", "ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2]
 
 ROOT = Path(__file__).parents[4]
@@ -212,6 +213,46 @@ def test_the_check_looks_topic_by_topic(ros2_nodes, config, skytether):
     examined = skytether("doctor", str(config), "--json")
     findings = [f for f in json.loads(examined.communicate(timeout=60)[0]) if f["check"] in ("types", "ros graph")]
     assert {f["state"] for f in findings} == {"ok"}
+
+
+LATE = """
+from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import LaserScan
+
+say("ready")
+sys.stdin.readline()
+node.destroy_node()
+rclpy.shutdown()
+rclpy.init(domain_id=DOMAIN)
+node = rclpy.create_node("base")
+wheels = node.create_subscription(TwistStamped, "/base/cmd_vel", lambda m: None, 10)
+time.sleep(3.0)
+laser = rclpy.create_node("laser")
+scans = laser.create_publisher(LaserScan, "/scan", qos(reliable=False, depth=5))
+say("all there")
+"""
+"""Is running already, in another domain: its nodes are there within a moment when they are told to."""
+
+
+def test_the_check_waits_for_a_graph_that_is_discovered_after_ten_seconds(ros2_nodes, far_nodes, config, skytether):
+    """The first node after 10 s, the next after another 3: of neither is said that it is not there."""
+    change(config)
+    late = far_nodes.start(f"DOMAIN = {ros2_nodes.domain}\n{LATE}")
+    process = skytether("robot", "run", str(config), "--check")
+    until(programs, "our node to begin")
+    time.sleep(10.5)  # what this is about; it joins a second after it begins, and then waits for 12
+    assert process.poll() is None
+    late.tell("come")
+    found, said = process.communicate(timeout=60)
+    assert late.next() == "all there"
+    plain = " ".join(found.split())
+    assert process.returncode == 0, found + said
+    assert "all is there" in found + said
+    assert "2 other nodes are seen" in plain
+    assert "from /laser" in plain
+    assert "is listened to" in plain
+    assert "no other node" not in plain + said
+    assert "nobody" not in plain + said
 
 
 def test_the_check_names_wheels_that_get_nothing_because_of_their_quality(ros2_nodes, config, skytether):
