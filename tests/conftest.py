@@ -119,6 +119,7 @@ TOGETHER = (
     "robot/control/test_supervisor.py",
     "robot/offload/test_task_manager.py",
     "ros/ros1/",
+    "ros/ros2/test_console.py",
     "ros/ros2/test_display.py",
     "ros/ros2/test_gate.py",
     "ros/ros2/native/",
