@@ -1,10 +1,28 @@
-"""``--option KEY=VALUE``, as several commands take it."""
+"""``--option KEY=VALUE``, and what is asked for, as several commands take them."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from .output import fail
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+_Request = TypeVar("_Request", bound="BaseModel")
+
+
+def checked(kind: type[_Request], asked: Mapping[str, Any]) -> _Request:
+    """A request as it is asked for; one that cannot be ends the command with a sentence."""
+    from pydantic import ValidationError
+
+    from skytether.api.validation_errors import explain
+
+    try:
+        return kind.model_validate(asked)
+    except ValidationError as error:
+        fail("; ".join(str(fault) for fault in explain(error, kind)), 2)
 
 
 def options_of(entries: list[str] | None) -> dict[str, Any]:

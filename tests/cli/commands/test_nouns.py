@@ -203,9 +203,10 @@ def test_a_wrong_file_is_one_sentence(run: Run, tmp_path: Path, text: str | None
         (["site", "delete", "locl"], 1, "there is no site 'locl'; known are: local; did you mean 'local'?"),
         (["robot", "delete", "nobody"], 1, "there is no robot 'nobody'; known are: "),
         (["token", "delete", "0"], 1, "there is no token '0'; known are: "),
-        (["instance", "create", "toy", "--robot", "R!"], 2, "robot: "),
+        (["instance", "create", "toy", "--robot", "R!"], 2, "robot: string should match pattern"),
+        (["token", "create", "R!", "--scope", "read"], 2, "name: string should match pattern"),
         (["instance", "create", "toy", "--robot", "r", "--params", "{"], 2, "--params is no JSON"),
-        (["instance", "create", "toy", "--robot", "r", "--params", "[]"], 2, "params: "),
+        (["instance", "create", "toy", "--robot", "r", "--params", "[]"], 2, "params: must be a mapping"),
         (["robot", "add", "R!"], 2, "'R!' is no name"),
         (["site", "list", "--token-file", "/nowhere"], 2, "there is no token file /nowhere"),
         (

@@ -8,7 +8,7 @@ import typer
 
 from .. import names
 from ..connection import Json, TokenFile, Url, connected
-from ..options import value_of
+from ..options import checked, value_of
 from ..output import console, fail, or_dash, plain, print_json, print_table, show
 
 if TYPE_CHECKING:
@@ -85,10 +85,7 @@ def add_group(
     json: Json = False,
 ) -> None:
     """Add a group. It makes machines, so only the token in the orchestrator's state folder may."""
-    from pydantic import ValidationError
-
     from skytether.api.groups import GroupCreate
-    from skytether.api.validation_errors import explain
 
     given = {
         "name": name,
@@ -107,10 +104,7 @@ def add_group(
         "join_timeout_s": join_timeout_s,
         "parallel": parallel,
     }
-    try:
-        request = GroupCreate.model_validate(given)
-    except ValidationError as error:
-        fail("; ".join(str(fault) for fault in explain(error, GroupCreate)), 2)
+    request = checked(GroupCreate, given)
     with connected(url, token_file) as client:
         made = client.create_group(request)
     show(made, json)

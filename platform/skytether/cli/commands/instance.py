@@ -10,6 +10,7 @@ import typer
 from .. import names
 from ..connection import Json, TokenFile, Url, connected
 from ..names import InstanceId
+from ..options import checked
 from ..output import console, fail, or_dash, plain, print_foreign, print_json, print_table, show
 from ..waiting import until_resized, until_running
 
@@ -60,18 +61,14 @@ def create_instance(
     json: Json = False,
 ) -> None:
     """Run a service by hand, for tests; robots ask by themselves."""
-    from pydantic import ValidationError
-
     from skytether.api.rest import InstanceCreate
 
     try:
         values = json_module.loads(params)
-        request = InstanceCreate(robot=robot, service=service, params=values, lease_s=lease_s)
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg']}", 2)
     except ValueError as error:
         fail(f"--params is no JSON: {error}", 2)
+    asked = {"robot": robot, "service": service, "params": values, "lease_s": lease_s}
+    request = checked(InstanceCreate, asked)
     with connected(url, token_file) as client:
         made = client.create_instance(request)
         made = until_running(client, made.id, timeout_s) if wait else made

@@ -9,7 +9,8 @@ import typer
 from .. import names
 from ..connection import Json, TokenFile, Url, connected
 from ..names import need
-from ..output import console, fail, or_dash, plain, print_json, print_table
+from ..options import checked
+from ..output import console, or_dash, plain, print_json, print_table
 
 if TYPE_CHECKING:
     from skytether.api.rest import TokenCreated
@@ -56,16 +57,10 @@ def create_token(
     json: Json = False,
 ) -> None:
     """Make a token. It is printed on standard output, this once."""
-    from pydantic import ValidationError
-
     from skytether.api.rest import TokenCreate
 
     asked = {"name": name, "robot": robot, "scopes": scope or (), "ttl_s": None if days is None else days * _DAY}
-    try:
-        request = TokenCreate.model_validate(asked)
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{first['loc'][0]}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
+    request = checked(TokenCreate, asked)
     with connected(url, token_file) as client:
         _show(client.create_token(request), json)
 

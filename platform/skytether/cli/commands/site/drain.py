@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,13 +37,9 @@ def drain_site(
     """
     with connected(url, token_file) as client:
         site = client.drain_site(name)
-        deadline, told = time.monotonic() + timeout_s, ""
-        while wait and site.instances:
-            told = _tell(_left(site), told)
-            if time.monotonic() >= deadline:
-                fail(f"{_left(site)}; `skytether instance list` says why")
-            time.sleep(_POLL_S)
-            site = _look(client, name) or site
+        if wait:
+            advice = "; `skytether instance list` says why"
+            site = _until(client, site, lambda now: _left(now) if now.instances else "", timeout_s, advice)
     if json:
         print_json(plain(site))
     else:
@@ -63,13 +60,8 @@ def resume_site(
     """
     with connected(url, token_file) as client:
         site = client.resume_site(name)
-        deadline, told = time.monotonic() + timeout_s, ""
-        while wait and site.state != "ready":
-            told = _tell(text := f"site {name} is {site.state}: {site.reason}", told)
-            if time.monotonic() >= deadline:
-                fail(text)
-            time.sleep(_POLL_S)
-            site = _look(client, name) or site
+        if wait:
+            site = _until(client, site, _not_ready, timeout_s)
     if json:
         print_json(plain(site))
     else:
@@ -116,6 +108,30 @@ def remove_site(
 
 def _left(site: Site) -> str:
     return f"{site.instances} instances are at site {site.name} still"
+
+
+def _not_ready(site: Site) -> str:
+    return "" if site.state == "ready" else f"site {site.name} is {site.state}: {site.reason}"
+
+
+def _until(client: Client, site: Site, missing: Callable[[Site], str], timeout_s: float, advice: str = "") -> Site:
+    """Wait for a site, and tell each change of what is missing.
+
+    Args:
+        client: The orchestrator.
+        site: As it is now.
+        missing: One sentence; empty: nothing.
+        timeout_s: After that the command fails with the sentence.
+        advice: After it then.
+    """
+    deadline, told = time.monotonic() + timeout_s, ""
+    while text := missing(site):
+        told = _tell(text, told)
+        if time.monotonic() >= deadline:
+            fail(text + advice)
+        time.sleep(_POLL_S)
+        site = _look(client, site.name) or site
+    return site
 
 
 def _look(client: Client, name: str) -> Site | None:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ...connection import Json, TokenFile, Url, connected
 from ...names import SiteName
-from ...options import options_of
+from ...options import checked, options_of
 from ...output import console, fail, or_dash, plain, print_json, print_table, show
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from skytether.api.rest import Site
 
-_M = TypeVar("_M", bound="BaseModel")
 Speed = Annotated[float, typer.Option(min=0.001, help="Of one core, beside the one services are stated for.")]
 Cost = Annotated[float, typer.Option(min=0, help="Of one instance, for placement.")]
 Images = Annotated[
@@ -79,7 +75,7 @@ def add_site(
         "speed": speed,
         "cost": cost,
     }
-    request = _checked(SiteCreate, {**asked, "images": tuple(image or ("*",))})
+    request = checked(SiteCreate, {**asked, "images": tuple(image or ("*",))})
     with connected(url, token_file) as client:
         made = client.create_site(request)
     show(made, json)
@@ -126,7 +122,7 @@ def invite_node(
     from skytether.api.rest import Invite
 
     asked = {"name": name, "tier": tier, "options": options_of(option), "speed": speed, "cost": cost}
-    request = _checked(Invite, {**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
+    request = checked(Invite, {**asked, "images": tuple(image or ("*",)), "ttl_s": _seconds(valid)})
     with connected(url, token_file) as client:
         made = client.invite(request)
     if json:
@@ -139,17 +135,6 @@ def invite_node(
     console.print(f"  skytether site join {where} --token-file -", markup=False, soft_wrap=True)
     console.print("with this token, which cannot be shown again:", markup=False)
     typer.echo(made.token)
-
-
-def _checked(kind: type[_M], asked: Mapping[str, object]) -> _M:
-    """A request as it is asked for; one that cannot be ends the command with a sentence."""
-    from pydantic import ValidationError
-
-    try:
-        return kind.model_validate(asked)
-    except ValidationError as error:
-        first = error.errors()[0]
-        fail(f"{'.'.join(str(p) for p in first['loc'])}: {first['msg'][:1].lower()}{first['msg'][1:]}", 2)
 
 
 def _seconds(text: str) -> float:
