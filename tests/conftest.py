@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes.util
+import gc
 import os
 import secrets
 import shutil
@@ -11,6 +12,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Generator, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -186,9 +188,12 @@ _OPEN = pytest.StashKey[int]()
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what `make test` runs two at a time, and what it may run again."""
     here = Path(__file__).parent
-    for item in items:
-        if item.path.is_relative_to(here):
-            name = f"{item.path.relative_to(here).as_posix()}::{item.name}"
+    for path, ours in groupby(items, key=lambda item: item.path):
+        if not path.is_relative_to(here):
+            continue
+        file = path.relative_to(here).as_posix()
+        for item in ours:
+            name = f"{file}::{item.name}"
             if name.startswith(TOGETHER) and not name.startswith(ALONE):
                 item.add_marker(pytest.mark.together)
                 if item.get_closest_marker("docker") or name.startswith(FIRST_ROW):
@@ -203,6 +208,18 @@ def pytest_configure() -> None:
     """Started in the background of a script, a program has its interrupt signal ignored, and so have its children."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection() -> None:
+    """Nothing of what is collected goes before the end: to look for it again and again takes 2 s."""
+    gc.disable()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Nor does the collector look through all of that in each test in which it comes along: it would take 1 s."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)
