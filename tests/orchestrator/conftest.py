@@ -16,9 +16,13 @@ import pytest
 import uvicorn
 from node_scene import NodeScene, ReachedRuntime, find_runtime
 from reconcile_bench import Bench
+from sqlalchemy import create_engine
+from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate
+from skytether.node import join as node_join
+from skytether.node import run as node_run
 from skytether.orchestrator.config.settings import Nodes, Settings, Timing
 from skytether.orchestrator.core import Orchestrator
 from skytether.orchestrator.domain.records import Record
@@ -29,6 +33,7 @@ from skytether.orchestrator.http.server import listening
 from skytether.orchestrator.scheduling import catalog as catalog
 from skytether.orchestrator.scheduling import runtime_entry_points
 from skytether.orchestrator.scheduling.runtime_entry_points import load_runtime
+from skytether.orchestrator.store import engine
 from skytether.orchestrator.store.store import Store
 from skytether.testing import runtimes
 from skytether.testing.runtimes import FakeRuntime
@@ -121,6 +126,16 @@ def refusals_are_not_waited_for() -> Iterator[None]:
     """Hundreds of tests ask what they may not; those of `RefusalDelay` have their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(app, "RefusalDelay", partial(RefusalDelay, 0.0))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def statements_are_compiled_once() -> Iterator[None]:
+    """Each engine would compile each anew, which takes as long as to execute it a few times."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SQLiteDialect_pysqlite, "__eq__", lambda one, other: type(one) is type(other))
+        patch.setattr(SQLiteDialect_pysqlite, "__hash__", lambda one: hash(type(one)))
+        patch.setattr(engine, "create_engine", partial(create_engine, execution_options={"compiled_cache": {}}))
         yield
 
 
@@ -277,8 +292,12 @@ def later() -> Later:
 
 
 @pytest.fixture
-def nodes(tmp_path: Path, server: Server, later: Later) -> Iterator[NodeScene]:
-    """An orchestrator that machines join, and its machines."""
+def nodes(tmp_path: Path, server: Server, later: Later, monkeypatch: pytest.MonkeyPatch) -> Iterator[NodeScene]:
+    """An orchestrator that machines join, and its machines, which wait a tenth of what they would."""
+    monkeypatch.setattr(node_join, "_POLL_S", 0.02)
+    monkeypatch.setattr(node_join, "_LEFT_S", 0.1)
+    monkeypatch.setattr(node_run, "_AGAIN_S", 0.1)
+    monkeypatch.setattr(node_run, "_LOOK_AWAY_S", 0.1)
     ReachedRuntime.worlds.clear()
     state = tmp_path / "state"
     state.mkdir(mode=0o700)

@@ -27,7 +27,7 @@ from .run import NodeProgram
 from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
 
 _TOKEN = re.compile(r"sky-[0-9a-f]{64}\.[0-9a-f]{64}")
-_POLL_S = 0.1
+_POLL_S, _LEFT_S = 0.1, 1.0
 _READY_S = 300.0
 """By when a site that joined has answered: a slow machine takes a minute to start a program."""
 _LOOK_S = 5.0
@@ -368,7 +368,7 @@ def _leave(
                 f"{text}; nothing else takes them, perhaps: `skytether instance list` says why. They stay, and so does "
                 "the site; with --force it ends with them"
             )
-        time.sleep(1.0)
+        time.sleep(_LEFT_S)
 
 
 def _ask_any(config: NodeConfig, trust: ssl.SSLContext, asked: Leave) -> Stands:

@@ -19,6 +19,7 @@ from skytether.node import calls, checks, join, unit
 from skytether.node.calls import RefusedError, first_call, trusting
 from skytether.node.join import ChecksError, leave
 from skytether.node.store import NodeError, NodeStore, new_key, request_for
+from skytether.orchestrator.http import node_echo
 
 DAY = 86_400.0
 
@@ -379,12 +380,15 @@ def test_an_address_that_somebody_named_stays(nodes: NodeScene) -> None:
     assert nodes.operator.get_site("edge").options["advertise_host"] == "127.0.0.1"
 
 
-def test_the_echo_of_a_machine_that_joins_answers_the_orchestrator_or_it_is_told(nodes: NodeScene) -> None:
+def test_the_echo_of_a_machine_that_joins_answers_the_orchestrator_or_it_is_told(
+    nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("0.0.0.0", 0))
         port = free.getsockname()[1]
     assert nodes.join(echo=port).stands.echo is True
     nodes.engine("other")
+    monkeypatch.setattr(node_echo, "_ASK_S", 0.05)  # nobody is there who could answer
     # Robots would be told an address at which nobody passes on what comes for this machine.
     assert (
         join.join(nodes.options(nodes.invite("other"), "other", echo=port, advertise="192.0.2.1")).stands.echo is False
