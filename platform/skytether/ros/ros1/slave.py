@@ -107,6 +107,8 @@ class _Handler(SimpleXMLRPCRequestHandler):
 class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     daemon_threads = True
     block_on_close = False
+    request_queue_size = _MOST
+    """Who finds no room in it comes again after a second, by its kernel's timer."""
     trusts: Callable[[str], bool]
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
