@@ -104,10 +104,11 @@ class _Watcher:
 class UnrulyCluster:
     """Use within ``running``. What has no underscore may be called from any thread."""
 
-    def __init__(self, seed: int, *, fails: float = 0.0) -> None:
-        """``fails``: the chance of a run to fail at once."""
+    def __init__(self, seed: int, *, fails: float = 0.0, pace: float = 1.0) -> None:
+        """``fails``: the chance of a run to fail at once; ``pace``: how quick its nodes are, beside real ones."""
         self.regime = CALM
         self.fails = fails
+        self._pace = pace
         self.minor = 33
         """Of its version; `pods/resize` is there from 33 on."""
         self.no_room = ""
@@ -284,7 +285,7 @@ class UnrulyCluster:
     async def _live(self, namespace: str, name: str, uid: str) -> None:
         """A pod's life on its node."""
         rng, run = self._rng, self.runs[uid]
-        await asyncio.sleep(rng.uniform(0.01, 0.1))
+        await asyncio.sleep(rng.uniform(0.01, 0.1) / self._pace)
         pod = self._pod(namespace, name, uid)
         if pod is None:
             run.over = True
@@ -293,13 +294,13 @@ class UnrulyCluster:
         pod["status"]["hostIP"] = "10.0.0.1"
         self._changed(namespace, "pods", pod, "MODIFIED")
         while name not in self._of(namespace, "secrets"):
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.1 / self._pace)
             pod = self._pod(namespace, name, uid)
             if pod is None or run.over:
                 run.over = True
                 return
         self._begin(run)
-        await asyncio.sleep(rng.uniform(0.1, 0.6))
+        await asyncio.sleep(rng.uniform(0.1, 0.6) / self._pace)
         pod = self._pod(namespace, name, uid)
         if pod is None or run.over or run.ending:
             return
@@ -309,10 +310,10 @@ class UnrulyCluster:
         pod["status"] |= {"phase": "Running", "podIP": "10.1.0.1", "containerStatuses": [status]}
         self._changed(namespace, "pods", pod, "MODIFIED")
         if rng.random() < self.fails:
-            await asyncio.sleep(rng.uniform(0.05, 0.5))
+            await asyncio.sleep(rng.uniform(0.05, 0.5) / self._pace)
             self._ended(namespace, name, uid, "Error")
             return
-        await asyncio.sleep(rng.uniform(0.1, 0.4))
+        await asyncio.sleep(rng.uniform(0.1, 0.4) / self._pace)
         pod = self._pod(namespace, name, uid)
         if pod is not None and not run.over and not run.ending:
             pod["status"]["containerStatuses"][0] |= _container(started=True)
@@ -346,10 +347,10 @@ class UnrulyCluster:
             if held := self._held.get(uid):
                 await held.wait()
             takes = 0.0 if run.over else self._rng.choice([min(within_s, 0.2), within_s])
-            await asyncio.sleep(takes + self._rng.uniform(0.05, 0.4))
+            await asyncio.sleep(takes + self._rng.uniform(0.05, 0.4) / self._pace)
             self._ended(namespace, name, uid, reason)
             if remove and self._pod(namespace, name, uid):
-                await asyncio.sleep(self._rng.uniform(0.0, 0.3))
+                await asyncio.sleep(self._rng.uniform(0.0, 0.3) / self._pace)
                 if self._pod(namespace, name, uid):
                     self._drop(namespace, "pods", name)
 
@@ -370,7 +371,7 @@ class UnrulyCluster:
                     if ns == namespace and owner in [o["uid"] for o in one["metadata"].get("ownerReferences") or ()]:
                         self._drop(ns, kind, name)
 
-        self._loop.call_later(self._rng.uniform(0.3, 3.0), collect)
+        self._loop.call_later(self._rng.uniform(0.3, 3.0) / self._pace, collect)
 
     def _delete(self, namespace: str, kind: str, name: str, options: Document) -> tuple[int, Document]:
         there = self._of(namespace, kind).get(name)

@@ -126,8 +126,10 @@ def test_one_customers_network_is_one_address() -> None:
     assert place_of("unix") == "unix"
 
 
-async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtocol) -> tuple[bytes, list[str]]:
-    """All that a real connection is sent, until it is closed, and the paths that were served.
+async def answers_to(
+    *asked: bytes, make: type[GuardedProtocol] = GuardedProtocol, end: bytes = b""
+) -> tuple[bytes, list[str]]:
+    """All that a real connection is sent, until it is closed or ends as told, and the paths that were served.
 
     Each part of what is asked is sent, and read, for itself, before there is an answer.
     """
@@ -160,7 +162,7 @@ async def answers_to(*asked: bytes, make: type[GuardedProtocol] = GuardedProtoco
             sent.set()
             answers = b""
             with contextlib.suppress(OSError):
-                answers = await reader.read()
+                answers = await (reader.readuntil(end) if end else reader.read())
             writer.close()
         finally:
             door.close()
@@ -178,7 +180,7 @@ def test_a_connection_leaves_nothing_that_waits_for_the_collector() -> None:
 
     gc.disable()
     try:
-        answer, served = asyncio.run(answers_to(get("/a"), make=Watched))
+        answer, served = asyncio.run(answers_to(get("/a"), make=Watched, end=OK))
         assert (answer[-2:], served) == (b"ok", ["/a"])
         assert [protocol() for protocol in made] == [None]
     finally:
@@ -203,6 +205,7 @@ def test_who_sends_on_and_on_instead_of_waiting_is_cut_off() -> None:
     assert (answers, served) == (b"", ["/a"])
 
 
+OK = b"\r\n\r\nok"
 TOO_LARGE = b"The request's headers are too large."
 
 
@@ -226,10 +229,11 @@ def test_a_head_is_bounded_before_it_is_complete(asked: tuple[bytes, ...]) -> No
 
 def test_heads_and_bodies_as_people_send_them_are_served() -> None:
     headers = b"Host: localhost\r\n" + b"".join(b"x-%d: %s\r\n" % (n, b"v" * 200) for n in range(98))
-    answers, served = asyncio.run(answers_to(b"GET /a?q=" + b"v" * 8_000 + b" HTTP/1.1\r\n" + headers + b"\r\n"))
+    head = b"GET /a?q=" + b"v" * 8_000 + b" HTTP/1.1\r\n" + headers + b"\r\n"
+    answers, served = asyncio.run(answers_to(head, end=OK))
     assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/a"])
     body = b"POST /b HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\n" + b"v" * 100_000
-    answers, served = asyncio.run(answers_to(body))
+    answers, served = asyncio.run(answers_to(body, end=OK))
     assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/b"])
 
 
@@ -243,7 +247,7 @@ def test_what_comes_after_a_body_is_no_header() -> None:
 
     head = b"POST /a HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
     chunks = b"1\r\nx\r\n0\r\nauthorization: x\r\n\r\n"
-    answers, served = asyncio.run(answers_to(head + chunks, make=Watched))
+    answers, served = asyncio.run(answers_to(head + chunks, make=Watched, end=OK))
     assert (answers[:15], served) == (b"HTTP/1.1 200 OK", ["/a"])
     assert [name for name, _ in seen] == [b"host", b"transfer-encoding"]
 

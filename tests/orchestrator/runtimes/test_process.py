@@ -21,6 +21,7 @@ from skytether.api.manifest import ServiceSpec
 from skytether.orchestrator.domain.errors import InvalidError
 from skytether.orchestrator.domain.validation import parse
 from skytether.orchestrator.runtimes.base import Launch, Observation, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.notes import noted_port
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 from skytether.orchestrator.runtimes.procfs import (
     BOOT_ID,
@@ -32,6 +33,8 @@ from skytether.orchestrator.runtimes.procfs import (
 )
 
 KEY = base64.b64encode(bytes(range(32))).decode()
+NESTED = b"[" * 60_000
+"""No JSON that a reader should follow."""
 
 
 def launch(attempt: int = 1, entrypoint: str = "skytether.testing.toy_service", **params: Any) -> Launch:
@@ -415,7 +418,7 @@ def test_a_folder_that_cannot_be_written_is_a_failure_in_words(open_runtime: Ope
         b"rubbish",
         b"[1]",
         b"\xff\xfe",
-        b"[" * 60_000,
+        NESTED,
         b'{"port": "x"}',
         b'{"port": true}',
         b'{"port": 0}',
@@ -426,10 +429,15 @@ def test_a_folder_that_cannot_be_written_is_a_failure_in_words(open_runtime: Ope
         b'{"port": 1' + b" " * (1 << 20) + b"}",
     ],
 )
-def test_a_ready_file_with_rubbish_in_it_is_no_ready_file(tmp_path: Path, open_runtime: Open, content: bytes) -> None:
+def test_rubbish_notes_no_port(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "ready.json").write_bytes(content)
+    assert noted_port(tmp_path / "ready.json") is None
+
+
+def test_a_ready_file_with_rubbish_in_it_is_no_ready_file(tmp_path: Path, open_runtime: Open) -> None:
     runtime = open_runtime()
     runtime.start(launch(entrypoint="this"))
-    (tmp_path / "instances/i1/own/ready.json").write_bytes(content)
+    (tmp_path / "instances/i1/own/ready.json").write_bytes(NESTED)
     assert runtime.observe()["i1"].port is None
     assert until(runtime, Phase.EXITED).port is None
     runtime.start(launch(attempt=2, entrypoint="this"))  # it is read once more, for the port to keep

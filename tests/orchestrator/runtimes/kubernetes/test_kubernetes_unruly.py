@@ -24,7 +24,7 @@ Open = Callable[..., KubernetesRuntime]
 
 @pytest.fixture
 def cluster() -> Iterator[UnrulyCluster]:
-    made = UnrulyCluster(16)
+    made = UnrulyCluster(16, pace=10)
     with made.running():
         yield made
 

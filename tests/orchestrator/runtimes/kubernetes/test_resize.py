@@ -32,7 +32,7 @@ SPEC = ServiceSpec.model_validate({"image": "registry.invalid/toy:1", "needs": {
 
 @pytest.fixture
 def cluster() -> Iterator[UnrulyCluster]:
-    made = UnrulyCluster(17)
+    made = UnrulyCluster(17, pace=10)
     with made.running():
         yield made
 
