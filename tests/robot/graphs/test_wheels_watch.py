@@ -1,6 +1,6 @@
 import pytest
 
-from skytether.robot.graphs.wheels_watch import MOST, UNNAMED, Others, WheelsWatch, strangers
+from skytether.robot.graphs.wheels_watch import LEFT_BEHIND, MOST, UNNAMED, Others, WheelsWatch, strangers
 
 OURS = ("/skytether_guard", "/skytether_gate")
 
@@ -57,4 +57,20 @@ def test_a_graph_that_does_not_answer_tells_nothing_new():
     watch.look()
     watch.look()
     assert watch.others == Others(("/teleop",), 1)
+    watch.close()
+
+
+def test_another_gate_of_our_configuration_is_named_and_a_killed_writer_is_not():
+    """Two gates with folders of their own drove the same wheels, and neither status said so."""
+    found = [*OURS, OURS[0]]
+    watch = WheelsWatch("/cmd_vel", OURS, lambda: found, look_s=3600)
+    for _ in range(LEFT_BEHIND):
+        watch.look()
+    found.remove(OURS[0])
+    watch.look()
+    assert watch.others == Others((), 0)
+    found.append(OURS[0])
+    for _ in range(LEFT_BEHIND + 1):
+        watch.look()
+    assert watch.others == Others(("another /skytether_guard",), 1)
     watch.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ from skytether.robot.graphs.registry import GRAPHS, keys
 from skytether.robot.safety.config.safety_config import NO_GATE, WITHOUT_SECTION, SafetyConfig
 from skytether.ros.names import namespace_of
 from skytether.ros.ros1.arguments import RosArguments
+
+_ALIKE = 0.8
+"""From here on a key is taken for a misspelt one."""
 
 
 class _GateFile(BaseModel):
@@ -37,6 +41,10 @@ class _GateFile(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _take_from_the_robot(cls, document: Any) -> Any:
+        if isinstance(document, dict) and "safety" not in document:  # a slip must not be a gate without sensors
+            meant = [key for key in document if get_close_matches("safety", [str(key).lower()], cutoff=_ALIKE)]
+            if meant:
+                raise ValueError(f"the key {meant[0]!r} is unknown, did you mean 'safety'?")
         return inherit(document)
 
 

@@ -17,6 +17,8 @@ LOOK_S = 1.0
 """Between looks."""
 MOST = 16
 """Names that are kept; more than one is one too many already."""
+LEFT_BEHIND = 30
+"""Looks. So long a graph may show a node of ours that was killed, beside the one that is there instead."""
 UNNAMED = "somebody whose name is not told"
 
 
@@ -59,6 +61,24 @@ def strangers(found: Collection[str], own: Collection[str]) -> tuple[str, ...]:
     return tuple(names[:MOST] + ([UNNAMED] if unnamed > hidden else []))
 
 
+class Doubles:
+    """Who has a name of ours and is none of ours: another gate for the same wheels, of the same configuration. Pure.
+
+    Args:
+        own: Names of the nodes that may publish the topic, once each.
+    """
+
+    def __init__(self, own: Collection[str]) -> None:
+        self._own = own
+        self._looks: dict[str, int] = {}
+
+    def look(self, found: Collection[str]) -> tuple[str, ...]:
+        """Names, in words, of those that are there twice for longer than one that was killed is shown."""
+        counts = Counter(found)
+        self._looks = {name: self._looks.get(name, 0) + 1 for name in self._own if counts[name] > 1}
+        return tuple(sorted(f"another {name}" for name, looks in self._looks.items() if looks > LEFT_BEHIND))
+
+
 class WheelsWatch:
     """Looks again and again until closed.
 
@@ -75,6 +95,7 @@ class WheelsWatch:
         self.others = NOBODY
         self._topic = topic
         self._own = own
+        self._doubles = Doubles(own)
         self._find = find
         self._look_s = look_s
         self._ended = threading.Event()
@@ -88,7 +109,7 @@ class WheelsWatch:
         except Exception as error:  # a graph that does not answer tells nothing new
             _log.debug("who publishes %s is not known now", self._topic, exc_info=error)
             return
-        names = strangers(found, self._own)
+        names = (*strangers(found, self._own), *self._doubles.look(found))
         new = [name for name in names if name not in self.others.names]
         for name in new:
             _log.error("%s", sentence(self._topic, [name]))

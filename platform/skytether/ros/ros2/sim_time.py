@@ -11,6 +11,8 @@ from .dialect import Endpoint, Kind
 from .qos import Qos
 from .seam import GraphNode, Handle
 
+_LAST = 2.0**31 - 1
+"""Seconds: a stamp has no more. Whatever ``/clock`` says, the wheels can be told a velocity, or to brake."""
 TOPIC, TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 
 
@@ -50,4 +52,4 @@ class GraphClock:
         except DecodeError as error:
             self._node.report(f"clock {TOPIC}", f"{TOPIC}: {error}")
             return
-        self._told = told.sec + told.nanosec / 1e9
+        self._told = min(max(told.sec + told.nanosec / 1e9, 0.0), _LAST)

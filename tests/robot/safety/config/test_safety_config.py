@@ -180,9 +180,15 @@ def test_a_mistake_names_its_key(load, change, says):
 
 def test_a_section_that_is_missing_or_misspelt_is_named(tmp_path):
     path = tmp_path / "robot.yaml"
-    path.write_text("saftey: {}")
+    path.write_text("limits: {}")
     with pytest.raises(ConfigError, match="safety: is missing"):
         load_safety(path)
+    for slip in ("saftey", "Safety", "safty"):  # with a graph no section is a gate without sensors
+        path.write_text(f"ros2: {{}}\n{slip}: {{footprint: {{radius: 0.3}}, sensors: {{scan: {{}}}}}}")
+        with pytest.raises(ConfigError, match=f"the key '{slip}' is unknown, did you mean 'safety'?"):
+            load_safety(path)
+    path.write_text("ros2: {}\nrobot: walker\nservice: wall-stop")
+    assert load_safety(path).sensors == {}
 
 
 @pytest.mark.parametrize(
