@@ -138,7 +138,7 @@ def say(engine: Engine, sent: bytes, registries: tuple[str, ...] = ()) -> bytes:
             writer.write(sent)
             got = b""
             async with asyncio.timeout(20):
-                while b"Connection: close" not in got and got.count(b"HTTP/1.1 200") < sent.count(b" HTTP/1.1\r\n"):
+                while b"Connection: close" not in got and got.count(b"HTTP/1.1 20") < sent.count(b" HTTP/1.1\r\n"):
                     piece = await reader.read(65536)
                     if not piece:
                         break
@@ -269,6 +269,30 @@ def test_a_container_starts_in_networks_that_are_open_to_it_still(
     assert (b"200 OK" in got) is good
     assert says in got
     assert any(line.endswith("/start") for line in engine.lines) is good
+
+
+@pytest.mark.parametrize(
+    ("mode", "networks", "good"),
+    [
+        ("skytether", {"skytether": {"skytether.io/network": "filtered"}}, True),
+        ("lab", {"lab": {"skytether.io/open": "yes"}}, False),
+        ("lab", {"another": {}}, False),  # it may be made again
+        (f"container:{ID}", {"skytether": {"skytether.io/network": "filtered"}}, False),
+    ],
+)
+def test_a_guard_has_its_right_in_networks_of_orchestrators_alone(
+    engine: Engine, mode: str, networks: dict[str, dict[str, str]], good: bool
+) -> None:
+    """By that it takes any address there, and what is sent to it."""
+    engine.networks, engine.container = networks, {"HostConfig": {"NetworkMode": mode}}
+    guard = CREATED.replace(b'"CapDrop"', b'"CapAdd": ["NET_ADMIN"], "CapDrop"') % f"container:{ID}".encode()
+    got = say(engine, request("POST /v1.41/containers/create", guard))
+    assert (b"no guard has a right in" not in got) is good
+    assert any(line.startswith("POST") for line in engine.lines) is good
+    joins = json.dumps({"Container": ID}).encode()
+    for name, labels in networks.items():
+        got = say(engine, request(f"POST /v1.41/networks/{name}/connect", joins))
+        assert (b"200 OK" in got) is ("skytether.io/network" in labels)
 
 
 def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Engine) -> None:

@@ -137,7 +137,7 @@ def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for
     joins = {"Container": ID, "EndpointConfig": {"IPAMConfig": {}}}
     assert judge(Call("POST", "/networks/n/connect", {}, joins)) == (
         None,
-        (("containers", ID), ("joined networks", "n")),
+        (("containers", ID), ("kept networks", "n")),
     )
 
 
@@ -293,8 +293,10 @@ def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are()
     made = {"Image": "a", "Labels": OWNER, "HostConfig": held}
     assert judge(Call("POST", "/containers/create", {}, made)) == (
         None,
-        (("containers", ID), ("volumes", "skytether-a")),
+        (("containers", ID), ("guarded", ID), ("volumes", "skytether-a")),
     )
+    held.pop("CapAdd")
+    assert judge(Call("POST", "/containers/create", {}, made))[1] == (("containers", ID), ("volumes", "skytether-a"))
     made["HostConfig"] = HOST
     assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
     assert judge(Call("DELETE", "/networks/skytether-n", {}, None)) == (None, (("networks", "skytether-n"),))

@@ -47,6 +47,7 @@ _MARKS = {
     "networks": {NETWORK},
     "seen networks": {NETWORK, OPEN},
     "joined networks": {NETWORK, OPEN},
+    "kept networks": {NETWORK},
 }
 """By kind, labels of which one makes a thing ours."""
 _KNOWN = 4096
@@ -174,6 +175,8 @@ class EngineGate:
                     raise RefusedCall(odd)
             elif subject[0] == "images":
                 await self._may_be_pulled(subject[1])
+            elif subject[0] == "guarded":
+                await self._may_be_guarded(subject[1])
             elif not await self._is_ours(subject):
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
         if call.path.endswith("/archive"):
@@ -188,6 +191,16 @@ class EngineGate:
         known = {_familiar(str(one).partition("@")[0]) for one in digests or ()}
         if status != HTTPStatus.NOT_FOUND and _familiar(image.rpartition(":")[0]) not in known:
             raise RefusedCall(f"the image {image[:80]} of this machine was not pulled from there")
+
+    async def _may_be_guarded(self, container: str) -> None:
+        """Raises unless the network that it is made in is ours, and it is connected to no other but ours after that.
+
+        Who has a guard's right in a network takes others' addresses there.
+        """
+        found = (await self._asked(f"/containers/{container}/json"))[1]
+        mode = str((found.get("HostConfig") or {}).get("NetworkMode"))
+        if not await self._is_ours(("kept networks", mode)):
+            raise RefusedCall(f"no guard has a right in {mode[:80]}, which no orchestrator made")
 
     async def _may_be_opened(self, container: str) -> None:
         """Raises unless the engine may look into its files."""
@@ -276,7 +289,7 @@ class EngineGate:
             return False
         status, found = await self._asked(path)
         if status == HTTPStatus.NOT_FOUND:
-            return kind != "joined networks"
+            return kind not in ("joined networks", "kept networks")
         document = found if isinstance(found, dict) else {}
         config = document.get("Config") if what == "containers" else document
         labels = config.get("Labels") if isinstance(config, dict) else None

@@ -112,8 +112,10 @@ class Call:
 
 Subject = tuple[str, str]
 """Kind and name of what must be ours: ``containers``, ``networks``, ``volumes``, if it is there at all. What is one of
-``seen networks`` may be open to us, too, and so may ``joined networks``, which must be there. ``images`` must not be
-there, or be from where they are pulled; ``pulled`` must be from a registry that may be asked."""
+``seen networks`` may be open to us, too, and so may ``joined networks``, which must be there. ``kept networks`` must be
+there and ours: in these a guard has a right that others in there feel. ``guarded`` is a container that is in such ones
+alone. ``images`` must not be there, or be from where they are pulled; ``pulled`` must be from a registry that may be
+asked."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -153,6 +155,7 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             odd = None if name.startswith(_OURS) else f"it is named '{name[:80]}', and ours begin with {_OURS}"
             return odd or _container(body, set(devices)), (
                 ("containers", within) if within else ("joined networks", network),
+                *((("guarded", within),) if within and host.get("CapAdd") else ()),
                 *(("volumes", str(volume)) for volume in volumes if volume),
             )
         case "update":
@@ -163,7 +166,7 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[st
             container = _text(body, "Container")
             if not re.fullmatch(_CONTAINER_ID, container):
                 return "a container is named by its whole id", ()
-            return refused or _network_name(name), (("containers", container), ("joined networks", name))
+            return refused or _network_name(name), (("containers", container), ("kept networks", name))
         case "network made":
             return _network(body), ()
         case "volume made":

@@ -84,7 +84,8 @@ def refuses_to_be_had(house: NodeScene, docker_site: DockerSite, ours: str) -> N
     """Whoever has the orchestrator gets neither the node's files, nor what else runs there, nor a shell in it."""
     way = f"unix://{house.core.settings.state_dir}/sites/edge/engine.sock"
     image = docker_site.images.name("base")
-    good = holder(DockerOptions(network=docker_site.network), docker_site.owner, image)
+    # Of another owner: this orchestrator removes helpers of its own that it does not know.
+    good = holder(DockerOptions(network=docker_site.network), f"{docker_site.owner}-else", image)
     stranger = docker_site.docker("create", "--entrypoint", "/bin/sleep", image, "60")
     client = Engine(way, version="1.41", timeout=30)
     try:
