@@ -19,7 +19,9 @@ class Followed:
         there: Whether anybody does.
         quality: What those who publish offer, or what we do; in the graph's words.
         refused: Why nothing is carried; empty: it is.
-        dropped: Messages that could not be given on between graph and bridge.
+        passed: Messages that were given on between graph and bridge; of the wheels: velocities that were published.
+            None: nobody counts them.
+        dropped: Messages that could not be.
     """
 
     name: str
@@ -30,4 +32,5 @@ class Followed:
     there: bool = False
     quality: str = ""
     refused: str = ""
+    passed: int | None = None
     dropped: int = 0

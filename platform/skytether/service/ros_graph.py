@@ -223,8 +223,7 @@ def _work(grant: Grant, graph: RosGraph, joined: _Joined, *, wait_s: float) -> i
             graph.guard.run(graph.program, *graph.command)
         ended = graph.guard.ended()
         if ended:
-            _log.error("%s; see the lines above", ended)
-            return 1
+            raise ServiceError(f"{ended}; see the lines above")
 
 
 def take_from(notes: queue.SimpleQueue[Notes], timeout: float, use: Callable[[Notes], object]) -> bool:

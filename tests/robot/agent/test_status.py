@@ -86,7 +86,7 @@ def test_topics_stand_beside_what_became_of_their_messages(status, serve):
     seen = (
         Followed("scan", "/scan", "sensor_msgs/msg/LaserScan", "from", ("/laser",), True, "best effort"),
         Followed("map", "/map", "nav_msgs/msg/OccupancyGrid", "from"),
-        Followed("goal", "/goal", "x", "to", refused="another type hash"),
+        Followed("goal", "/goal", "x", "to", refused="another type hash", passed=12, dropped=3),
     )
     status = replace(status, session=SessionStats(True, (scan,)), topics=seen, rates={("scan", "in"): 39.96})
     (first, *rest) = document("walker", "guide", status, 60.0)["topics"]
@@ -95,6 +95,7 @@ def test_topics_stand_beside_what_became_of_their_messages(status, serve):
     assert counts["sent"] == sum(counts[n] for n in ("delivered", "superseded", "lost", "unsettled"))
     assert (first["hz"], first["graph"]["nodes"], first["graph"]["quality"]) == (40.0, ["/laser"], "best effort")
     assert [(t["topic"], t["messages"]) for t in rest] == [("map", None), ("goal", None)]
+    assert [(t["graph"]["passed"], t["graph"]["dropped"]) for t in rest] == [(None, 0), (12, 3)]
     shown = CliRunner().invoke(app, ["robot", "status", "--port", str(serve(status))], env={"COLUMNS": "200"})
     assert "/scan from /laser (best effort)" in shown.output
     assert "/map: nobody publishes it yet" in shown.output

@@ -514,7 +514,17 @@ def test_the_observer_sees_each_command_and_cannot_stop_the_robot(base, make_clo
     rig.connect(bridge)
     status = rig.run(1.5, linear=0.2)
     assert seen == [(i, None) for i in range(150)]
+    assert status.commands == 150
     assert status.source is Source.CLOUD
+
+
+def test_commands_that_came_while_the_loop_stood_still_are_all_counted(driven):
+    before = driven.driver.status()
+    for i in range(20):
+        driven.cloud.send(driven.now + i / 100)
+    driven.now += 0.2
+    status = driven.run(0.01)
+    assert (status.commands - before.commands, status.missed_commands) == (16, 4)
 
 
 def test_halt_writes_zero(driven):

@@ -93,6 +93,8 @@ def document(robot: str, service: str, status: AgentStatus, now: float) -> dict[
             {"ago_s": round(now - change.at, 2), "source": change.source, "reason": change.reason}
             for change in driver.transitions[-_TRANSITIONS:]
         ],
+        "commands": driver.commands,
+        "missed_commands": driver.missed_commands,
         "objections": dict(driver.objections),
         "errors": dict(driver.errors),
         "overruns": status.overruns,
@@ -287,6 +289,7 @@ def _topics(status: AgentStatus) -> list[dict[str, Any]]:
                     "nodes": list(graph.nodes),
                     "quality": graph.quality,
                     "refused": graph.refused,
+                    "passed": graph.passed,
                     "dropped": graph.dropped,
                 },
                 "messages": None if bridge is None else {name: getattr(bridge, name) for name in _ACCOUNT},

@@ -106,6 +106,8 @@ class ControlStatus:
         why: Of the last change, one line with the numbers behind it.
         seconds: Under each source.
         velocity: What the wheels were last told.
+        commands: Of the cloud that were looked at, admitted or not.
+        missed_commands: Of the cloud that nobody looked at: the loop stood still, and newer ones came.
         objections: The supervisor's, by kind.
         errors: Exceptions caught in the loop, by the part that raised them.
         first_command_at: Arrival of the first command from the cloud that was admitted.
@@ -122,6 +124,8 @@ class ControlStatus:
     why: str
     seconds: Mapping[Source, float]
     velocity: Velocity
+    commands: int
+    missed_commands: int
     objections: Mapping[str, int]
     errors: Mapping[str, int]
     first_command_at: float | None
@@ -193,6 +197,7 @@ class ControlLoop:
         self._transitions = deque([Transition(now, self._choice.source, self._choice.reason)], _TRANSITIONS_KEPT)
         self._counts: Counter[str] = Counter({self._choice.reason: 1})
         self._seconds = dict.fromkeys(Source, 0.0)
+        self._commands = self._missed_commands = 0
         self._objections: Counter[str] = Counter()
         self._errors: Counter[str] = Counter()
         self._read: Counter[str] = Counter()
@@ -265,6 +270,8 @@ class ControlLoop:
             why=self._why,
             seconds=dict(self._seconds),
             velocity=self._supervised.velocity,
+            commands=self._commands,
+            missed_commands=self._missed_commands,
             objections=dict(self._objections),
             errors=dict(self._errors),
             first_command_at=self._first_command_at,
@@ -345,7 +352,9 @@ class ControlLoop:
 
     def _take_commands(self, now: float) -> None:
         for session in self._change_over():
+            self._missed_commands += session.take_missed()
             for epoch, message in session.take():
+                self._commands += 1
                 self._take(epoch, message, session.encoding, now)
 
     def _take(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:

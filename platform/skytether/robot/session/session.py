@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import count
 from typing import Protocol
 
@@ -83,7 +84,9 @@ class LiveSession:
         self.said: MessageReceived | None = None
         self._epochs = epochs
         self._epoch = next(epochs)
-        self._arrived: deque[tuple[int, MessageReceived]] = deque(maxlen=_WAITING_COMMANDS)
+        self._arrived: deque[tuple[int, MessageReceived]] = deque()
+        self._missed = self._told_missed = 0
+        """Each is changed by one thread alone: the bridge's, and who takes."""
 
     def open(self, make: Callable[[Port], Endpoint], peer: tuple[str, int]) -> None:
         """Make the bridge and start it."""
@@ -120,6 +123,12 @@ class LiveSession:
             taken.append(self._arrived.popleft())
         return taken
 
+    def take_missed(self) -> int:
+        """How many were too many to wait, since the last call."""
+        new = self._missed - self._told_missed
+        self._told_missed += new
+        return new
+
     def attach(self, publisher: Publisher) -> None:
         """Port: the graph sends through it."""
         if self._graph is not None:
@@ -128,6 +137,10 @@ class LiveSession:
     def deliver(self, message: MessageReceived) -> None:
         """Port: keep commands, and what is for other robots; the rest is the graph's."""
         if message.topic == self._command_topic:
+            if len(self._arrived) >= _WAITING_COMMANDS:
+                with suppress(IndexError):  # it was taken just now
+                    self._arrived.popleft()
+                    self._missed += 1
             self._arrived.append((self._epoch, message))
         elif message.topic == self._shared_topic:
             self.said = message

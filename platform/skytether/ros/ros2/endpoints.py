@@ -53,12 +53,14 @@ class Handle(ABC):
     Attributes:
         endpoint: What it is; its type hash may be learned later.
         refused: Why nothing is carried: a sentence, or empty.
+        passed: Messages of a topic that were given on.
         dropped: Messages that could not be given on.
     """
 
     def __init__(self, host: Host, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
         self.refused = ""
+        self.passed = 0
         self.dropped = 0
         self.closed = False
         self._host = host
@@ -112,6 +114,7 @@ class Publication(Handle):
             sent = self._host.outbox(lambda: self._send(payload), self.endpoint.name)
         elif sent:
             sent = self._send(payload)
+        self.passed += sent
         self.dropped += not sent
         return sent
 
@@ -182,6 +185,7 @@ class Subscription(Handle):
         if self.refused:
             self.dropped += 1
             return
+        self.passed += 1
         try:
             self._take(sample.payload.to_bytes())
         except Exception:  # Zenoh's thread must live on

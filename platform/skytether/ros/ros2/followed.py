@@ -30,5 +30,6 @@ def followed(node: GraphNode, name: str, endpoint: Endpoint, handle: Handle | No
         there=bool(others),
         quality=" / ".join(sorted({describe(other.qos) for other in others})) if takes else describe(endpoint.qos),
         refused=refused or (handle.refused if handle is not None else ""),
+        passed=handle.passed if handle is not None else 0,
         dropped=handle.dropped if handle is not None else 0,
     )

@@ -216,7 +216,8 @@ class Ros2Port:
         way = self._ways[row.name]
         if endpoint.kind is Kind.PUBLISHER:
             if self._may(Access.PUBLISH, row.name, endpoint.name):
-                way.handle = way.publication = self._node.publish(endpoint, waits=row.reliable)
+                every = row.reliable or row.depth > 1  # not only the newest
+                way.handle = way.publication = self._node.publish(endpoint, waits=every)
         else:
             send, lose = partial(self._send, row.name), partial(self._lose, row.name)
             if endpoint.name == STATIC_TF:

@@ -26,11 +26,13 @@ class Handle(Protocol):
     Attributes:
         endpoint: What it is; its type hash may be learned later.
         refused: Why nothing is carried: a sentence, or empty.
+        passed: Messages of a topic that were given on: to the graph, or from it.
         dropped: Messages that could not be given on.
     """
 
     endpoint: Endpoint
     refused: str
+    passed: int
     dropped: int
 
     def close(self) -> None:

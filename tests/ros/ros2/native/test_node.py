@@ -276,16 +276,31 @@ node.create_subscription(Twist, "/bot/cmd_vel", lambda m: say(m.linear.x), 100)
 """
     )
     wheels = ours.publish(publisher("/bot/cmd_vel"), fresh_s=0.1)
-    until(lambda: wheels.put(encode(FAST)) and peer.all(), "the first velocity")
+    puts = 0
+
+    def put(speed):
+        nonlocal puts
+        puts += 1
+        return wheels.put(encode(Twist(linear=Vector3(x=speed))))
+
+    until(lambda: put(0.5) and peer.all(), "the first velocity")
     os.kill(ours.pid, signal.SIGSTOP)
-    until(lambda: not wheels.put(encode(Twist(linear=Vector3(x=2.5)))), "the program to be stuck")
+    until(lambda: not put(2.5), "the program to be stuck")
     assert wheels.stuck
     peer.all()
     os.kill(ours.pid, signal.SIGCONT)
     until(lambda: not wheels.stuck, "the program to go on")
-    assert wheels.put(encode(Twist()))
+    before = wheels.passed
+    assert put(0.0)
     until(lambda: peer.heard.extend(peer.all()) or 0.0 in peer.heard, "a velocity again")
     assert 2.5 not in peer.heard
+    until(lambda: wheels.passed == before + 1, "it to be counted")
+    assert wheels.passed + wheels.dropped == puts
+    os.kill(ours.pid, signal.SIGSTOP)
+    assert put(0.0)
+    os.kill(ours.pid, signal.SIGKILL)
+    until(lambda: wheels.passed + wheels.dropped == puts, "what waited in a program that ended to be counted")
+    assert wheels.passed == before + 1
 
 
 def test_there_is_a_node_where_no_log_can_be_written(ros2_nodes, monkeypatch):

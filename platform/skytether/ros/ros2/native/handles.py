@@ -55,6 +55,7 @@ class Handle:
         endpoint: What it is.
         channel: Its number on the socket.
         refused: Why nothing is carried: a sentence, or empty.
+        passed: Messages of a topic that were given on.
         dropped: Messages that could not be given on.
     """
 
@@ -62,6 +63,7 @@ class Handle:
         self.endpoint = endpoint
         self.channel = channel
         self.refused = ""
+        self.passed = 0
         self.dropped = 0
         self._host = host
         self._sender: Sender | None = None
@@ -114,6 +116,8 @@ class Publication(Handle):
         """Number and time [s] of each that the program has not dealt with, where `fresh_s` says how old one may get."""
         self._unread: tuple[float, float] = (0.0, 0.0)
         """When the program said for how long what was published is unread, and that [s]."""
+        self._published = 0
+        """Of those, as this program counts them."""
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
@@ -124,11 +128,15 @@ class Publication(Handle):
             self._kept = body
         sender = self._sender
         if sender is None or self.refused or self.stuck:
-            self.dropped += 1
+            with self._lock:
+                self.dropped += 1
             return False
-        frame = Frame(Kind.DATA, self.channel, body) if self._fresh_s == inf else self._fresh(body)
-        # What is pushed out is an older one of this topic.
-        self.dropped += sender.put(frame)
+        if self._fresh_s < inf:  # what becomes of each the program tells, or its end
+            sender.put(self._fresh(body))
+            return True
+        pushed_out = sender.put(Frame(Kind.DATA, self.channel, body))  # an older one of this topic
+        self.dropped += pushed_out
+        self.passed += 1 - pushed_out
         return True
 
     @property
@@ -154,19 +162,30 @@ class Publication(Handle):
             return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
 
     def take(self, frame: Frame) -> None:
-        number, unread_s = pull_dealt_with(frame.body)
+        number, unread_s, published = pull_dealt_with(frame.body)
         with self._lock:
             self._unread = (_now(), unread_s)
+            waited = len(self._waiting)
             while self._waiting and self._waiting[0][0] <= number:
                 self._waiting.popleft()
+            new, self._published = published - self._published, published
+            self.passed += new
+            self.dropped += waited - len(self._waiting) - new  # too old, or a newer one came before their turn
 
     def leave(self) -> None:
         super().leave()
+        self._forget()
+
+    def _forget(self) -> None:
+        """What waited in the program that is gone: nobody tells any more what became of it."""
         with self._lock:
+            self.dropped += len(self._waiting)
             self._waiting.clear()
             self._unread = (0.0, 0.0)
+            self._published = 0
 
     def join(self, sender: Sender) -> None:
+        self._forget()  # one may have been put in the moment of the end
         ours = self.endpoint
         depth = max(ours.qos.depth, MAX_WAITING) if self._waits else ours.qos.depth
         sender.set(self.channel, ours.priority, depth)
@@ -202,7 +221,7 @@ class Subscription(Handle):
         super().__init__(host, channel, endpoint)
         self._take = take
         self._lose = lose
-        self._taken = self._lost = 0
+        self._lost = 0
         self._overrun = Overrun(endpoint.qos.depth)
         self._asked: Qos | None = None
 
@@ -237,7 +256,7 @@ class Subscription(Handle):
         if self.refused:
             self.dropped += 1
             return
-        self._taken += 1
+        self.passed += 1
         try:
             self._take(frame.body)
         except Exception:  # the node's thread must live on
@@ -251,7 +270,7 @@ class Subscription(Handle):
 
     def overrun(self, now: float) -> str:
         """A sentence if messages come quicker than they are taken; empty if not, or not any more. ``now`` in s."""
-        found = self._overrun.look(self._taken, self._lost, now)
+        found = self._overrun.look(self.passed, self._lost, now)
         name = self.endpoint.name
         how = "publish them less often, or give the topic's row more depth"
         return f"{name}: messages come quicker than they are taken: {found}; {how}" if found else ""

@@ -8,8 +8,8 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, serialised message, which is published until then
-  or never; from the node the number, and float64 seconds for which nobody has acknowledged what was published: this
-  message, and those before it, wait no more.
+  or never; from the node the number, float64 seconds for which nobody has acknowledged what was published, and uint64
+  how many of this topic were published so far: this message, and those before it, wait no more.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Protocol
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
 FRESH = struct.Struct("<Qd")
+_DEALT_WITH = struct.Struct("<QdQ")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
@@ -92,15 +93,22 @@ def pull_fresh(body: bytes) -> tuple[int, float, bytes]:
     return *FRESH.unpack_from(body), body[FRESH.size :]
 
 
-def dealt_with(channel: int, number: int, unread_s: float) -> Frame:
-    """A frame of the node: it is done with a message of `fresh`, and all before it are unread for so long [s]."""
-    return Frame(Kind.FRESH, channel, FRESH.pack(number, unread_s))
+def dealt_with(channel: int, number: int, unread_s: float, published: int) -> Frame:
+    """A frame of the node: it is done with a message of `fresh`, and all before it.
+
+    Args:
+        channel: The topic's.
+        number: Of the message.
+        unread_s: For how long all before it are unread [s].
+        published: How many of this topic were, so far.
+    """
+    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published))
 
 
-def pull_dealt_with(body: bytes) -> tuple[int, float]:
-    """Number and seconds of `dealt_with`."""
-    number, unread_s = FRESH.unpack(body)
-    return number, unread_s
+def pull_dealt_with(body: bytes) -> tuple[int, float, int]:
+    """Number, seconds and how many were published, of `dealt_with`."""
+    number, unread_s, published = _DEALT_WITH.unpack(body)
+    return number, unread_s, published
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

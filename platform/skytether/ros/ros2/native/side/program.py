@@ -117,6 +117,8 @@ class Program:
         self._lock = threading.Lock()
         self._names: dict[int, str] = {}
         self._publishers: dict[int, Any] = {}
+        self._published: dict[int, int] = {}
+        """Of those that are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._read_at: dict[int, float] = {}
         """When all that was published had been acknowledged last, where it was at some time [s]."""
@@ -207,7 +209,8 @@ class Program:
                 unread_s = self._unread_s(frame.channel, publisher)
                 if _now() <= until:
                     publisher.publish(body)
-            self._sender.put(dealt_with(frame.channel, number, unread_s))
+                    self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
+            self._sender.put(dealt_with(frame.channel, number, unread_s, self._published.get(frame.channel, 0)))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -395,7 +398,8 @@ class Program:
         known = self._known(sorted(self._all, key=lambda e: str(e[0])))
         endpoints = [[*e[:2], wanted.get(e[2], e[2]), *e[3:]] for e in known]
         nodes, same = graph.others(self._node)
-        dropped = self._sender.dropped()
+        # Of a publisher only answers wait here, the newest of which says all.
+        dropped = {c: n for c, n in self._sender.dropped().items() if c not in self._publishers}
         lost = {c: [dropped.get(c, 0), self._lost.get(c, 0)] for c in {*dropped, *self._lost}}
         news = {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
         sim_time = self._node.get_parameter_or("use_sim_time").value is True
