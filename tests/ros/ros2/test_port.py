@@ -211,7 +211,9 @@ def test_what_comes_before_the_robot_waits_until_it_tells_its_encoding(stage, mo
     node, heard = stage.ours(), []
     subscribe = node.subscribe
     monkeypatch.setattr(
-        node, "subscribe", lambda endpoint, take: subscribe(endpoint, lambda data: (take(data), heard.append(data)))
+        node,
+        "subscribe",
+        lambda endpoint, take, **more: subscribe(endpoint, lambda data: (take(data), heard.append(data)), **more),
     )
     bridge, port = FakeBridge(), Translated(Ros2Port(node, [row], Role.SERVICE), "cdr", [row])
     port.attach(bridge)
