@@ -359,7 +359,9 @@ def test_the_log_of_what_another_orchestrator_began_can_be_read_and_followed(ope
     runtime.start(launch(flood=2))
     until(runtime, Phase.RUNNING)
     assert "line 1\n" in other.logs("i1", 100)
-    with contextlib.closing(other.follow("i1", 100)) as stream:
+    followed = other.follow("i1", 100)
+    assert followed is not None
+    with contextlib.closing(followed) as stream:
         assert "line 1\n" in (stream.read() or "")
         runtime.stop("i1", force=True)
         until(runtime, Phase.EXITED)

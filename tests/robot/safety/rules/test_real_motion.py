@@ -19,11 +19,12 @@ from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 
 TURN = 0.02
 LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0, period_s=TURN, max_step_s=0.1)
+ODOMETRY = OdometryRules()
 RULES = Rules(
     footprint=circle(0.3),
     limits=LIMITS,
     sources=SourceRules(further={"nav_vel": SourceParams("navigation", 20)}),
-    odometry=OdometryRules(),
+    odometry=ODOMETRY,
     unseen=UnseenParams(action=Action.FREE),
 )
 
@@ -89,7 +90,7 @@ def test_a_robot_that_moves_while_it_was_told_to_stand_is_stopped():
 
 
 def test_a_fault_may_be_named_only():
-    robot = Robot(replace(RULES, odometry=replace(RULES.odometry, latches=False)))
+    robot = Robot(replace(RULES, odometry=replace(ODOMETRY, latches=False)))
     robot.drive(0.4, 2.0)
     robot.wheels.fault = lambda _: STANDSTILL
     named = [robot.drive(0.4).troubles for _ in range(200)]
@@ -99,7 +100,7 @@ def test_a_fault_may_be_named_only():
 
 @pytest.mark.parametrize(("action", "speed"), [(Action.STOP, 0.0), (Action.SLOW, 0.1), (Action.FREE, 0.4)])
 def test_odometry_that_is_silent_does_what_is_configured(action, speed):
-    robot = Robot(replace(RULES, odometry=replace(RULES.odometry, on_unknown=action)))
+    robot = Robot(replace(RULES, odometry=replace(ODOMETRY, on_unknown=action)))
     robot.drive(0.4, 2.0)
     robot.odometry = False
     assert robot.drive(0.4, 2.0).velocity.linear == pytest.approx(speed)
@@ -121,7 +122,7 @@ def test_a_message_of_another_type_is_named_and_is_silence():
 
 def test_a_new_driver_begins_at_what_the_wheels_do():
     """Held back by a threshold at 0.15 m/s, told 0.4: the one who takes over rises from 0.15, and nothing leaps."""
-    robot = Robot(replace(RULES, odometry=replace(RULES.odometry, from_measured=True)), Wheels(noise=0.0))
+    robot = Robot(replace(RULES, odometry=replace(ODOMETRY, from_measured=True)), Wheels(noise=0.0))
     for _ in range(10):
         robot.gate.sense("nav_vel", Twist(), robot.now)
         robot.drive(0.0, 0.1)
