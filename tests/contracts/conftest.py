@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -83,8 +83,12 @@ class FakeKit(RuntimeKit):
         self.world = FakeWorld()
 
     def open(self, behaviour: str = "good") -> Runtime:
-        kind = {"good": self.kind, "stubborn": StubbornRuntime, "crashing": CrashingRuntime}[behaviour]
-        runtime = kind("lab", self.folder, FakeOptions(), self.world)
+        kinds: dict[str, Callable[..., Runtime]] = {
+            "good": self.kind,
+            "stubborn": StubbornRuntime,
+            "crashing": CrashingRuntime,
+        }
+        runtime = kinds[behaviour]("lab", self.folder, FakeOptions(), self.world)
         self.runtimes.append(runtime)
         return runtime
 

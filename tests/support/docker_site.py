@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
 from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
@@ -17,12 +18,12 @@ from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
 _BUILD = Path(__file__).parents[2] / "images" / "build.py"
 
 
-def build(prefix: str, *names: str) -> list[dict[str, object]]:
+def build(prefix: str, *names: str) -> list[dict[str, Any]]:
     """Build images from this very code; what ``--json`` tells of them."""
     command = [sys.executable, str(_BUILD), "--prefix", prefix, "--json", *names]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    rows: list[dict[str, object]] = json.loads(done.stdout)
+    rows: list[dict[str, Any]] = json.loads(done.stdout)
     return rows
 
 
@@ -31,7 +32,7 @@ class Images:
     """The images of one run of the tests, removed at its end, unless the next run is to have them."""
 
     prefix: str
-    rows: list[dict[str, object]]
+    rows: list[dict[str, Any]]
     """What ``images/build.py --json`` told of them."""
     kept: bool = False
 

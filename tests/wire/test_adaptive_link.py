@@ -178,6 +178,7 @@ def test_a_machine_that_pauses_costs_no_rate(world, seed):
 def test_a_link_that_the_camera_saturates_delays_commands_by_milliseconds(world, seed, seconds):
     measured = Measured(world, SATURATED.link, seed=seed, seconds=seconds, flows=(*COMMANDS, replace(CAMERA, rank=2)))
     packet = 80 + 60 + IP_UDP_HEADERS
+    assert SATURATED.link.rate is not None
     idle = SATURATED.link.delay + packet * 8 / SATURATED.link.rate
     for flow in COMMANDS:
         assert measured.delivered[flow.name] == 1

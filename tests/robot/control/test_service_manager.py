@@ -67,7 +67,9 @@ NUMBER = st.one_of(st.none(), st.floats(0, 1e308), st.sampled_from([inf, nan, 0.
 def test_no_answer_widens_what_the_robot_needs(rtt, loss, late, period):
     own = Needs(max_rtt_s=0.4, max_loss=0.3, max_late=0.2)
     needs = tighten(own, Terms(rtt, loss, late, period))
+    assert needs.max_rtt_s is not None
     assert needs.max_rtt_s <= 0.4
+    assert needs.max_loss is not None
     assert needs.max_loss <= 0.3
     assert needs.max_late <= 0.2
     same = ("max_clock_error_s", "command_timeout_s", "bad_s", "good_s", "local")

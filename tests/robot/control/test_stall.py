@@ -186,4 +186,6 @@ def test_the_watch_with_clocks_that_are_not_to_be_trusted():
 def test_both_clocks_of_this_machine_go_on():
     (now, boot), (later, after) = read_clocks(), read_clocks()
     assert later >= now
+    assert after is not None
+    assert boot is not None
     assert after >= boot

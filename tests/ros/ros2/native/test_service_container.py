@@ -5,6 +5,7 @@ import secrets
 import signal
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import yaml
@@ -95,7 +96,7 @@ def image(docker_images, tmp_path_factory):
 
 def manifest(image, name="guide", **more):
     text = {"type": "std_msgs/msg/String", "depth": 100, "lifespan_ms": 2000}
-    topics = [
+    topics: list[dict[str, Any]] = [
         {"name": "chat", "direction": "in", **text},
         {"name": "said", "direction": "out", **text},
         {"name": "cmd_vel", "type": "geometry_msgs/msg/Twist", "direction": "out", "priority": 127, "period_ms": 50},

@@ -1,5 +1,7 @@
 """Two real graphs of ROS 2 in two networks with a bad link between them, and ``skytether bridge`` at either end."""
 
+from typing import Any
+
 import pytest
 from networks import Program
 from ros2_nodes import far_nodes, first, ros2_nodes, until
@@ -123,7 +125,7 @@ def bridge(link, ros2_nodes, far_nodes, tmp_path):
     key.touch(0o600)
     key.write_text("MDEyMzQ1Njc4OTAxMjM0NTY3ODkwMTIzNDU2Nzg5MDE=")
     there = {"host": SERVICE, "port": 4600}
-    ends = {
+    ends: dict[str, dict[str, Any]] = {
         "service": {"bind": there, "ros2": {"domain": far_nodes.domain, "namespace": "/cloud"}},
         "robot": {
             "peer": there,
